@@ -1,7 +1,8 @@
-"""A flight from start to end: `Flight.open` opens everything for it, `run` flies, and `close` closes everything.
+"""A flight from start to end: `Flight.open` opens everything, `run` flies, and `close` closes everything.
 
-Each turn of the loop takes the newest frame, recognises it, and tells the autopilot and the observers. The same code
-flies in the air and in a replay: what differs is handed in as its `World`.
+Each pass of the loop takes the newest frame, recognises it, and reports the result to the autopilot and to observers
+(the functions that count, watch, log and learn). The same code flies in the air and in a replay: only its `World`, all
+that is outside of it, differs.
 """
 
 import logging
@@ -37,15 +38,15 @@ from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
-_TURN_S = 0.2  # the loop turns at least this often, with or without frames
+_TURN_S = 0.2  # a pass of the loop waits no longer than this for a frame
 
 _log = logging.getLogger(__name__)
 
 
 def fly(config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None) -> int:
-    """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with those of the
-    frames of a recording; `read_again` reads the configuration anew, when SIGHUP asks for that. Raises an EdgevprError,
-    one sentence, where the flight cannot start."""
+    """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions
+    of the frames, if the source is a recording (None: there is none). `read_again` reads the configuration again on
+    SIGHUP (None: it has no file). Raises an EdgevprError, one sentence, if the flight cannot start."""
     with in_the_air(config, positions, read_again) as world, signals(world):
         try:
             with closing(Flight.open(config, world)) as flight:
@@ -56,7 +57,7 @@ def fly(config: Config, positions: Path | None = None, read_again: Callable[[], 
 
 
 class Flight:
-    """A flight for which everything is open. Close it when it has been flown."""
+    """A flight for which everything is open. Close it after `run`."""
 
     def __init__(self, config: Config, crew: Crew) -> None:
         self._config, self._crew, self._opened = config, crew, ExitStack()
@@ -84,8 +85,8 @@ class Flight:
 
     @classmethod
     def open(cls, config: Config, world: World) -> "Flight":
-        """Open the map, the log, the links and the source, in this order. Raises an EdgevprError where one of them
-        cannot be opened, and StopNow where the flight is to end before it has begun."""
+        """Open the map, the log, the links and the source, in this order. Raises an EdgevprError if one of them cannot
+        be opened, and StopNow if a signal ends the flight before it has begun."""
         systemd.starting()
         with ExitStack() as stack:
             with world.stop.beginning():
@@ -133,11 +134,11 @@ class Flight:
         return flight
 
     def close(self) -> None:
-        """Close everything that was opened, the last first."""
+        """Close everything that was opened, in reverse order."""
         self._opened.close()
 
     def run(self) -> int:
-        """Fly until the source has ended or a signal ends the flight, and write the last line of the log; return 1 if
+        """Fly until the source has ended or a signal ends the flight, and write the last line of the log. Return 1 if
         any frame failed, else 0."""
         with suppress(StopNow):
             while not (self._crew.stop.asked or self._crew.source.ended):
@@ -146,9 +147,13 @@ class Flight:
         return 1 if self._tally.unusable + self._tally.failed else 0
 
     def totals(self) -> dict[str, Any]:
-        """Return the counts and costs of the flight so far: queries, those of `FlightMeter.totals`, the pictures that
-        were not read in time (`dropped`) or not new and whole (`refused`, by reason), the seconds that the newest was
-        old when it could be read (`latency_s`), and the places that were left out."""
+        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`, and
+        - `queries`: the number of queries
+        - `dropped`: pictures not read in time (None: the source is a recording)
+        - `refused`: pictures that were not new and whole, their number by reason
+        - `latency_s`: age of the newest picture when it could be read, seconds (None: unknown)
+        - `left_out`: places of the map that cannot be read.
+        """
         source = self._crew.source
         return {
             "queries": self._tally.queries,
@@ -160,6 +165,7 @@ class Flight:
         }
 
     def _turn(self) -> None:
+        """Run one pass of the loop, with one frame at most."""
         source, clock, meter = self._crew.source, self._crew.clock, self._crew.meter
         self._vitals.beat()
         self._commands.obey()
@@ -191,8 +197,8 @@ class Flight:
         self._governing.look()  # here, so that each reading covers a whole number of queries
 
     def _pass_over(self) -> None:
-        """Let the newest picture of a camera or stream go by, so that none is old when the flight goes on; a recording
-        waits."""
+        """Drop the newest picture of a live source while the flight is paused, so that none is old when it resumes. A
+        recording waits."""
         if self._crew.source.is_live:
             with suppress(ImageError):
                 self._crew.source.read(_TURN_S)
@@ -200,8 +206,8 @@ class Flight:
             self._crew.clock.sleep(_TURN_S)
 
     def _tell(self, event: Recognition) -> None:
-        """Tell the autopilot of an event, then all observers, who also learn what became of its fix. A listener that
-        fails is logged: it must not end the flight."""
+        """Report an event to the autopilot, then to all observers, which also get the report of its fix. An exception
+        in one of these is logged: it must not end the flight."""
         meter = self._crew.meter
         meter.count(event)
         with meter.telling():
@@ -216,7 +222,7 @@ class Flight:
                     _log.exception("%s could not be told", tell.__qualname__)
 
     def _log_event(self, event: Recognition) -> None:
-        """Write the line of an event: of kind "query", or "unusable" for a frame that never became a query."""
+        """Write the log line of an event: of kind "query", or "unusable" for a frame that could not become a query."""
         if event.frame is None or not event.is_query:
             self._crew.flight_log.write("unusable", problem=event.reason)
             return
@@ -234,7 +240,7 @@ class Flight:
         )
 
     def _learn(self, event: Recognition) -> None:
-        """Make a place of the frame, where it is worth one; later frames may be recognised as that place."""
+        """Add the frame to the map as a new place, if it is worth it; later frames may be recognised as that place."""
         learner = self._crew.learner
         if learner is None:
             return
@@ -288,7 +294,8 @@ class Flight:
 def open_links(
     settings: MavlinkConfig, world: World, navigator: Navigator, place_map: PlaceMap, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
-    """Open the link to the flight controller and the one to the ground, None where there is none."""
+    """Open the link to the flight controller and the link to the ground station, which `stack` closes. Return both;
+    each is None if it is not configured."""
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None

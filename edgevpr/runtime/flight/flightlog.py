@@ -1,4 +1,5 @@
-"""The flight log: one JSON object a line. A full disk or a pulled card loses lines, but never ends the flight."""
+"""The flight log: one JSON object per line. `flight` writes it, `wholeflight` reads it. A full disk or a pulled memory
+card loses lines, but never ends the flight."""
 
 import json
 import logging
@@ -29,28 +30,28 @@ from edgevpr.core.text import json_line
 from edgevpr.core.types import NO_TAPE, Tape
 
 _log = logging.getLogger(__name__)
-_PARTS = 4  # of `max_mb`: the file that is written, and three for those that are set aside
+_PARTS = 4  # of `max_mb`: one for the file that is written, three for the numbered files
 _SYNC_EVERY_S = 1.0
-_MOST_START_BYTES = 1_000_000  # of a file that is looked through for anything but start lines
+_MOST_START_BYTES = 1_000_000  # a larger file has more than start lines
 
 
 class FlightLog:
-    """An open flight log; `path=None` writes nothing. Close it (it is a context manager).
+    """Writer of a flight log; with `path` None nothing is written. Close it (it is a context manager).
 
-    `path` is the log of the newest flight. What is there of an earlier flight is set aside under the next number
-    (`core.appending`) before the first line is written, unless it is nothing but start lines. So is a file of a
-    quarter of `max_mb` (None: without limit). The files with numbers have the other three quarters: the oldest are
-    deleted. Every file of a flight but the first begins with the flight's start line again, with `repeated`, and
-    `part`, the number of the file among those of the flight. Where another process writes `path`, this flight has files
-    with numbers only.
+    `path` is the log of the newest flight. Before the first line of this flight, the file of an earlier flight is set
+    aside, that is renamed to the next number (see `core.appending`); if it has nothing but start lines, it is emptied
+    instead. A file that reaches a quarter of `max_mb` (None: no limit) is set aside too. The numbered files share the
+    other three quarters: the oldest are deleted. Each further file of a flight begins with a copy of the start line,
+    with `repeated` and with `part`, the number of the file within the flight. If another process writes `path`, this
+    flight writes numbered files only.
 
-    A line is the system's as soon as it is written: the end of this process, however sudden, costs nothing. It is on
-    the disk (fdatasync) with the first line that comes a second or more after the last sync, or with the next call of
-    `sync_due`. A pulled battery costs at most the lines of the last two seconds.
+    Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
+    are synced to the disk (fdatasync) by the first line written a second or more after the last sync, or by the next
+    call of `sync_due`. A pulled battery costs at most the lines of the last two seconds.
 
-    `state` is None while lines are written, else a sentence that says why they are not. `lost_lines` counts the missing
-    lines. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". A log that was
-    deleted or moved in flight goes on in a new file of that name.
+    `state` is None while lines are written, else a sentence that says why not. `lost_lines` counts the missing lines.
+    Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". If the log is deleted
+    or moved in flight, it goes on in a new file of the same name.
     """
 
     def __init__(
@@ -63,8 +64,9 @@ class FlightLog:
         max_mb: float | None = None,
         tape: Tape = NO_TAPE,
     ) -> None:
-        """Open for appending. Raises EdgevprError where the file cannot be opened. With `wait`, for a service that may
-        restart in the air, every line tries to open the file again instead."""
+        """Open the file for appending. Raises EdgevprError if that fails. With `wait`, for a service that may be
+        restarted in the air, it does not raise: every line tries to open the file again. `clock` gives monotonic
+        seconds."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
@@ -75,7 +77,7 @@ class FlightLog:
         self._ours: tuple[int, int] | None = None  # device and inode of the file with lines of this flight
         self._written = 0  # lines in the file that is open
         self._synced_s, self._is_synced, self._is_new = -math.inf, True, False
-        self._start: dict[str, Any] = {}  # the start line, as it is repeated
+        self._start: dict[str, Any] = {}  # the start line, for the copies in later files
         self._part, self._has_start = 0, False  # start lines written so far; the open file has one
         self._warned: set[str] = set()
         if path is not None:
@@ -91,7 +93,7 @@ class FlightLog:
 
     @property
     def is_written(self) -> bool:
-        """True where lines are written, as far as that was noticed."""
+        """True if the last line could be written; the answer is recorded on the tape."""
         return self._tape.read("log is written", lambda: self.state is None)
 
     def __enter__(self) -> "FlightLog":
@@ -131,20 +133,20 @@ class FlightLog:
             self.lost_lines += 1
             self._has_start &= not is_start
             self._note_trouble(error)
-            self._let_go()  # the medium may be another one when it comes back, so the file is opened anew
+            self._let_go()  # the card may be another one when it comes back, so the file is opened anew
         else:
             if self.state is not None:
                 self.state = None
                 _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
 
     def restate(self, **fields: Any) -> None:
-        """Give fields of the start line another value, where it is repeated from now on."""
+        """Change fields of the start line in its copies at the beginning of later files."""
         if self._start:
             self._start |= json.loads(json_line(fields))
 
     def sync_due(self, now_s: float) -> None:
-        """Bring lines to the disk that no other line has followed for a second; `now_s` is the time by the clock. Never
-        raises OSError."""
+        """Sync lines to the disk if a second or more has passed since the last sync. `now_s` is the present time of
+        `clock`. Never raises OSError."""
         if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_EVERY_S:
             return
         try:
@@ -154,7 +156,7 @@ class FlightLog:
             self._let_go()
 
     def close(self) -> None:
-        """Bring everything to the disk. A failure is logged, not raised."""
+        """Sync all lines to the disk and close the file. A failure is logged, not raised."""
         if self._file is None:
             return
         try:
@@ -165,12 +167,12 @@ class FlightLog:
         self._file = None
 
     def _writable(self, more_bytes: int) -> FileIO:
-        """Return the open file, after what has to be set aside for these bytes. Raises OSError."""
+        """Return the open file, with room for `more_bytes`; a full file is set aside first. Raises OSError."""
         file = self._file or self._open()
         size = _size_of(file)
         if not size or (_identity(file) == self._ours and size + more_bytes <= self._part_bytes):
             return file
-        if self._ours is None and _has_only_starts(file):  # of a service that could not start
+        if self._ours is None and _has_only_starts(file):  # left by a service that could not start
             file.truncate(0)
         elif self._is_set_aside():
             sync(file)
@@ -180,7 +182,7 @@ class FlightLog:
         return file
 
     def _open(self) -> FileIO:
-        """Open the file to be written, which is then locked. Raises OSError."""
+        """Open and lock the file to be written; if another process has locked it, a numbered file. Raises OSError."""
         file = open_appending(self._at)
         if not try_lock(file):
             file.close()
@@ -196,8 +198,8 @@ class FlightLog:
         return file
 
     def _is_set_aside(self) -> bool:
-        """Give the file that is written a number, so that `_open` makes a new one. Return False where it stays as it
-        is: it is then written on, since a line is worth more than a limit."""
+        """Set the written file aside, so that `_open` makes a new one. Return False if that fails: the old file is then
+        written further, since lines matter more than the limit."""
         try:
             if self._at == Path(self.path or ""):
                 set_aside(self._at)
@@ -212,7 +214,7 @@ class FlightLog:
         return True
 
     def _delete_oldest(self) -> None:
-        """Delete the oldest files with a number until a new file has its room."""
+        """Delete the oldest numbered files until together they keep to three quarters of `max_mb`."""
         if math.isinf(self._part_bytes):
             return
         try:
@@ -266,8 +268,9 @@ class FlightLog:
 
 
 def read_log(path: str | Path, begin: int = 0, end: float = math.inf) -> Iterator[dict[str, Any]]:
-    """Yield the lines of a file as dicts, in order; with `begin` and `end` those that begin there, in bytes. A line
-    that was cut (battery pulled) is left out. `wholeflight.flight_of` reads a flight of several files."""
+    """Yield the lines of one log file as dicts, in order; only those that begin at byte `begin` or later and before
+    byte `end`. A line that was cut (battery pulled) is left out. `wholeflight.flight_of` reads a flight of several
+    files."""
     with open(path, "rb") as handle:
         handle.seek(begin)
         for line in handle:
@@ -280,7 +283,7 @@ def read_log(path: str | Path, begin: int = 0, end: float = math.inf) -> Iterato
 
 
 def record_of(line: bytes) -> dict[str, Any] | None:
-    """Return a line as a dict, None for one that was cut or is none."""
+    """Parse one line of a log. None: the line was cut, or is no JSON object."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
@@ -310,12 +313,12 @@ def _line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
 
 
 def _identity(file: FileIO) -> tuple[int, int]:
-    """Return the device and the number of an open file: those of no other file that is there."""
+    """Return the device and inode numbers of an open file, which no other existing file has."""
     found = os.fstat(file.fileno())
     return found.st_dev, found.st_ino
 
 
 def _size_of(file: FileIO) -> int:
-    """Return the bytes of an open file, 0 for a device."""
+    """Return the size of an open file in bytes, 0 for a device."""
     found = os.fstat(file.fileno())
     return found.st_size if stat.S_ISREG(found.st_mode) else 0

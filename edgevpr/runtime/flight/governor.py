@@ -1,8 +1,9 @@
 """The governor keeps CPU share, memory and temperature within the board's profile. It first compares fewer candidates,
-which find nearly as much for less, then asks less often, and goes back the same way when there is room again.
+which find nearly as much for less, then makes fewer queries per second. When there is room again, it returns step by
+step to the setting that was asked for. The loop of `flight` uses `Governing`.
 
-Two rules keep it from swinging to and fro. It goes back only if the reading, scaled to the higher setting, leaves a
-clear distance to every limit. A step back that soon had to be undone is tried again later, and each time twice as late.
+Two rules keep it from switching back and forth. It goes back up only if the load, scaled to the higher setting, stays
+clearly below every limit. After a step up that soon had to be undone, it waits twice as long before the next one.
 """
 
 import math
@@ -15,22 +16,22 @@ from edgevpr.runtime.flight.metering import LoadReading
 from edgevpr.runtime.flight.world import Crew
 
 GOVERN_S = 1.0
-_PATIENCE_S = 3.0  # a limit must be passed for so long before anything changes
+_PATIENCE_S = 3.0  # a limit must be exceeded for so long before anything changes
 _HEAT_PATIENCE_S = 20.0  # after a change: a hot board cools slowly, so its effect shows late
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 6.0, 600.0  # with room below all limits, before it goes back
-_TRIAL_S = 300.0  # going back was right if it lasts so long
-_ROOM = 0.85  # of a limit, for the load expected at the higher setting
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 6.0, 600.0  # with room below all limits, before a step up
+_TRIAL_S = 300.0  # a step up was right if it lasts so long
+_ROOM = 0.85  # share of a limit that the load expected at the higher setting may reach
 _LATE = 0.95
 _COOLER_C = 5.0
 _NEAR_MEMORY, _MEMORY_ROOM = 0.95, 0.9
-_SLOWEST = 8  # times less often than asked, at most
-_OF_CANDIDATES = 0.6  # of a query that is for its candidates, in a large map (benchmarks/results/arm64.md)
+_SLOWEST = 8  # times fewer queries per second than asked for, at most
+_OF_CANDIDATES = 0.6  # share of a query's time for comparing candidates, in a large map (benchmarks/results/arm64.md)
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Settings of recognition: queries a second, places compared, and the form of the index, which stays as it is
-    (None: the technique has no forms)."""
+    """Settings of recognition: queries per second, places compared per query, and the form of the index in RAM, which
+    never changes (None: the technique has no forms)."""
 
     rate_hz: float
     candidates: int
@@ -39,8 +40,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits: the process's share of all cores (0..1) and its memory, and the temperature of the board in degrees
-    Celsius."""
+    """Upper limits: share of all cores that this process uses (0..1), its memory, and the temperature of the board in
+    degrees Celsius."""
 
     cpu_share: float
     memory_max_mb: float
@@ -49,8 +50,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from one setting to another, with the reason. `back` is True towards what was asked; both settings are the
-    same where nothing is left to lower."""
+    """Change from one setting to another, and the reason. `back`: it goes up, towards the setting asked for. If nothing
+    is left to lower, both settings are the same."""
 
     before: Setting
     after: Setting
@@ -59,9 +60,9 @@ class Change:
 
 
 def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
-    """Return the settings from what is asked down to the least: the candidates are lowered to each of `fewer`, numbers
-    that are known to accept no wrong place, largest first; then the rate is halved down to an eighth. `keeps_rate` is
-    for sequences, which need queries as often as the map was made."""
+    """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to each number
+    in `fewer`, largest first; those are known to accept no wrong place. Then the rate is halved, down to an eighth.
+    `keeps_rate`, for sequences, which need queries as often as the map was made, leaves the rate as it is."""
     found = [asked]
     found += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
     while not keeps_rate and found[-1].rate_hz > asked.rate_hz / _SLOWEST:
@@ -70,7 +71,7 @@ def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[
 
 
 def lowered(setting: Setting, asked: Setting) -> str:
-    """Name what a setting has other than asked, in a few words; "" where it is all as asked."""
+    """Describe in a few words what is lowered in `setting` compared with the one `asked` for; "" if nothing is."""
     parts = (
         f"{setting.rate_hz:g} of {asked.rate_hz:g} Hz" if setting.rate_hz != asked.rate_hz else "",
         f"{setting.candidates} of {asked.candidates} candidates" if setting.candidates != asked.candidates else "",
@@ -79,7 +80,7 @@ def lowered(setting: Setting, asked: Setting) -> str:
 
 
 class Governor:
-    """Goes down and up `settings` (of `steps`)."""
+    """Decides which of the `settings` (from `steps`, highest first) is in force."""
 
     def __init__(self, limits: Limits, settings: Sequence[Setting]) -> None:
         self._limits, self._settings, self._at = limits, list(settings), 0
@@ -90,22 +91,22 @@ class Governor:
 
     @property
     def setting(self) -> Setting:
-        """Setting in force."""
+        """The setting in force."""
         return self._settings[self._at]
 
     @property
     def asked(self) -> Setting:
-        """Setting in force while no limit is passed."""
+        """The highest setting, which is in force while no limit is exceeded."""
         return self._settings[0]
 
     def ask_rate(self, rate_hz: float) -> None:
-        """Ask for another rate: what is lowered stays lowered as much."""
+        """Change the rate of the highest setting; the rates of all others change by the same factor."""
         factor = rate_hz / self.asked.rate_hz
         self._settings = [replace(each, rate_hz=each.rate_hz * factor) for each in self._settings]
 
     def look(self, now_s: float, reading: LoadReading) -> Change | None:
-        """Judge a reading; None: all stays as it is. Call it about once a second, each time with a reading over a whole
-        number of queries."""
+        """Judge a measurement, and return the change to be made (None: no change). Call it about once a second; each
+        measurement must cover a whole number of queries."""
         hot, over = self._load(reading)
         most_mb = self._limits.memory_max_mb
         has_room = self._has_room(reading, self._settings[max(0, self._at - 1)])
@@ -130,14 +131,15 @@ class Governor:
         return None
 
     def _below(self, hot: bool) -> int | None:
-        """Return the next step down; where the board is hot, the next to a lower rate, since a small one cools it too
-        slowly to tell. None: there is none."""
+        """Return the index of the next lower setting (None: there is none). If the board is `hot`, it is the next one
+        with a lower rate: fewer candidates alone would cool it too slowly to see an effect."""
         below = range(self._at + 1, len(self._settings))
         slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
 
     def _load(self, reading: LoadReading) -> tuple[bool, str | None]:
-        """Tell whether it is too hot, and say which limit is passed (None: none, memory apart)."""
+        """Return (whether the board is too hot, the limit that is exceeded, in words). None: no limit is, memory not
+        counted."""
         limits, temperature_c = self._limits, reading.temperature_c
         if temperature_c is not None and temperature_c >= limits.temperature_c:
             return True, f"{temperature_c:.0f} degrees, and {limits.temperature_c:.0f} are the limit"
@@ -150,7 +152,7 @@ class Governor:
         return False, None
 
     def _has_room(self, reading: LoadReading, then: Setting) -> bool:
-        """Tell whether all limits would be kept by a clear distance with this setting."""
+        """Tell whether the load would stay clearly below all limits with the setting `then`."""
         now, limits = self.setting, self._limits
         more = 1 + _OF_CANDIDATES * (then.candidates / now.candidates - 1)
         more *= then.rate_hz / now.rate_hz
@@ -163,7 +165,8 @@ class Governor:
         )
 
     def _nothing_left(self, what: str, why: str) -> Change | None:
-        """Say once that a limit is passed for which nothing can be lowered."""
+        """Return a change that changes nothing, to report that a limit is exceeded and no setting can be lowered. None:
+        that has been reported for `what` already."""
         if what in self._told:
             return None
         self._told.add(what)
@@ -186,14 +189,13 @@ class Governor:
 
 
 class _Held:
-    """Timer of a condition: for how long it has held."""
+    """Timer of a condition."""
 
     def __init__(self) -> None:
         self._since_s: float | None = None
 
     def since(self, now_s: float, holds: bool) -> float:
-        """Return the seconds since the first reading at which the condition held without a break, 0 where it does
-        not."""
+        """Return for how many seconds the condition has held without a break, 0 if it does not hold now."""
         if not holds:
             self._since_s = None
             return 0.0
@@ -206,8 +208,8 @@ class _Held:
 
 
 class Governing:
-    """Keeps a recogniser and its `pace` within the limits of the board. Every change, down or back, is told once. A
-    sequence needs queries as often as the map was made, and its rivals compared."""
+    """Applies a `Governor` to a recogniser and its `pace`. Every change is reported once. In a sequence neither rate
+    nor candidates are lowered: it needs queries as often as the map was made, and compares all candidates."""
 
     def __init__(self, crew: Crew, pace: Pace) -> None:
         self._crew, self._pace = crew, pace
@@ -220,17 +222,17 @@ class Governing:
 
     @property
     def held(self) -> str | None:
-        """Settings that are lowered to keep to the board's limits, in a few words; None where none is."""
+        """Description of the lowered settings, in a few words; None if nothing is lowered."""
         what = lowered(self._governor.setting, self._governor.asked)
         return f"held to {what}" if what else None
 
     def ask_rate(self, rate_hz: float) -> None:
-        """Fly on with another rate; what is lowered stays lowered as much."""
+        """Change the rate that is asked for; lowered settings stay lowered by the same factor."""
         self._governor.ask_rate(rate_hz)
         self._pace.rate_hz = self._governor.setting.rate_hz
 
     def look(self) -> None:
-        """Look at the load of the flight, once a second, and change the settings if needed."""
+        """Measure the load of the flight if the last measurement is a second old, and change the settings if needed."""
         crew = self._crew
         if crew.meter.age_s < GOVERN_S:
             return

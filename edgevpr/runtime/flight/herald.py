@@ -1,4 +1,5 @@
-"""The herald of a flight: what happens is told to the journal, to the flight log and to the people on the ground."""
+"""The herald of a flight reports what happens to the journal (the log of the process), to the flight log and to the
+ground station. `autopilot`, `commands`, `governor`, `vitals` and `watching` report through it."""
 
 import logging
 from typing import Any
@@ -11,23 +12,23 @@ _log = logging.getLogger(__name__)
 
 
 class Herald:
-    """Tells what happens in a flight. Without a `link` nobody on the ground is told."""
+    """Reports what happens in a flight. Without a `link` nothing is sent to the ground station."""
 
     def __init__(self, flight_log: FlightLog, link: Link | None) -> None:
         self._flight_log, self._link = flight_log, link
 
     def note(self, kind: str, **fields: Any) -> None:
-        """Write a line of a kind to the flight log, and tell nobody."""
+        """Write a line to the flight log only."""
         self._flight_log.write(kind, **fields)
 
     def say(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
-        """Tell the journal, and the ground when its turn comes (with the shorter text `ground`, where there is one).
-        The newest text of a `topic` takes the place of one that still waits."""
+        """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
+        given). A text that still waits is replaced by a newer one of the same `topic`."""
         _log.log(logging.WARNING if severity is Severity.WARNING else logging.INFO, "%s", text)
         self.announce(severity, ground or text, topic)
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Tell the ground alone."""
+        """Queue a text for the ground station only (see `say`)."""
         if self._link:
             self._link.announce(severity, text, topic)
 
@@ -41,21 +42,22 @@ class Herald:
         topic: str | None = None,
         **fields: Any,
     ) -> None:
-        """Tell everybody at once: write a line of a kind, with its fields, to the flight log, and say the text. Its
-        topic is the kind, unless given."""
+        """Report to all three at once: write a line of `kind`, with its fields, to the flight log, and `say` the text.
+        Without a `topic`, the kind is its topic."""
         self.note(kind, **fields)
         self.say(severity, text, ground=ground, topic=topic or kind)
 
 
 class Trouble:
-    """A trouble that comes and goes: everybody is told once that it has `begun`, and once that it is `over`."""
+    """A condition that begins and ends. The text `begun` is reported once when it begins, the text `over` once when it
+    ends. `is_so`: it has begun and has not ended."""
 
     def __init__(self, herald: Herald, kind: str, begun: str, over: str) -> None:
         self.is_so = False
         self._herald, self._kind, self._begun, self._over = herald, kind, begun, over
 
     def note(self, is_so: bool) -> None:
-        """Note whether it is so."""
+        """Set whether the condition holds now, and report if that has changed."""
         if is_so == self.is_so:
             return
         self.is_so = is_so

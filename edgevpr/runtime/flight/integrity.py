@@ -1,4 +1,5 @@
-"""GPS against the map: a receiver that is far from where confident matches say is jammed, spoofed, or has a glitch."""
+"""Check of GPS by the map: a receiver far from the positions of accepted matches is jammed, spoofed, or wrong for a
+moment. `watching.GpsWatch` uses it."""
 
 import math
 from collections.abc import Collection
@@ -13,19 +14,21 @@ from edgevpr.runtime.flight.navigation import PositionedMatch, positioned, worst
 from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Standard deviations of both. What is wrong with map and receiver stays for minutes, so a second look takes nothing off
-# it: of 3000 flights one map is so far off. With 5 m of the map, that is 23 m for good matches and a good receiver.
+# In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
+# does not reduce them: they are so large in one flight of 3000. With a standard deviation of 5 m for the map, the limit
+# is 23 m for good matches and a good receiver.
 _CONTRADICTS = 4.0
-_LEAST_M = 15.0  # less is no danger, and seconds of a bad receiver
+_LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
 _IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
-_WITHIN_S = 30.0  # those in a row
+_WITHIN_S = 30.0  # the matches in a row must be no older
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class _Against:
-    """A match that contradicts GPS: the time, the places, and by how much (2,) metres."""
+    """A match that contradicts GPS: the time of its frame, its places, and its offset (2,) from GPS, metres east and
+    north."""
 
     t_s: float
     places: Collection[int]
@@ -33,9 +36,10 @@ class _Against:
 
 
 class Integrity:
-    """Compares every accepted match with the receiver. Three in a row, of different places, that lie off GPS by the
-    same step say that GPS `is_wrong`; three that agree with it say that it is right again. `map_sd_m` is by how much
-    all matches may be off together, `off_m` by how many metres the last one lay off (None: there is no receiver)."""
+    """Compares every accepted match with the GPS receiver. GPS `is_wrong` after three matches in a row, of different
+    places, with about the same offset from GPS; it is right again after three that agree with it. `map_sd_m` is the
+    standard deviation of the error that all matches share. `off_m` is the distance of the last match from GPS, metres
+    (None: there is no receiver)."""
 
     def __init__(self, map_sd_m: float) -> None:
         self._map_sd_m = map_sd_m
@@ -45,8 +49,8 @@ class Integrity:
         self.off_m: float | None = None
 
     def look(self, event: Recognition) -> str | None:
-        """Take in an accepted match with a position; return once, in a few words, that GPS is wrong, or right again;
-        None: there is no news."""
+        """Compare an accepted match that has a position. Return a short text once when GPS becomes wrong or right
+        again, else None."""
         seen, vehicle = positioned(event), event.vehicle
         if seen is None or vehicle is None or vehicle.gps is None or not vehicle.is_fresh_at(seen.t_s):
             self.off_m = None
@@ -83,7 +87,8 @@ class Integrity:
 
 
 def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
-    """Return the step (2,), metres, from the receiver's position at the time of the frame to the match."""
+    """Return the offset (2,), metres east and north, from the receiver's position at the time of the frame to the
+    match."""
     here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
     flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
@@ -91,6 +96,7 @@ def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
 
 
 def _are_alike(one: _Against, other: _Against, sd_m: float) -> bool:
-    """Tell whether two matches lie off GPS by the same step, as far as a receiver moves away at 10 m/s."""
+    """Tell whether two matches have about the same offset from GPS. It may change by 10 m/s, as a receiver may be led
+    away."""
     room_m = math.hypot(2 * sd_m, 10.0 * (other.t_s - one.t_s))
     return math.hypot(*(other.off_m - one.off_m)) <= 2 * room_m

@@ -1,4 +1,5 @@
-"""Metering of what a flight takes of its board: charge, cores, memory, heat."""
+"""Metering of what a flight takes from its board: charge, CPU time, memory, heat. The loop of `flight`, `vitals` and
+`governor` use it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,9 +19,10 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
-    """One measurement. `cpu_share`, of all cores (0..1), and `late_share` are since the last reading. `late_share` is
-    the share of the time that queries took, 0 where nothing kept them waiting. The rest is the present state, None
-    where unknown."""
+    """One measurement for the governor. Since the last one, `cpu_share` is the share of all cores that this process
+    used (0..1), and `late_share` the share of the time that queries took (0 if nothing kept them waiting). `rss_mb` is
+    the memory of this process now; temperature (degrees Celsius) and `throttled` are those of the board (None:
+    unknown)."""
 
     cpu_share: float
     late_share: float
@@ -30,9 +32,9 @@ class LoadReading:
 
 
 class FlightMeter:
-    """Meter of a flight, from the moment it is made. `thermal` is the last look at the board's heat, and `limit_c` the
-    temperature from which on it slows itself down; `queries_throttled` counts the queries made meanwhile. What is read
-    of the machine is on the `tape`."""
+    """Meter of a flight, which starts when it is made. `thermal` is the newest measurement of the board's heat,
+    `limit_c` the temperature at which the board slows itself down, and `queries_throttled` the number of queries while
+    it did. All measurements are recorded on the `tape`."""
 
     def __init__(
         self,
@@ -59,13 +61,12 @@ class FlightMeter:
 
     @property
     def used_mah(self) -> float:
-        """Charge that the board has drawn from the pack so far, mAh."""
+        """Charge that the board has drawn from the battery pack so far, mAh."""
         return self.totals()["used_mah"]
 
     @contextmanager
     def reading_frame(self, is_live: bool) -> Iterator[Stage]:
-        """Meter the reading of a frame. Of a live source that is mostly waiting for the next frame, and
-        no work."""
+        """Measure the reading of a frame. For a live source this is mostly waiting and does not count as work."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as reading:
             yield reading
         if not is_live:
@@ -73,30 +74,29 @@ class FlightMeter:
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Meter the loop's work on a frame, by the CPU time of its own thread."""
+        """Measure the loop's work on a frame, by the CPU time of its own thread."""
         with stage(self._clock.mono_s, self._clock.thread_cpu_s) as work:
             yield
         self._load.busy(work.cost)
 
     @contextmanager
     def telling(self) -> Iterator[None]:
-        """Meter the telling of others of an event."""
+        """Measure the reporting of an event to the autopilot and the observers."""
         with stage(self._clock.mono_s, self._clock.process_cpu_s) as told:
             yield
         self._energy.add(told.cost)
 
     def count(self, event: Recognition) -> None:
-        """Count what a frame took: reading, encoding and matching."""
+        """Add the cost of a frame: reading, encoding and matching."""
         self._energy.add(event.steps.read, event.cost.whole)
         self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
-        """Return the totals until now.
-
-        `used_mah` is the charge that the board has drawn from the pack, idle all the time and busy with this process
-        (other programs are not counted). `process_mah` is the part that the process added, and `marginal_mah` the part
-        of it that the stages of its queries added; `process_cpu_s` and `stages_cpu_s` are the CPU-seconds of both.
-        `elapsed_s` is the time, and `queries_throttled` a count.
+        """Return the totals since the start:
+        - `used_mah`: charge drawn from the pack by the idle board and by this process (other programs are not counted)
+        - `process_mah`: the part of it that this process added; `process_cpu_s`: its CPU-seconds
+        - `marginal_mah`: the part of that which the stages of queries added; `stages_cpu_s`: their CPU-seconds
+        - `elapsed_s`: time since the start; `queries_throttled`: a count.
         """
         so_far, board = self._energy.so_far(), self._board
         process = StageCost(so_far.elapsed_s, so_far.process_cpu_s)
@@ -112,20 +112,20 @@ class FlightMeter:
         }
 
     def look_at_heat(self) -> None:
-        """Look at the sensors, once a second or so."""
+        """Measure the heat of the board. Call it about once a second."""
         self.thermal = ThermalState(*self._tape.read("heat", lambda: astuple(self._watch.look())))
 
     def machine_load(self) -> MachineLoad:
-        """Return the load of the machine since the last look at it, once a second."""
+        """Return the load of the whole machine since the last call. Call it once a second."""
         core_shares, *ram_bytes = self._tape.read("load", lambda: astuple(machine_load()))
         return MachineLoad(tuple(core_shares), *ram_bytes)
 
     def rss_mb(self) -> float:
-        """Return the memory of this process, MB."""
+        """Return the memory that this process takes, MB."""
         return self._tape.read("rss_mb", rss_mb)
 
     def reading(self) -> LoadReading:
-        """Return the governor's reading: the load since the last one, and the present memory and heat."""
+        """Return a measurement for the governor: the load since the last one, and the present memory and heat."""
         cpu_share, late_share = self._load.look()
         return LoadReading(
             cpu_share=cpu_share,
@@ -140,7 +140,7 @@ class FlightMeter:
 
 
 def meter_of_queries(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> QueryMeter:
-    """Make the meter of the queries of a flight."""
+    """Make the meter of the cost of single queries in a flight."""
     memory = OwnMemory()
     return QueryMeter(
         board,
