@@ -1,16 +1,18 @@
-"""Evidence of a match: the figures from which its confidence is made (see `confidence`), and the calibration of a map.
+"""Evidence of a match: the figures that its confidence is computed from (see `confidence`), and map calibration.
 
-There are three kinds, since a camera that looks ahead sees other things than one that looks straight down, and not
-every map has landmarks. All figures are larger the more they speak for the match, but for `rank_gap`.
+There are three kinds: for a camera that looks ahead (AHEAD), and for one that looks straight down, with landmarks
+(DOWN) or without (DOWN_BARE). A place *elsewhere* is farther than `neighbour_m` from the best place. Regions *agree* if
+they show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
 
-* agree: log of the share of regions that agree on a step; ahead, of the geometric mean of both ways
-* lead: how far that is above the best place elsewhere
-* lead_around: the same, of the mean of a place with the one before and the one after it (ahead)
+* agree: log of the share of regions that agree; ahead, of its geometric mean over query and place
+* lead: `agree` minus that of the best place elsewhere
+* lead_around: the same of the score, averaged over a place, the one before and the one after it (ahead)
 * coverage: log of the share of the place's regions that agree, each counted once
-* mutual, mutual_best: log of the share of regions that find each other, and whether no place elsewhere has more (ahead)
-* rank_gap: how much better the regions of another place rank at its step (ahead)
-* back, likeness: see `Support` (ahead)
-* landmarks: log of one more than the landmarks that agree as expected (down)
+* mutual: log of the share of regions that are each other's most similar (ahead)
+* mutual_best: 1 if no place elsewhere has more of them, else 0 (ahead)
+* rank_gap: mean log rank of the regions (see `Support`) minus the least of all places compared (ahead)
+* back, likeness: log of `Support.back`, and `Support.likeness` (ahead)
+* landmarks: log of one more than the number of landmarks that agree as expected (down)
 """
 
 import json
@@ -33,15 +35,15 @@ from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
 _LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}
-# What tells whether a query shows ground of the map, and which of its places it shows.
+# Names of the evidence that tells whether a query shows ground of the map, and which of its places.
 OF_MAP = {AHEAD: ("mutual", "coverage", "back", "likeness"), **_LOOKING_DOWN}
 OF_PLACE = {AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"), **_LOOKING_DOWN}
-WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, for want of its spec (see `kinds_of`)
-_LEAST = 1e-3  # of a share whose logarithm is taken
-_BY_CHANCE = 0.07  # a share that pictures of foreign ground reach, where there is no place elsewhere to compare with
-_BESIDE = 0.5  # weight of either neighbour
-FEWEST_PLACES = 30  # with fewer the shipped model is used as it is
-_HARDLY = 0.5  # mean confidence of a place that is hardly recognisable
+WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, where its spec is not at hand (see `kinds_of`)
+_LEAST = 1e-3  # least share, so that its logarithm exists
+_BY_CHANCE = 0.07  # share that pictures of foreign ground reach; stands for a place elsewhere if there is none
+_BESIDE = 0.5  # weight of each neighbour in the index
+FEWEST_PLACES = 30  # a map with fewer is not calibrated
+_HARDLY = 0.5  # mean confidence below which a place is hardly recognisable
 _CHECKSUM_DIGITS = 8
 
 _log = logging.getLogger(__name__)
@@ -49,10 +51,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCalibration:
-    """Calibration of a map, from `asked` changed pictures of its own places. `models` are those of its kinds of
-    evidence. Of the pictures the share `accepted` is accepted at the precision that was asked for then, and
-    `accepted_wrong` of all accepted matches are wrong, those of places that were left out among them. `recognisable`
-    is the mean confidence of the right matches of a place, 0..1 by its number, of the places that were asked for."""
+    """Calibration of a map, from `asked` altered pictures of its own places. `models` maps kinds of evidence to models,
+    and `made` is the date. At the `precision` asked for then, the share `accepted` of the pictures is accepted.
+    `accepted_wrong` of the accepted matches are wrong, among them those of places that were left out of the map for the
+    test. `recognisable` maps the number of each place tested to the mean confidence (0..1) of its right matches."""
 
     models: Mapping[str, Model]
     made: str
@@ -64,16 +66,16 @@ class MapCalibration:
 
     @property
     def hardly_recognisable(self) -> float:
-        """Share of the places asked for that are hardly recognisable."""
+        """Share of the tested places that are hardly recognisable."""
         return sum(each < _HARDLY for each in self.recognisable.values()) / max(len(self.recognisable), 1)
 
     @property
     def looks_alike(self) -> bool:
-        """True where most of the map looks alike."""
+        """True if more than half of the tested places are hardly recognisable."""
         return self.hardly_recognisable > 0.5
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures for programs."""
+        """Return the figures as a dict for JSON."""
         return {
             "made": self.made,
             "made_of": [model.made_of for model in self.models.values()],
@@ -87,7 +89,7 @@ class MapCalibration:
         }
 
     def described(self) -> str:
-        """Say in words what to expect of the map."""
+        """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
         wrong = {0: "no wrong match was", 1: "1 wrong match was"}.get(
             self.accepted_wrong, f"{self.accepted_wrong} wrong matches were"
         )
@@ -100,22 +102,22 @@ class MapCalibration:
 
 
 def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
-    """Return the kinds of evidence that a technique gives; none for one that is judged by its limits."""
+    """Return the kinds of evidence that a technique gives; an empty tuple if its matches are judged by fixed limits."""
     if spec.cells is not None:
         return DOWN, DOWN_BARE
     return (AHEAD,) if spec.scan_counts else ()
 
 
 def kind_of(evidence: Evidence) -> str:
-    """Return the kind of some evidence."""
+    """Return the kind of this evidence."""
     if "likeness" in evidence:
         return AHEAD
     return DOWN if "landmarks" in evidence else DOWN_BARE
 
 
 def require_usable(kind: str, model: Model) -> None:
-    """Raise ValueError for a model of a kind, or with evidence, that there is not (it comes from another edgevpr), and
-    ValueError or ArithmeticError for figures that make no sense."""
+    """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
+    edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
     if kind not in OF_MAP:
         raise ValueError(f"there is no evidence of kind {kind!r:.40}")
     for name in (*model.of_map.names, *model.of_place.names):
@@ -139,10 +141,11 @@ def described(evidence: Evidence) -> str:
 def evidence_of(
     ranking: Ranking, index: PlaceIndex, neighbour_m: float, proof: Agreement | None, same: Collection[int], down: bool
 ) -> dict[str, float] | None:
-    """Return the evidence of the best place of a ranking; None where there is none.
+    """Return the evidence for the best place of a ranking; None if no place was compared or, ahead, a match has no
+    `support`.
 
-    `down` tells whether the camera looks straight down. Then `proof` is how the landmarks of the place agree (None:
-    nothing is known of them), and the places numbered `same` show the same ground, and are not elsewhere.
+    `down` tells whether the camera looks straight down. If so, `proof` is the agreement of the landmarks (None: not
+    compared), and the places with the numbers `same` show the same ground as the best one, so they are not elsewhere.
     """
     matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
     if not matches or (not down and any(match.support is None for match in matches.values())):
@@ -154,7 +157,7 @@ def evidence_of(
 
 
 def votes_of(match: FineMatch) -> float:
-    """Return the share of regions that agree on a step: ahead, the geometric mean of both ways."""
+    """Return the share of regions that agree on a shift: ahead, its geometric mean over query and place."""
     return match.score if match.support is None else math.sqrt(match.score * match.support.back)
 
 
@@ -191,7 +194,7 @@ def _evidence_down(
 
 
 def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
-    """Return the calibration of a map; None where it has none, and, with a warning, where it cannot be used."""
+    """Return the calibration of a map; None if it has none, or, after a warning in the log, if it is unusable."""
     try:
         text = place_map.calibration
         if text is None:
@@ -210,20 +213,20 @@ def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
 
 
 def not_calibrated(places: int) -> str:
-    """Say of a map with so many places that it is not calibrated, and why."""
+    """Return a sentence for a map with so many places: it is not calibrated, and why."""
     if places < FEWEST_PLACES:
         return f"not calibrated ({places} places: fewer than {FEWEST_PLACES}): the shipped confidence is used"
     return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` makes its own of its pictures"
 
 
 def calibration_text(calibration: MapCalibration) -> str:
-    """Write a calibration as `read_calibration` reads it: JSON, after the CRC-32 of it."""
+    """Write a calibration as text for `read_calibration`: the CRC-32 of the JSON that follows, then the JSON."""
     body = json.dumps(asdict(calibration))
     return _checksum(body) + body
 
 
 def read_calibration(text: str) -> MapCalibration:
-    """Read the text of a map. Raises ValueError for one that is damaged or makes no sense."""
+    """Read a calibration from the text in a map. Raises ValueError if it is damaged or invalid."""
     checksum, body = text[:_CHECKSUM_DIGITS], text[_CHECKSUM_DIGITS:]
     if checksum != _checksum(body):
         raise ValueError("its checksum is wrong")
@@ -248,12 +251,13 @@ def read_calibration(text: str) -> MapCalibration:
 
 
 def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:
+    """Return the log ratio of the share of the best place to the largest share `away` (elsewhere)."""
     return _log_share(share[best]) - _log_share(max((share[slot] for slot in away), default=_BY_CHANCE))
 
 
 def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
-    """Return the weighted mean of each place with the one before and the one after it in the index. One that was not
-    compared counts as the least of those that were."""
+    """Return the weighted mean of each place's share with those of the place before and after it in the index. A place
+    that was not compared counts with the least share of all."""
     least = min(share.values())
     return {
         slot: (own + _BESIDE * (share.get(slot - 1, least) + share.get(slot + 1, least))) / (1 + 2 * _BESIDE)

@@ -1,7 +1,7 @@
-"""Following a flight from query to query: what one query says of itself is handed to a belief (see `belief`).
+"""Follows a flight from query to query: turns the result of each query into proposals for a belief (see `belief`).
 
-The best place of a query has its confidence. What is left of the probability that it shows ground of the map at all is
-spread over the other places it was compared with.
+A *look* is one search of the map for one query. Its best place has a confidence. The rest of the probability that the
+query shows ground of the map at all is spread over the other places compared. The recogniser uses `Follower`.
 """
 
 import copy
@@ -25,19 +25,19 @@ from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
-_SHARPNESS = 10.0  # of two places, how much more likely is the one with more votes: the power of the ratio
-_OTHERS = 0.7  # of what the best place leaves: so often the right one is among the others
-_PROPOSED = 20  # places of one query
+_SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
+_OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
+_PROPOSED = 20  # most places that one query proposes
 _NEAR_PLACES, _NEAR_FOOTPRINT, _HALF = 3.0, 0.25, 0.5
-_PLACES_A_QUERY = 3.0  # at most, where nothing is known of the time or of the ground
+_PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
 _FASTEST_M_S = 30.0  # unless the configuration says another speed
 _LEAST_SPACING_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class FollowedPosition:
-    """Position of the aircraft by the flight so far, with `covariance_m2` (variance east, covariance, variance north),
-    and the heading of the top of its pictures (None: unknown)."""
+    """Position of the aircraft by the flight so far, with `covariance_m2` (variance east, covariance, variance north)
+    in square metres, and the heading of the top of its pictures, degrees (None: unknown)."""
 
     position: Position
     covariance_m2: Covariance
@@ -45,15 +45,16 @@ class FollowedPosition:
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of one axis."""
+        """Standard deviation along one axis, metres."""
         return math.sqrt((self.covariance_m2[0] + self.covariance_m2[2]) / 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Followed:
-    """Outcome of a query with the flight so far: the `slot` of the place that is likeliest now, and the probability
-    `confidence` that the aircraft is there (0 and None without any). `lost` is the probability that it is nowhere the
-    flight knows of, and `mass` that of the `estimate` (None: there is none, or the map has no positions)."""
+    """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
+    (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
+    at no position of the belief, and `mass` the probability of `estimate` (None: unknown, or the map has no
+    positions)."""
 
     slot: int | None
     confidence: float
@@ -62,13 +63,14 @@ class Followed:
     estimate: FollowedPosition | None
 
     def leads_from(self, slot: int) -> bool:
-        """Tell whether another place than this one is more likely than not."""
+        """Return True if a place other than `slot` is more likely than not."""
         return self.slot is not None and self.slot != slot and self.confidence > _HALF
 
 
 class _Survey:
-    """The ground of a map as it is when it has so many `places`: its `scale`, the `origin` of positions on it (None:
-    they are numbers of places, in order), and the standard deviation of a place without a pose."""
+    """Distances and origin of a map, measured when it has this number of `places`: its `scale`, the `origin` of
+    positions in its plane (None: the map has no positions; numbers of places are used), and `spread`, the standard
+    deviation of the position of a place without a pose."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
@@ -86,13 +88,13 @@ class _Survey:
             )
 
     def is_outdated(self, index: PlaceIndex) -> bool:
-        """Tell whether to measure again: the places have got positions, or have become twice as many. The first few
-        places say little of how far apart the others are."""
+        """Return True if the map must be measured again: most places have got positions since, or there are twice as
+        many. The first few places do not show how far apart the others are."""
         is_measured = self.origin is not None and len(index) < 2 * self.places
         return not is_measured and bool((~np.isnan(index.lat_deg)).mean() > _HALF)
 
     def positions(self, slots: Ints, index: PlaceIndex) -> Doubles:
-        """Return where places are, as the belief has it: float (K, 2), NaN where unknown."""
+        """Return the positions of places in the plane of the belief: float (K, 2), NaN if unknown."""
         if self.origin is None:
             return np.stack([index.place_ids[slots].astype(float), np.zeros(len(slots))], 1)
         lat_deg, lon_deg = index.lat_deg[slots], index.lon_deg[slots]
@@ -100,19 +102,19 @@ class _Survey:
 
 
 class Follower:
-    """Follows one flight over one map: `went_on` for each frame, then `heard` for each look of it, and `settle` keeps
-    what the last look has led to.
+    """Follows one flight over one map. Call `went_on` for each frame, then `heard` for each look for it, then `settle`
+    to keep the belief of the last look.
 
-    `fastest_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for frames of a recording,
-    whose times are those of their own clock.
+    `fastest_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for recorded frames, whose
+    times are those of the recording.
     """
 
     def __init__(self, place_map: PlaceMap, *, fastest_m_s: float | None, is_live: bool) -> None:
         self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
         self._survey: _Survey | None = None  # of the map, once it has a place
         self._belief: Belief | None = None
-        self._next: Belief | None = None  # that nobody has settled yet
-        self._arrived: tuple[Doubles, float] | None = None  # where the newest ground began, and how sure that was
+        self._next: Belief | None = None  # the belief after the last look, until `settle`
+        self._arrived: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
         self._arriving: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_settled_s: float | None = None
@@ -120,8 +122,7 @@ class Follower:
         self._velocity_m_s: tuple[float, float] | None = None
 
     def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
-        """Take note of the time that has passed since the last look that was kept, and of the velocity of the aircraft,
-        if they are known."""
+        """Note the time since the last settled look, and the velocity of the aircraft, if they are known."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_settled_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
@@ -131,8 +132,9 @@ class Follower:
     def heard(
         self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: Sureness, where: Located | None
     ) -> Followed:
-        """Return what becomes of the belief with the places of a look, of which the best has this `evidence` and says
-        that the aircraft is at `where` (None: at the place)."""
+        """Return the result of one look together with the flight so far; nothing is kept before `settle`. `evidence` is
+        that of the best place of the `ranking`, which `sure` turns into probabilities. `where` is the position of the
+        aircraft computed from it (None: that of the place is taken)."""
         if self._survey is None or self._belief is None or self._survey.is_outdated(index):
             self._survey = _Survey(self._map, index)
             self._belief = Belief(self._survey.scale)
@@ -148,7 +150,7 @@ class Follower:
             confidence = float(posterior.p[is_near].sum())
             off = np.hypot(*(posterior.estimate.at - at)) if posterior.estimate else np.inf
             if confidence > _HALF and off <= near:
-                confidence = max(confidence, posterior.mass)  # with what the look does not see, and knows to be here
+                confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this look
             confidence = self._not_by_repetition(at, confidence, float(proposed.p[is_near].sum()))
         return Followed(
             slot=slot,
@@ -159,14 +161,14 @@ class Follower:
         )
 
     def saw_nothing(self, index: PlaceIndex) -> None:
-        """Take note of a picture that says nothing: nobody knows whether it shows ground of the map."""
+        """Note a picture that shows too little: it does not tell whether the aircraft is over the map."""
         if self._survey and self._belief:
             self._next = copy.copy(self._belief)
             self._next.update(None, self._moved(self._survey), len(index))
             self.settle()
 
     def settle(self) -> None:
-        """Believe what the last look has led to; nothing changes where nothing was heard."""
+        """Keep the belief of the last look; without a look since the last call the belief stays as it is."""
         self._belief, self._next = self._next or self._belief, None
         self._arrived, self._t_settled_s = self._arriving, self._t_now_s
 
@@ -176,8 +178,8 @@ class Follower:
         return moved(self._elapsed_s, 1.0, self._fastest_m_s, self._velocity_m_s)
 
     def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Return a confidence that does not rise while the pictures show the same ground: it is that of the first one
-        there, or that of the newest look by itself."""
+        """Limit a confidence while the pictures show the same ground: it is at most that of the first picture there, or
+        that of this look alone (`by_itself`), whichever is higher."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence
@@ -197,7 +199,7 @@ def _on_earth(estimate: PlaneEstimate | None, origin: Position | None) -> Follow
 def _proposals(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Return the slots of the places that a look proposes, int (K,), and what it says of them."""
+    """Turn a ranking into proposals. Returns the slots of the places proposed, int (K,), and the proposals."""
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
     covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))
@@ -211,13 +213,13 @@ def _proposals(
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
     votes = np.array([votes_of(ranking.compared[slot]) for slot in slots.tolist()])
     near = np.hypot(*(at - at[0]).T) <= survey.scale.near
-    near[0] = True  # also where nobody knows its position
+    near[0] = True  # even if its position is unknown
     confidence = sure.confidence(evidence)
     left = max(0.0, sure.of_map(evidence) - confidence)
     p = np.zeros(len(slots))
     p[near & ~same] = confidence * _shares(votes[near & ~same])
     p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
-    # What speaks for a place without position speaks for no other.
+    # The probability of a place without a position is given to no other place.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(
         p=p[is_placed], at=at[is_placed], covariance=covariance[is_placed], heading_deg=heading_deg[is_placed]
@@ -225,7 +227,7 @@ def _proposals(
 
 
 def _shares(votes: Doubles) -> Doubles:
-    """Return how probability is shared between places with these votes."""
+    """Return the shares (K,) of probability of places with these votes (K,)."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS
