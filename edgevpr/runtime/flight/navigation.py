@@ -1,4 +1,5 @@
-"""The position of the aircraft at any moment, by its path and the filter of the path's errors."""
+"""The position of the aircraft at any moment, from its path (see `path`) and the filter of the path's errors (see
+`filter`). `navigator` uses it."""
 
 import math
 from dataclasses import dataclass
@@ -14,18 +15,18 @@ from edgevpr.runtime.recognise.locate import matrix_of
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _GPS_EVERY_S = 1.0
-_GPS_NEW_S = 0.7  # reports come five times a second; when they stay away, the autopilot has begun to reckon
-# The errors of GPS are alike from one second to the next: a position is heard as one of twice its deviation.
+_GPS_NEW_S = 0.7  # positions of a receiver come five times a second; without new ones the autopilot dead-reckons
+# Errors of GPS are correlated from one second to the next, so its standard deviation is multiplied by this.
 _GPS_ALIKE = 2.0
 _GPS_VELOCITY_SD = 0.3  # m/s
 _UNKNOWN_M = 1e4
-_ANY_M_S = 10.0  # of an aircraft of which only a fix is known
+_ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Whereabouts:
-    """Position and velocity (m/s, east and north) of the aircraft at `t_s`, with standard deviations of one axis along
-    the worst direction."""
+    """Position and velocity (m/s, east and north) of the aircraft at `t_s`. The accuracies are standard deviations
+    along the worst direction."""
 
     t_s: float
     position: Position
@@ -36,8 +37,9 @@ class Whereabouts:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedFix:
-    """A fix as the navigation expects it: metres (2,) beside the path, with their covariance (2, 2), without that of
-    the fix; the point of the path, metres (2,); and by how many metres (2,) the fix itself lies beside that."""
+    """Prediction of a fix, and the fix itself, in metres east and north. `off_m` (2,): predicted offset from the path;
+    `covariance_m2` (2, 2): that of the prediction, without that of the fix; `path_m` (2,): point of the path when the
+    frame was taken; `beside_m` (2,): offset of the fix from that point."""
 
     off_m: Doubles
     covariance_m2: Doubles
@@ -46,9 +48,9 @@ class ExpectedFix:
 
 
 class Navigation:
-    """The position by the autopilot's motion and our fixes. `drift` says how the path is made: of the autopilot's
-    velocity (`RECKONED`) or of accelerations (`INERTIAL`). `map_sd_m` is the standard deviation of one axis of what all
-    fixes have in common. `has_gps`: at the last report, the autopilot's position was one by GPS."""
+    """Position from the autopilot's motion and our fixes. `drift` says what the path is summed up from: the autopilot's
+    velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard deviation, of one axis, of the
+    error that all fixes share. `has_gps`: at its last report, the autopilot had a GPS that is believed."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -58,17 +60,17 @@ class Navigation:
 
     @property
     def fixed_s(self) -> float:
-        """Time of the last fix, or of the last position by GPS; -inf where there was none."""
+        """Time of the last fix or the last GPS position, whichever is later; -inf if there was none."""
         return max(self._fixed_s, self._gps_s)
 
     def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
-        """Take in a report of the autopilot; one without velocity says nothing. `believes_gps`: where it has GPS, its
-        position is heard too."""
+        """Process a report of the autopilot: its velocity continues a path of velocities and, if it has GPS and
+        `believes_gps`, its position and velocity correct ours. A report without velocity is ignored."""
         if vehicle.velocity_m_s is None:
             return
         had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
         if self._drift is RECKONED and vehicle.position_sd_m is None:
-            self._path = None  # it does not know its position any more, and its velocity least of all
+            self._path = None  # it has lost its position, so its velocity is even less reliable
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
         path = self._unbroken
@@ -91,13 +93,13 @@ class Navigation:
             self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
 
     def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
-        """Take in a mean acceleration (2,) over the ground since the last one."""
+        """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
     def expected(self, position: Position, t_s: float) -> ExpectedFix | None:
-        """Return what was expected of a fix at a position, of a frame taken at `t_s`; None where nothing is known of
-        that time."""
+        """Predict the fix of a frame taken at `t_s`, and compare it with the fix at `position`; None if the path at
+        that time is not known."""
         path = self._unbroken
         there = path.at(t_s) if path else None
         if path is None or there is None:
@@ -107,23 +109,23 @@ class Navigation:
         return ExpectedFix(off_m, covariance_m2, there.at_m, beside_m)
 
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, t_s: float, is_against: bool = False) -> None:
-        """Take in a fix that lies `off_m` (2,) beside the path, of a frame taken at `t_s`, with its covariance (2, 2).
-        `is_against`: it contradicts what was believed, and is believed all the same."""
+        """Correct our position by a fix of a frame taken at `t_s` that lies `off_m` (2,) beside the path, with its
+        covariance (2, 2). `is_against`: it contradicts the expected position, and is believed all the same."""
         if self._path:
             hear = self._filter.trust_fix if is_against else self._filter.hear_fix
             hear(off_m, covariance_m2, self._path.now.t_s - t_s)
             self._fixed_s = max(self._fixed_s, t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
-        """Begin with a fix of a frame taken at `t_s`, where nothing was known of the position before, nor of how fast
-        the aircraft is."""
+        """Begin the path at a fix of a frame taken at `t_s`, when neither position nor velocity is known. Does nothing
+        for a path of velocities (`RECKONED`), which begins with a report of the autopilot."""
         if self._drift is INERTIAL:
             sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
             self._fixed_s = t_s
 
     def at(self, t_s: float) -> Whereabouts | None:
-        """Return where the aircraft is, or was, at a time; None where that is not known."""
+        """Return where the aircraft is, or was, at `t_s`; None if that is not known."""
         path = self._unbroken
         there = path.at(t_s) if path else None
         if path is None or there is None:
@@ -140,8 +142,8 @@ class Navigation:
         )
 
     def path_drift_m_s(self) -> tuple[float, float]:
-        """Return how fast the aircraft leaves its path, east and north: for an autopilot that reckons, how fast its
-        error grows."""
+        """Return the velocity (east, north) of the aircraft minus that of its path. For an autopilot that dead-reckons,
+        this is how fast its position error grows."""
         _, off_m_s, _ = self._filter.errors(0.0)
         return float(off_m_s[0]), float(off_m_s[1])
 
@@ -157,7 +159,7 @@ class Navigation:
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:
-    """Tell whether a reported position is one by GPS: has a receiver, near it, a position that is still new."""
+    """Tell whether a reported position rests on GPS: a receiver has a fix near it that is still new."""
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
 
 
@@ -168,8 +170,9 @@ def worst_sd(covariance: Doubles) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionedMatch:
-    """An accepted match with a position: the time of its frame, where the aircraft was, the accuracy to claim, the
-    covariance (2, 2) without what all fixes of the map have in common, and the places that say so."""
+    """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
+    to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
+    from."""
 
     t_s: float
     position: Position
@@ -179,7 +182,7 @@ class PositionedMatch:
 
 
 def positioned(event: Recognition) -> PositionedMatch | None:
-    """Return the sighting of an event, None where no match with a position was accepted."""
+    """Return the positioned match of an event; None if no match with a position was accepted."""
     if event.frame is None or event.best is None or event.located is None or event.accuracy_m is None:
         return None
     return PositionedMatch(

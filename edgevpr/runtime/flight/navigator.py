@@ -1,8 +1,7 @@
-"""Navigation in flight: hears the vehicle's motion from the link and the matches from the loop, and says what is worth
-being sent.
-
-The link calls in its own thread, the loop in the main one.
-"""
+"""Navigation in flight: takes the vehicle's motion from the link and the matches from the loop, and decides which
+position is sent to the autopilot. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a
+second, otherwise single fixes. The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the
+main one."""
 
 import math
 from dataclasses import dataclass
@@ -23,28 +22,28 @@ from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch, Where
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# What comes on top of what a fix knows of itself: the attitude is known to half a degree, and the time of a frame to
-# some hundredths of a second.
+# Standard deviations that are added to that of a fix: the attitude is known to half a degree, and the time of a frame
+# to some hundredths of a second.
 _ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
-_UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # where the autopilot tells none: an aircraft that turns banks
-_LOST_M, _LOST_S = 50.0, 60.0  # a continuous position that is worse, or without a fix for longer, is none
+_UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
+_LOST_M, _LOST_S = 50.0, 60.0  # a continuous position is sent up to this error, and so long after a fix
 _ALT_SD_M = 3.0
-# An autopilot takes the ten positions of a second for independent ones. Their errors are alike for about five seconds,
-# so each says as little as one of fifty that were independent. Without this it trusted them more than its own gyros:
+# An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
+# fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE = math.sqrt(50)
-_FASTEST_M_S = 2.0  # of a correction: ArduPilot did not follow a jump of 25 m for 8 s
+_FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
-# ArduPilot refuses a fix then, and PX4 takes it with a gain that makes its velocity jump.
+# With GPS, ArduPilot refuses a fix, and PX4 takes it with a gain that makes its velocity jump.
 _HAS_GPS = "not needed: the autopilot has GPS"
 _HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
 
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Advice on an accepted match: the `fix` that is to be sent, or the reason `why` there is none. `is_held`: it
-    contradicts what is known."""
+    """Advice on an accepted match: the `fix` to be sent or, if it is None, the reason `why` not. `is_held`: it is held
+    back, since it contradicts the expected position."""
 
     fix: Fix | None
     why: str | None = None
@@ -52,8 +51,8 @@ class Advice:
 
 
 class Navigator:
-    """Navigates by one autopilot. `map_sd_m` is by how much all fixes may be off together, `every_s` the time between
-    two queries. In a dry run it `is_muted`, and gives no continuous position."""
+    """Navigates for one autopilot. `map_sd_m` is the standard deviation of the error that all fixes share, `every_s`
+    the time between two queries. `is_muted`, in a dry run: no continuous position is given."""
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False) -> None:
         self._is_muted = is_muted
@@ -69,42 +68,41 @@ class Navigator:
 
     @property
     def has_gps(self) -> bool:
-        """True where the autopilot's position is one by GPS that can be believed."""
+        """True if the autopilot's position rests on a GPS that is believed."""
         return self._navigation.has_gps
 
     def believe_gps(self, believes: bool) -> None:
-        """Navigate by GPS, or no longer."""
+        """Set whether GPS is used for navigation."""
         self._believes_gps = believes
 
     def hear_channel(self, channel: Channel) -> None:
-        """Take in by which channel the autopilot is told positions: a continuous position must not rest on the velocity
-        that the autopilot has from it, and is carried on by accelerations."""
+        """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
+        positions, and we must not use it: the path is then summed up from accelerations."""
         with self._lock:
             if channel.is_continuous != self._channel.is_continuous:
                 self._navigation = Navigation(INERTIAL if channel.is_continuous else RECKONED, self._map_sd_m)
             self._channel = channel
 
     def hear_autopilot(self, t_s: float) -> None:
-        """Take in that there is an autopilot, or another one than before."""
+        """Note at `t_s` that an autopilot has appeared, or another one than before."""
         with self._lock:
             self._appeared_s, self._vehicle = t_s, None
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
-        """Take in a report of position and velocity."""
+        """Process a report of position and velocity."""
         with self._lock:
             self._vehicle = vehicle
             self._navigation.hear_vehicle(vehicle, self._believes_gps)
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Take in what the accelerometers feel."""
+        """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
         acceleration_m_s2 = over_ground(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
         with self._lock:
             self._attitude = attitude
             self._navigation.hear_acceleration(t_s, acceleration_m_s2)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
-        """Take in an accepted match with a position, and say what is to be sent for it. Raises ValueError for a
-        position off the Earth."""
+        """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""
         seen = positioned(event)
         if seen is None:
             return Advice(None, "the place has no position")
@@ -137,19 +135,19 @@ class Navigator:
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
 
     def knows_position(self, now_s: float) -> bool:
-        """Tell whether the position is known well enough to be sent as a continuous one."""
+        """Tell whether the position is known well enough to be sent through a continuous channel."""
         with self._lock:
             return self._known(now_s) is not None
 
     def accuracy_m(self, now_s: float) -> float | None:
-        """Return how well the position is known, the standard deviation of one axis; None: it is not known."""
+        """Return how well the position is known: metres, standard deviation of one axis (None: it is not known)."""
         with self._lock:
             estimate = self._navigation.at(now_s)
             return None if estimate is None else self._claimed_m(estimate)
 
     def state_at(self, t_s: float) -> MotionState | None:
-        """Return where the vehicle is or was, later than at the last call, to be sent as a continuous position; None:
-        that is not known well enough."""
+        """Return position and motion at `t_s`, to be sent through a continuous channel; None if they are not known well
+        enough. `t_s` must be later than in the last call."""
         if self._is_muted:
             return None
         with self._lock:
@@ -173,8 +171,8 @@ class Navigator:
             )
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
-        """Say what is to be sent to an autopilot that reports no position: it may have none, and need ours; or its
-        report is on its way, and it has GPS."""
+        """Advise on a fix for an autopilot that has lately reported no position. It may have none and need ours, or its
+        report, with GPS, is still to come: the fix is sent after a few seconds without a report."""
         if self._channel.is_continuous:
             return Advice(None, _UNHEARD)
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
@@ -187,7 +185,7 @@ class Navigator:
         return estimate
 
     def _improved(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
-        """Say what is to be sent so that the autopilot is better off, if it can be."""
+        """Advise what to send to an autopilot with a position of its own: only what makes that better."""
         if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
@@ -196,44 +194,44 @@ class Navigator:
         if estimate is None:
             return Advice(None, _UNHEARD)
         here, claimed_m = estimate.position, self._claimed_m(estimate)
-        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives its position up where none comes for some seconds
+        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives up its position after some seconds without one
             return Advice(Fix(here.lat_deg, here.lon_deg, claimed_m, now_s))
         east_m_s, north_m_s = velocity_m_s
         since_s = now_s - vehicle.t_heard_s
         there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
-        # Its mean square error is that of the estimate and this; without this, it is that of the estimate alone.
+        # Mean square errors: of our estimate 2 * accuracy_m**2 (two axes), of the autopilot's position off_m**2 more.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
             return Advice(
                 None,
                 f"not needed: the autopilot is {off_m:.1f} m from where we are, good to {estimate.accuracy_m:.1f} m",
             )
-        # So that the autopilot is right in the middle of the time until the next fix. Now it is off by that, along one
-        # of two axes: of the variance of an axis it is half.
+        # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
+        # is off by this lead, in one direction: half of its square is added to the variance of each axis.
         ahead_m = [self._every_s / 2 * each for each in self._navigation.path_drift_m_s()]
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
 
     def _claimed_m(self, estimate: Whereabouts) -> float:
-        """Return the accuracy that is claimed for an estimate: never better than what all fixes have in common."""
+        """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
         return max(self._map_sd_m, estimate.accuracy_m)
 
 
 class Slew:
-    """A position that never jumps, since autopilots follow no jump: it follows estimates at their own velocity, and
-    catches up with them at 2 m/s at most."""
+    """A position that never jumps, since autopilots do not follow jumps: it moves with the velocity of the estimates,
+    and its error against them shrinks by 2 m/s at most."""
 
     def __init__(self) -> None:
         self._said: Whereabouts | None = None
         self._at = 0.0, 0.0
 
     def forget(self) -> None:
-        """Begin anew with the next estimate."""
+        """Restart at the next estimate."""
         self._said = None
 
     def followed(self, estimate: Whereabouts) -> tuple[float, float, float]:
-        """Return latitude and longitude that follow an estimate, later than the one before, and by how many metres they
-        lie behind it."""
+        """Follow an estimate, later than the last one. Returns latitude, longitude, and the remaining distance to the
+        estimate in metres."""
         here = estimate.position
         if self._said is None:
             self._said, self._at = estimate, (here.lat_deg, here.lon_deg)
@@ -253,7 +251,7 @@ def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
 
 
 def _covariance(seen: PositionedMatch, vehicle: Vehicle) -> Doubles:
-    """Return the covariance (2, 2) of a fix, without what all fixes of the map have in common."""
+    """Return the covariance (2, 2) of a fix, without the error that all fixes share."""
     speed_m_s = math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
     height_m = vehicle.height_m or 0.0
     tilt_sd = _ATTITUDE_SD if vehicle.roll_deg is not None else _UNTOLD_ATTITUDE_SD

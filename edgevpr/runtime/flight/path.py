@@ -1,7 +1,7 @@
-"""The way that an aircraft has flown by its own sensors: velocities, or accelerations, summed up.
+"""The path of an aircraft: its velocities or accelerations, summed up. `navigation` compares it with GPS and fixes.
 
-A path starts where it may and drifts. It never jumps, so it can be compared with fixes over any time; the position that
-an autopilot reports jumps wherever the autopilot is corrected.
+A path starts at a known position and drifts from it. It never jumps, so that offsets from it can be compared at any two
+times; the position that an autopilot reports jumps whenever it is corrected.
 """
 
 import math
@@ -15,12 +15,12 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
 KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
-_LONGEST_STEP_S = 1.0  # after a longer silence nobody knows the way that was flown
+_LONGEST_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A point of a path: time in seconds, metres and m/s, each (2,) east and north."""
+    """A point of a path: time in seconds; metres from its origin, and m/s, each (2,) east and north."""
 
     t_s: float
     at_m: Doubles
@@ -28,8 +28,8 @@ class Point:
 
 
 class Path:
-    """The points of the last seconds of a way that began at `origin`, at a velocity (2,); the last one is `now`.
-    `is_broken` tells that there was a silence in it."""
+    """The points of the last seconds of a path that began at `origin` with a velocity (2,); the last one is `now`.
+    `is_broken`: there was a gap of over a second between two points."""
 
     def __init__(self, origin: Position, t_s: float, velocity_m_s: Doubles) -> None:
         self.origin, self.is_broken = origin, False
@@ -41,12 +41,12 @@ class Path:
         return self._points[-1]
 
     def from_origin(self, lat_deg: float, lon_deg: float) -> Doubles:
-        """Return the metres (2,) from the origin to a place on the Earth."""
+        """Return the metres (2,), east and north, from the origin to a position."""
         return np.array(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg))
 
     def fly(self, t_s: float, velocity_m_s: Doubles) -> float:
-        """Go on to a time at which the velocity (2,) is this one, and return the seconds that it took; 0 for a time
-        that is not later."""
+        """Add a point at `t_s` with this velocity (2,), and return the seconds since the last point. If `t_s` is not
+        later than that, nothing is added, and 0 returned."""
         last = self._points[-1]
         step_s = t_s - last.t_s
         if not step_s > 0:
@@ -55,18 +55,18 @@ class Path:
         velocity_m_s = np.asarray(velocity_m_s, float)
         at_m = last.at_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
         self._points.append(Point(t_s, at_m, velocity_m_s))
-        if self._points[0].t_s < t_s - 2 * KEPT_S:  # seldom: it moves all of them
+        if self._points[0].t_s < t_s - 2 * KEPT_S:  # rarely, since this moves all points
             del self._points[: bisect_left(self._points, t_s - KEPT_S, key=_time)]
         return step_s
 
     def accelerate(self, t_s: float, acceleration_m_s2: Doubles) -> float:
-        """Go on to a time with a mean acceleration (2,) over the ground, and return the seconds that it took."""
+        """Add a point at `t_s`, reached with a mean acceleration (2,) over the ground; return the seconds as `fly`."""
         last = self._points[-1]
         return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
 
     def at(self, t_s: float) -> Point | None:
-        """Return the point at a time; beyond the end the last velocity goes on. None before the first that is kept, and
-        more than a second beyond the last."""
+        """Return the point at `t_s`; after the last point, its velocity is continued. None if `t_s` is before the first
+        point kept or more than a second after the last."""
         if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _LONGEST_STEP_S:
             return None
         after = bisect_left(self._points, t_s, key=_time)
@@ -84,8 +84,8 @@ class Path:
 
 
 def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float) -> Doubles:
-    """Return the acceleration over the ground (2,), east and north, from what accelerometers feel (nose, right, down)
-    at an attitude: gravity has no part in it."""
+    """Return the acceleration over the ground (2,), east and north, from the specific force that accelerometers measure
+    (nose, right, down) at an attitude. Gravity, being vertical, has no part in it."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
     ahead, right, down = force_m_s2
     low = right * math.sin(roll) + down * math.cos(roll)

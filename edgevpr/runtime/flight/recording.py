@@ -1,11 +1,10 @@
-"""The recording of a flight: its tape and its frames, with which it can be flown again on the ground.
+"""The recording of a flight: its tape and its frames, with which `review` can fly it again on the ground.
 
-A folder for each flight: `tape.jsonl`, a line for everything that came in, and `frames/`, the pictures as JPEG. Where
-the flight learns, `map.gpkg` is the map as it was at the start.
+Each flight has a folder: `tape.jsonl`, one line for each input, and `frames/`, the pictures as JPEG. If the flight
+learns, `map.gpkg` is the map as it was at the start.
 
-A thread of its own writes: a slow disk keeps nobody waiting. A recording with a hole in it is worth nothing from there
-on. So it never leaves anything out: where the disk is too slow or full, or the recording too large, it ends, and the
-flight goes on.
+A thread of its own writes, so that a slow disk delays nobody. A recording is of no use after a gap. So nothing is ever
+left out: if the disk is too slow or full, or the recording too large, the recording ends and the flight goes on.
 """
 
 import errno
@@ -27,11 +26,11 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import without_passwords
 
 TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
-SPARED_BYTES = 100_000_000  # of the disk, which are left to logs and map
-WAITING_BYTES = 32_000_000  # of pictures that a slow disk keeps waiting: minutes of a small camera
+SPARED_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
+WAITING_BYTES = 32_000_000  # most bytes of pictures that may wait for a slow disk: minutes of a small camera
 WAITING_NOTES = 100_000
-_WRITE_S = 0.5  # a power cut costs what came since the last writing
-_CLOSE_S = 1.5  # the end of a flight takes two seconds at most
+_WRITE_S = 0.5  # interval of writing: a power cut loses what came since
+_CLOSE_S = 1.5  # longest wait for the thread: the end of a flight takes two seconds at most
 _FOLDER = re.compile(r"flight-(\d{4,})")
 
 T = TypeVar("T")
@@ -39,12 +38,12 @@ _log = logging.getLogger(__name__)
 
 
 class Recording:
-    """An open recording, and its tape. `path` is its folder. `state` says why it has ended, None while it goes on.
-    Close it (it is a context manager)."""
+    """An open recording, which is also the flight's tape. `path` is its folder. `state` is None while it goes on, else
+    a sentence that says why it has ended. Close it (it is a context manager)."""
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
-        """Make the folder of this flight in `folder`. Of the recordings there the oldest are deleted, until half of
-        `max_mb` is free; the new one may take that half. Raises EdgevprError where it cannot be made."""
+        """Make a folder for this flight in `folder`. The oldest recordings there are deleted until they take at most
+        half of `max_mb`; the new one may take the other half. Raises EdgevprError if the folder cannot be made."""
         self.state: str | None = None
         self._most_bytes = 1e6 * max_mb / 2
         self._waiting: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
@@ -71,19 +70,18 @@ class Recording:
         self.close()
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return what `look` finds, and take note of it."""
+        """Return the result of `look`, and record it on the tape under `kind`."""
         found = look()
         self.note(kind, found)
         return found
 
     def note(self, kind: str, *values: Any) -> None:
-        """Take note of what has happened. May be called from any thread and from a handler of signals; it never
-        blocks."""
+        """Record an event on the tape. May be called from any thread and from a signal handler; never blocks."""
         if self.state is None:
             self._waiting.append(without_passwords(json.dumps([kind, *values], default=_encoded)).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
-        """Keep a picture, and return its number."""
+        """Record a picture, and return its number."""
         self._frames += 1
         if self.state is None:
             self._bytes_put += len(jpeg)
@@ -91,7 +89,7 @@ class Recording:
         return self._frames
 
     def keep_map(self, path: Path) -> None:
-        """Keep a copy of the map as it is before the flight. Raises EdgevprError."""
+        """Copy the map, as it is before the flight, into the recording. Raises EdgevprError."""
         try:
             shutil.copyfile(path, self.path / MAP)
         except OSError as error:
@@ -101,7 +99,7 @@ class Recording:
             ) from error
 
     def close(self) -> None:
-        """Write what waits, for a second or so at most, and close the tape."""
+        """Write what still waits, and close the tape. Gives up after 1.5 seconds, with a warning."""
         self._closing.set()
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
@@ -127,7 +125,8 @@ class Recording:
                 self._tape.close()
 
     def _write(self) -> None:
-        """Write all that waits. A frame is on the disk before the tape speaks of it."""
+        """Write all that waits. Frames are on the disk before the lines of the tape that name them. Raises OSError,
+        also if the recording must end."""
         if self._bytes_put - self._bytes_written > WAITING_BYTES or len(self._waiting) > WAITING_NOTES:
             raise OSError(errno.EIO, "the disk is too slow for it")
         notes = []
@@ -165,18 +164,18 @@ class Recording:
 
 
 def _encoded(data: bytes) -> str:
-    """Return bytes as JSON holds them."""
+    """Encode bytes as base64 text for JSON."""
     return b64encode(data).decode()
 
 
 def frame_path(folder: Path, number: int) -> Path:
-    """Return the path of a picture in the folder of a recording."""
+    """Return the path of picture `number` in the folder of a recording."""
     return folder / FRAMES / f"{number:06d}.jpg"
 
 
 def recording_of(said: str | None, log: str | Path) -> Path | None:
-    """Find the recording that a flight's log speaks of: where it was, or in a folder of that name beside the log. None
-    where it is in neither."""
+    """Find the recording that the log file `log` names as `said`: at that path, or in a folder of the same name beside
+    the log. None if it is in neither, or the log names none."""
     if not said:
         return None
     here = Path(said)
@@ -185,7 +184,7 @@ def recording_of(said: str | None, log: str | Path) -> Path | None:
 
 
 def frames_of(folder: Path) -> dict[str, Path]:
-    """Return the frames of a recording by the names that the log gives them."""
+    """Return the picture files of a recording, by the names of the frames in the flight log."""
     found = {}
     with open(folder / TAPE, "rb") as tape:
         for line in tape:
@@ -197,7 +196,7 @@ def frames_of(folder: Path) -> dict[str, Path]:
 
 
 def recordings(folder: Path) -> list[Path]:
-    """List the folders of the recordings in a folder, the oldest first."""
+    """List the folders of the recordings in `folder`, oldest first."""
     numbered = [(int(found[1]), each) for each in folder.iterdir() if (found := _FOLDER.fullmatch(each.name))]
     return [each for _, each in sorted(numbered)]
 
@@ -206,7 +205,7 @@ def _new_folder(folder: Path) -> Path:
     while True:
         last = max((int(each.name.rpartition("-")[2]) for each in recordings(folder)), default=0)
         path = folder / f"flight-{last + 1:04d}"
-        with suppress(FileExistsError):  # another flight that has begun meanwhile has it
+        with suppress(FileExistsError):  # taken by another flight that has just begun
             path.mkdir(mode=0o750)
             return path
 

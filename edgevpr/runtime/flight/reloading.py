@@ -1,5 +1,5 @@
-"""The configuration is read again in flight, when SIGHUP asks for it: what may change in the air is taken, the rest is
-refused by name."""
+"""Reading of the configuration in flight, when SIGHUP asks for it: keys that may change in the air are taken, and all
+others are refused by name. The loop of `flight` uses it."""
 
 import logging
 from collections.abc import Callable
@@ -11,14 +11,15 @@ from edgevpr.core.errors import ConfigError, EdgevprError
 from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.runtime.flight.flightlog import FlightLog
 
-# Neither opens anything anew, nor decides who is told what.
+# Keys that may change in the air: neither opens anything anew, nor decides where data is sent.
 TAKEN = ("match.accept_precision", "source.rate_hz")
 
 _log = logging.getLogger(__name__)
 
 
 class Reread:
-    """Signal handler that asks for the configuration to be read again, by `read`. What is read is on the `tape`."""
+    """Signal handler that notes that the configuration is to be read again, with `read`. What is read is recorded on
+    the `tape`."""
 
     def __init__(self, read: Callable[[], Config], tape: Tape = NO_TAPE) -> None:
         self._read, self._tape, self._asked = read, tape, False
@@ -27,7 +28,7 @@ class Reread:
         self._asked = True
 
     def take(self) -> bool:
-        """Tell once that the configuration is to be read again."""
+        """Return True once after each signal."""
         asked = self._tape.read("reread", lambda: self._asked)
         if asked:
             self._asked = False
@@ -48,8 +49,8 @@ class Reread:
 
 
 def reload(reread: Reread, config: Config, flight_log: FlightLog) -> Config:
-    """Read the configuration again, say what comes of it, and return the one in force: `config` with those keys of the
-    new one that are `TAKEN`. One that cannot be read changes nothing."""
+    """Read the configuration again, and log the result. Returns the configuration now in force: `config` with the new
+    values of the keys in `TAKEN`. If it cannot be read, nothing changes."""
     try:
         new = reread.read()
     except EdgevprError as error:
@@ -76,7 +77,7 @@ def reload(reread: Reread, config: Config, flight_log: FlightLog) -> Config:
 
 
 def _keys(section: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the value of every key by its dotted name."""
+    """Flatten nested sections: return each value by its dotted name."""
     found: dict[str, Any] = {}
     for name, value in section.items():
         found |= _keys(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}

@@ -1,5 +1,5 @@
-"""The status of a flight at one moment, and the file in which people and programs beside it read it: one JSON object,
-replaced as a whole once a second."""
+"""The status of a flight at one moment, and the file in which people and programs beside the flight read it: one JSON
+object, replaced as a whole once a second. `vitals` writes it, the command `status` reads it."""
 
 import json
 import os
@@ -15,14 +15,14 @@ from edgevpr.core.errors import ConfigError, EdgevprError
 from edgevpr.core.text import json_line
 
 NAME = "status.json"
-_MODE = 0o660  # positions are nobody else's, and the group of the flight may look on
+_MODE = 0o660  # positions are private, but the flight's group may read them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenQuery:
-    """A query and the place found for it. `age_s` is the time since its frame was taken. `place`, `reference_image` and
-    `score` are None where no place was found, `confidence` where the technique has none, and the position and its
-    `accuracy_m` where no match with a position was accepted."""
+    """A query and the place found for it. `age_s` is the time since its frame was taken. `place` (its number),
+    `reference_image` and `score` are None if no place was found, and `confidence` if the technique has none. The
+    position and `accuracy_m` are None unless a match with a position was accepted."""
 
     query: str
     age_s: float
@@ -39,10 +39,10 @@ class SeenQuery:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkState:
-    """State of the link to the flight controller. `trouble` is why it is not open, `autopilot` the system id of the one
-    that is heard (each None: there is none), and `channel` how positions are told. `fixes` says in a few words what
-    became of them, and `answers` counts those to them by result. `accuracy_m` is how well the navigation knows the
-    position (one axis, 1 sigma; None: it is not known)."""
+    """State of the link to the flight controller. `trouble`: why it is not open (None: it is). `autopilot`: system id
+    of the autopilot heard (None: none is). `channel`: how positions are sent. `fixes`: counts of fixes in a few words.
+    `answers`: counts of answers to fixes, by result. `accuracy_m`: how well the position is known (one axis, 1 sigma;
+    None: it is not)."""
 
     connected: bool
     trouble: str | None
@@ -58,13 +58,13 @@ class LinkState:
 class Status:
     """Status of a flight.
 
-    `time` is UTC, `elapsed_s` that of the flight. `health` is that of the heartbeats, and `source` says how frames
-    come. `rate_hz` are the queries a second, and `cpu_cores` the cores that this process has kept busy, both over the
-    last ten seconds (None: too early); `asked_rate_hz` is the rate that the flight now tries to keep. `latency_s` is
-    how old the newest picture was when it could be read. `machine_cpu_share` (0..1) and `machine_ram_mb` are those of
-    all programs, of `machine_ram_total_mb`. `throttled`: the board slows itself down (None: it cannot tell). `newest`
-    is the last query, `match` the last that was accepted. `link` is None without one. `remarks` say what else people
-    are to know.
+    `time` is UTC, `elapsed_s` the time since the start. `health` is the state sent in heartbeats, and `source` that of
+    the source of frames. `rate_hz` is the number of queries per second, and `cpu_cores` the number of cores that this
+    process has kept busy, both over the last ten seconds (None: too early); `asked_rate_hz` is the rate that the flight
+    tries to keep. `latency_s` is the age of the newest picture when it could be read (None: unknown).
+    `machine_cpu_share` (0..1) and `machine_ram_mb` (of `machine_ram_total_mb`) are those of all programs. `throttled`:
+    the board slows itself down (None: unknown). `newest` is the last query, `match` the last accepted one, `link` the
+    link (None: there is none). `remarks` are sentences on what else people should know.
     """
 
     version: str
@@ -94,16 +94,16 @@ class Status:
 
     @property
     def summary(self) -> str:
-        """The most important of it in one line."""
+        """The most important values in one line."""
         counts = f"{self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh"
         return "; ".join((self.source, counts, *([self.link.fixes] if self.link else []), *self.remarks))
 
 
 class StatusFile:
-    """Tells the status in a file. Close it (it is a context manager), which removes the file."""
+    """Writes the status to a file. Close it (it is a context manager), which removes the file."""
 
     def __init__(self, path: str | Path) -> None:
-        """Try the folder. Raises EdgevprError where no file can be made in it."""
+        """Try to write in the folder of `path`. Raises EdgevprError if no file can be made there."""
         self._path, self._new = Path(path), Path(f"{path}.new")
         try:
             if self._path.exists() and not stat.S_ISREG(self._path.stat().st_mode):
@@ -124,7 +124,7 @@ class StatusFile:
             self._path.unlink()
 
     def tell(self, status: Status) -> None:
-        """Put a status in place of the one before. Never raises OSError."""
+        """Replace the status in the file. Never raises OSError."""
         with suppress(OSError):
             self._write(json_line(status))
             os.replace(self._new, self._path)
@@ -132,13 +132,13 @@ class StatusFile:
     def _write(self, data: bytes) -> None:
         descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
         with open(descriptor, "wb") as file:
-            os.fchmod(descriptor, _MODE)  # of which the umask has taken away
+            os.fchmod(descriptor, _MODE)  # again, since the umask may have removed bits
             file.write(data)
 
 
 def read_status(path: str | Path) -> tuple[Status, float] | None:
-    """Return the status in a file, and its age in seconds; None where no flight tells one. Raises EdgevprError where
-    the file may not be read, or holds something else."""
+    """Return the status in a file, and its age in seconds; None if there is no such file. Raises EdgevprError if the
+    file may not be read, or holds something else."""
     try:
         with open(path, "rb") as file:
             age_s = time.time() - os.fstat(file.fileno()).st_mtime
@@ -158,6 +158,7 @@ def read_status(path: str | Path) -> tuple[Status, float] | None:
 
 
 def usual_path() -> str | None:
-    """Return the path in the folder that systemd has made for a service, None where it has made none."""
+    """Return the path of the status file in the folder that systemd has made for the service; None if it has made
+    none."""
     folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     return str(Path(folder) / NAME) if folder else None

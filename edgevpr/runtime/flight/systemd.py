@@ -1,4 +1,5 @@
 """Messages to systemd: starting, ready, alive, stopping, and a line of status. Without systemd nothing is sent.
+`flight` and `vitals` use it.
 
 The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket that $NOTIFY_SOCKET names.
 """
@@ -13,9 +14,9 @@ _LONGEST_START_US = 1_800_000_000
 
 
 def notify(**assignments: object) -> bool:
-    """Send the assignments (`READY=1`, `WATCHDOG=1`, `STOPPING=1`, `STATUS="12 places"`); True if they were sent.
+    """Send assignments, such as READY=1, WATCHDOG=1 or STATUS="12 places". Returns True if they were sent.
 
-    Never raises: a flight does not end because nobody listens.
+    Never raises: a flight must not end because nobody listens.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
@@ -35,33 +36,33 @@ def notify(**assignments: object) -> bool:
 
 
 def starting() -> None:
-    """Ask for half an hour to start in: to try a technique, or to load a map, takes minutes on a slow board, and what
-    is broken off begins again at nothing."""
+    """Ask for half an hour to start in: measuring a technique or loading a map takes minutes on a slow board, and if
+    systemd stopped that, it would start again from nothing."""
     notify(EXTEND_TIMEOUT_USEC=_LONGEST_START_US)
 
 
 def ready() -> None:
-    """Tell that the start is over, and the flight begins."""
+    """Report that the start is over and the flight begins."""
     notify(READY=1)
 
 
 def stopping() -> None:
-    """Tell that the flight ends."""
+    """Report that the flight ends."""
     notify(STOPPING=1)
 
 
 def watchdog_ping() -> None:
-    """Tell that the loop turns."""
+    """Report that the loop of the flight still runs."""
     notify(WATCHDOG=1)
 
 
 def status(text: str) -> None:
-    """Tell how the flight goes, in one line."""
+    """Send one line on how the flight goes."""
     notify(STATUS=text)
 
 
 def watchdog_interval_s() -> float | None:
-    """Return the seconds after which `watchdog_ping` is due again, None where no watchdog waits for this process.
+    """Return the seconds between two calls of `watchdog_ping`; None if systemd does not watch this process.
 
     It is half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises.
     """

@@ -1,4 +1,5 @@
-"""Telling how a flight goes, once a second: to systemd (with the beat), to the autopilot, and to whoever looks."""
+"""Reporting of how a flight goes, once a second: to systemd (with its watchdog), to the autopilot, and to the status
+file. The loop of `flight` uses it."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -20,14 +21,15 @@ from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _HEALTH_S = 1.0
-_WINDOW = 10  # reports, one a second, over which rate and load are taken
+_WINDOW = 10  # reports, one a second, over which rate and load are averaged
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
 
 
 class Vitals:
-    """Tells systemd that the loop turns, it and the status's readers how the flight goes, and the autopilot how this
-    companion computer is. It tells everybody, once, when the camera is lost, frozen or damaged or shows nothing, when
-    nothing can be recognised any more, and when that is over. `remarks` are asked for what else people are to know."""
+    """Pings the watchdog of systemd, and reports once a second how the flight goes: to systemd, to the status file, and
+    the state of this computer to the autopilot. It reports once, through the herald, when the camera is lost, frozen,
+    damaged or shows nothing, when nothing can be recognised any more, and when each of these is over. `remarks` are
+    functions that return a sentence for the status, or None."""
 
     def __init__(
         self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Sequence[Callable[[], str | None]]
@@ -46,7 +48,7 @@ class Vitals:
         self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
 
     def tell(self, event: Recognition) -> None:
-        """Take note of an event."""
+        """Take the newest query, and the newest match, from an event."""
         if event.frame is None or not event.is_query:
             return
         self._newest, self._newest_s = _seen(event), event.frame.t_mono_s
@@ -54,7 +56,8 @@ class Vitals:
             self._match, self._match_s = self._newest, self._newest_s
 
     def beat(self) -> None:
-        """Send the watchdog's beat and the report, where they are due, and log the answers to fixes that have come."""
+        """Ping the watchdog and report, if due, and log the answers to fixes that have come. Call it in every pass of
+        the loop."""
         now_s = self._crew.clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s:
             systemd.watchdog_ping()
@@ -95,7 +98,8 @@ class Vitals:
         )
 
     def _look_at_log(self) -> None:
-        """Tell the ground of a flight log that cannot be written; the journal has the reason."""
+        """Report to the ground station if the flight log cannot be written, and when it can again; the journal has the
+        reason."""
         has_log = self._crew.flight_log.is_written
         if has_log != self._has_log:
             self._has_log = has_log
@@ -142,7 +146,8 @@ class Vitals:
         )
 
     def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
-        """Return the queries a second, and the cores kept busy, since the oldest look that is kept."""
+        """Return (queries per second, cores kept busy) since the oldest measurement kept; None for both if there is no
+        other."""
         self._looks.append((elapsed_s, self._tally.queries, cpu_s))
         begin_s, queries, begin_cpu_s = self._looks[0]
         span_s = elapsed_s - begin_s

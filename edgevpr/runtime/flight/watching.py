@@ -1,7 +1,5 @@
-"""Watching the events of a flight: counts them, and tells everybody when something goes wrong or is right again.
-
-Each class listens with `tell`, which takes an event; one that fails ends no flight.
-"""
+"""Observers of the events of a flight: they count them, and report when something goes wrong and when it is right
+again. The loop of `flight` calls `tell` of each class with every event; an exception in it ends no flight."""
 
 import logging
 
@@ -11,22 +9,22 @@ from edgevpr.runtime.flight.herald import Herald, Trouble
 from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.recognise.recognition import Recognition
 
-FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many are a fault of the camera, the map or the technique
-NOTHING_IN_A_ROW = 10  # likewise of pictures that say nothing
+FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
+NOTHING_IN_A_ROW = 10  # the like for pictures that hold too little to be recognised
 
-_KNOWN_WITH = 3  # accepted matches: with fewer it is not known that the map was ever there to be left
+_KNOWN_WITH = 3  # accepted matches before the map can be left: with fewer, the aircraft may never have been over it
 _LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten are nothing unusual
-_LOST, _LOST_AFTER = 0.9, 10  # queries in a row that are not accepted, and the flight so far says that it is lost
-_FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches, without so many others between two of them
-_TILT_LASTS_S = 5.0  # longer than a gust, and than the way from one turn into the next
+_LOST, _LOST_AFTER = 0.9, 10  # probability of being lost, in so many queries in a row that are not accepted
+_FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches that find the map again, with fewer misses between two of them
+_TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to the next
 
 _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts the events of a flight: `queries` and how many of them were `accepted`; `unusable` frames, which never
-    became a query; `failed` queries; `failed_in_a_row`, the latest events that all failed; and `nothing_in_a_row`, the
-    latest pictures that all said nothing."""
+    """Counts the events of a flight: `queries`; those `accepted`; `unusable` frames, which could not become a query;
+    `failed` queries; `failed_in_a_row`, the failed events since the last good one; and `nothing_in_a_row`, the pictures
+    in a row that hold too little to be recognised."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
@@ -48,10 +46,11 @@ class Tally:
 
 
 class MapWatch:
-    """Watches the map: each place that is left out has a line of kind "left out" in the log, and the ground is told
-    once. Everybody is told when the file cannot be read, in a line of kind "map", and when it can be read again.
+    """Watches the map. Each place that is left out because it cannot be read gets a log line of kind "left out"; the
+    ground station is told of the first. When the whole file cannot be read, and when it can be again, that is reported
+    as "map".
 
-    `left_out` counts the places.
+    `left_out` is the number of places left out.
     """
 
     def __init__(self, herald: Herald) -> None:
@@ -60,11 +59,11 @@ class MapWatch:
 
     @property
     def summary(self) -> str | None:
-        """Number of places left out, in a few words; None where there are none."""
+        """Number of places left out, in a few words; None if there are none."""
         return f"{self.left_out} places of the map left out" if self.left_out else None
 
     def tell(self, event: Recognition) -> None:
-        """Take note of an event."""
+        """Check an event for places left out and for a map that cannot be read."""
         for place_id, problem in event.left_out:
             self._herald.note("left out", place=place_id, problem=problem)
         if event.left_out and not self.left_out:
@@ -83,9 +82,11 @@ class MapWatch:
 
 
 class Sight:
-    """Tells everybody, once, when the map is left and found again, and when pictures are tilted too far and no more.
+    """Reports once when the aircraft leaves the map and when the map is found again, and when the camera is tilted too
+    far and when no longer.
 
-    A picture that shows nothing, is not worth a search, could not be used or is tilted too far says nothing of the map.
+    A picture that shows nothing, is not worth a search, could not be used or is tilted too far does not count as a
+    miss.
     """
 
     def __init__(self, herald: Herald) -> None:
@@ -95,7 +96,7 @@ class Sight:
         self._is_tilted, self._tilt_since_s = False, 0.0
 
     def tell(self, event: Recognition) -> None:
-        """Take note of an event."""
+        """Check the tilt of a query, and whether it was found in the map."""
         if event.is_query and event.frame:
             self._look_at_tilt(event.view.reason is not None, event.frame.t_mono_s)
             self._look_for_map(event)
@@ -127,14 +128,14 @@ class Sight:
 
 
 class GpsWatch:
-    """Holds GPS against the matches, and tells everybody, once, when it is contradicted and when it agrees again. The
-    autopilot is told of every comparison, and the flight navigates no longer by a receiver that is wrong."""
+    """Compares GPS with the matches, and reports once when they contradict each other and when they agree again. Every
+    comparison is sent to the autopilot, and the navigation does not use a GPS that is wrong."""
 
     def __init__(self, map_sd_m: float, herald: Herald, autopilot: Autopilot) -> None:
         self._integrity, self._herald, self._autopilot = Integrity(map_sd_m), herald, autopilot
 
     def tell(self, event: Recognition) -> None:
-        """Take note of an event."""
+        """Compare GPS with the match of an event, if that has a position."""
         if event.position is None or event.view.reason:
             return
         news = self._integrity.look(event)

@@ -1,4 +1,5 @@
-"""A whole flight of the files that its log has become: all who read a flight after its end read it here."""
+"""Reading of a whole flight, which may be spread over several files of its log. All programs that read a flight after
+its end use it."""
 
 import os
 from collections.abc import Iterator
@@ -18,8 +19,8 @@ _MISSING = "Files of the flight that are missing before {}: {}. The flight is re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """The lines of one flight in one file, from byte `begin` to byte `end`. `start` is the first start line, {} without
-    one, and `parts` are those that begin here: usually one."""
+    """The lines of one flight in one file, from byte `begin` to byte `end`. `start` is their first start line ({}:
+    there is none). `parts` are the numbers of the parts of the flight that begin here, usually one."""
 
     path: Path
     begin: int
@@ -30,9 +31,9 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLines:
-    """The lines of one flight: iterate over them, as often as you like. `number` of `flights` is the flight's in the
-    file `path`, and `stretches` of files are what it is read from, in order. `missing` is a sentence about files that
-    are not there (None: none)."""
+    """The lines of one flight; iterate over them as often as needed. It is flight `number` of the `flights` in the file
+    `path`, and is read from `stretches` of files, in order. `missing` is a sentence about files that are missing (None:
+    none are)."""
 
     path: Path
     number: int
@@ -41,7 +42,7 @@ class FlightLines:
     stretches: tuple[Stretch, ...]
 
     def __iter__(self) -> Iterator[Line]:
-        """Yield lines, each with a `kind`; the start line once."""
+        """Yield the lines, each with a `kind`; only the first start line is included."""
         has_start = False
         for stretch in self.stretches:
             for line in read_log(stretch.path, stretch.begin, stretch.end):
@@ -52,10 +53,10 @@ class FlightLines:
 
 
 def flight_of(path: str | Path, number: int | None = None) -> FlightLines:
-    """Find the lines of one flight of a log: the last flight in the file unless its `number` (1, 2, ...) is given.
+    """Find the lines of one flight in a log: the last flight in the file, unless its `number` (1, 2, ...) is given.
 
-    Where the file is one of several of its flight, the flight is read from its start up to the end of this file. Raises
-    UsageError where there is no such file or flight, and EdgevprError for a file without a line of a flight.
+    If the flight has several files, it is read from its start to the end of this file. Raises UsageError if there is no
+    such file or flight, and EdgevprError if the file has no line of a flight.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,7 +80,7 @@ def flight_of(path: str | Path, number: int | None = None) -> FlightLines:
 
 
 def _earlier(last: Stretch) -> list[Stretch]:
-    """Find the files with the parts of a flight before those of a stretch, in order."""
+    """Find the stretches, in other files, with the parts of the same flight before `last`, in order."""
     first = min(last.parts, default=1)
     found = {}
     for path in _relatives(last.path) if first > 1 else ():
@@ -96,12 +97,12 @@ def _relatives(path: Path) -> list[Path]:
 
 
 def _stretches(path: Path) -> list[Stretch]:
-    """Find the flights in a file. What comes before the first start line is a flight too. Raises OSError."""
+    """Find the flights in a file. Lines before the first start line count as a flight too. Raises OSError."""
     begins: list[tuple[int, Line, set[int]]] = []
     end = 0
     with open(path, "rb") as handle:
         for line in handle:
-            # Of the many lines after the first only start lines matter.
+            # After the first line, only start lines matter: others are not parsed.
             record = (record_of(line) if not begins or b'"start"' in line else None) or {}
             kind = record.get("kind")
             if kind == "start":
@@ -119,7 +120,7 @@ def _stretches(path: Path) -> list[Stretch]:
 
 
 def _flight(start: Line) -> tuple[object, object]:
-    """Return what no other flight has of a start line."""
+    """Return the values of a start line that identify its flight."""
     return start.get("time"), start.get("t_mono_s")
 
 

@@ -1,5 +1,5 @@
-"""The world of a flight: all that comes in from outside, and all that it speaks to. In the air that is the real thing,
-in a replay what is on the tape; the flight is the same."""
+"""The world of a flight: all that it takes in from outside and sends outside. In the air these are real cameras, clocks
+and links; in a replay they come from the recording's tape. The code of the flight is the same."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -30,8 +30,8 @@ class StopNow(BaseException):
 
 
 class Stop:
-    """Signal handler that ends a flight. While a frame is recognised, and before the flight begins, it ends at once, so
-    that a long comparison does not delay the end; otherwise it ends after the present turn of the loop."""
+    """Signal handler that ends a flight. While a frame is recognised, and before the flight begins, it raises StopNow,
+    so that a long comparison does not delay the end. Otherwise the flight ends after the present pass of its loop."""
 
     def __init__(self, tape: Tape = NO_TAPE) -> None:
         self._tape = tape
@@ -39,7 +39,7 @@ class Stop:
 
     @property
     def asked(self) -> bool:
-        """True where the flight is to end."""
+        """True if a signal has asked for the end of the flight."""
         return self._tape.read("stop", lambda: self._asked)
 
     def __call__(self, *_: object) -> None:
@@ -47,14 +47,14 @@ class Stop:
         if self._begins:
             raise StopNow
         if self._breakable:
-            self._breakable = False  # a second signal finds nothing more to break off
+            self._breakable = False  # a second signal must not raise again
             self._tape.note("stopped")
             raise StopNow
 
     @contextmanager
     def beginning(self) -> Iterator[None]:
-        """Let a signal interrupt what a flight begins with, and one that has come before it. Nothing was flown that a
-        replay would have to come to."""
+        """Let a signal end the flight at once inside this context, even one that came before it. This is not recorded:
+        nothing has been flown that could be replayed."""
         self._begins = True
         try:
             if self._asked:
@@ -65,7 +65,7 @@ class Stop:
 
     @contextmanager
     def breaks_off(self) -> Iterator[None]:
-        """Let a signal interrupt the work inside this context."""
+        """Let a signal interrupt the work inside this context by StopNow."""
         self._breakable = True
         try:
             yield
@@ -76,13 +76,14 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """The world of a flight.
-
-    `board` and the place map at the path `place_map` (None: none is named) are what it flies with, and `log` says where
-    its log goes. `tape` and `clock` give what comes in and when, `open_source` (with the seconds between two frames)
-    the pictures. `link` and `ground` are the kinds of the two links, with their `signing` and `tap`. `stop` ends the
-    flight, and `reread` has its configuration read again (None: it has no file). `status` is told how it goes, and
-    `recording` is where it is recorded (None: nobody is told, it is not).
+    """External parts of a flight, which a test or a replay replaces.
+    - `place_map`: path of the map (None: none is configured); `log`: settings of the flight log
+    - `tape`: records or plays back all input; `clock`: the clocks
+    - `open_source`: opens the source of frames, given the seconds between two frames
+    - `link`, `ground`: classes of the links to the autopilot and to the ground station
+    - `signing`: of their packets; `tap`: is called with each packet sent or received
+    - `stop`, `reread`: signal handlers that end the flight and reread its configuration (None: it has no file)
+    - `status`: the status file (None: none is written); `recording`: folder of the recording (None: there is none).
     """
 
     board: Board
@@ -103,9 +104,9 @@ class World:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crew:
-    """All that works together in a flight, opened. `learner` is None where nothing is learnt, the links where there are
-    none, `reread` where the configuration has no file, and `status` where nobody is told. `fewer_candidates` are
-    those that the governor may change to."""
+    """All opened parts of a flight that work together. None means: `learner`, no places are learnt; `link` and
+    `ground`, there is no such link; `reread`, the configuration has no file; `status`, no status file is written.
+    `fewer_candidates` are the numbers of candidates that the governor may lower to."""
 
     recogniser: Recogniser
     learner: Learner | None = None
@@ -125,7 +126,7 @@ class Crew:
 
 @contextmanager
 def signals(world: World) -> Iterator[None]:
-    """Let SIGTERM and SIGINT end the flight inside this context, and SIGHUP have its configuration read again."""
+    """Let SIGTERM and SIGINT end the flight inside this context, and SIGHUP reread its configuration."""
     handlers: dict[signal.Signals, Callable[..., None]] = {signal.SIGTERM: world.stop, signal.SIGINT: world.stop}
     if world.reread:
         handlers[signal.SIGHUP] = world.reread
