@@ -29,7 +29,8 @@ SOURCES = (
 _SHOWN = 80  # characters of a wrong value in a message
 
 T = TypeVar("T", bound="DataclassInstance")
-_WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", dict: "a section"}
+_WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", list: "a list"}
+_WORDS |= {dict: "a section"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,13 +310,13 @@ def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) 
 
 def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
     wanted = _kind(hint)
+    if value is None and isinstance(hint, types.UnionType):
+        return None
     if isinstance(wanted, type) and is_dataclass(wanted):
         if not isinstance(value, dict):
             raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
         return build(wanted, value, where, f"{key}.")
     if value is None:
-        if wanted is not hint:
-            return None
         raise ConfigError(f"{where}: `{key}` has no value: write one.")
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
