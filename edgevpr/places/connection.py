@@ -1,7 +1,7 @@
-"""An open map file: its one connection, the lock of the program that adds places, and the watch for another file in its
-place.
+"""The connection to an open map file, the lock of the one program that may add places, and the check that the file has
+not been replaced.
 
-What the rows mean is not known here (see `mapfile`), only how SQLite is asked for them.
+This module only queries SQLite; `mapfile.PlaceMap` builds on it and knows what the rows mean.
 """
 
 import os
@@ -22,20 +22,20 @@ from edgevpr.places.sqlite import is_of_one_row, sentences
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_BESIDE_BLOBS_BYTES = 100_000  # what a row may have beside its descriptor: the name of its image
+_BESIDE_BLOBS_BYTES = 100_000  # most bytes of a row besides its descriptor: mainly the image's name
 
 
 class MapConnection:
-    """An open map file. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
+    """A connection to a map file. Make it with `create`, `open` or `open_for_adding`, and close it or use `with`.
 
-    `stored` is what the file says of the map, `spec` the technique in it. `db` is the connection of SQLite for this
-    moment: `require_unchanged` may put another one in its place.
+    `stored` holds the values of the table edgevpr_map (see `mapspec`), and `spec` describes the technique that made the
+    descriptors. `db` is the current SQLite connection: `require_unchanged` may replace it.
     """
 
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         self.path, self.stored = path, read_stored(path, db)
         self.spec = spec_of(path, self.stored)
-        self._lock = lock  # the lock of the program that adds places; None: only read
+        self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
         if lock is not None:
             sqlite.start_log(db)
         self._wait_s = sqlite.WAIT_S
@@ -44,8 +44,8 @@ class MapConnection:
 
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "Self":
-        """Make an empty map for descriptors of `spec`: all of it, or no file. Raises MapError if the file has content
-        or cannot be written, and UsageError for a name that no file can have."""
+        """Create an empty map for descriptors of `spec`; if writing fails, remove the file. Raises MapError if the file
+        has content already or cannot be written, and UsageError for a name that no file can have."""
         path = mapfiles.map_path(path)
         mapfiles.require_regular(path)
         lock = mapfiles.lock(path, make=True)
@@ -71,8 +71,8 @@ class MapConnection:
 
     @classmethod
     def open(cls, path: str | Path) -> "Self":
-        """Open a map for reading. Raises MapError for a file that is missing, damaged, no place map, or of another
-        format, and UsageError for a name that no file can have."""
+        """Open a map for reading. Raises MapError if the file is missing, damaged, not a place map, or of an unknown
+        format version, and UsageError for a name that no file can have."""
         path = mapfiles.existing(path)
         sqlite.settle_left_log(path)
         with sentences(path):
@@ -85,8 +85,8 @@ class MapConnection:
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "Self":
-        """Open an existing map to add places to it. Raises MapError as `open` does, and MapBusyError where another
-        program adds places to it."""
+        """Open an existing map to add places to it. Raises the errors of `open`, and MapBusyError while another program
+        adds places to the map."""
         path = mapfiles.existing(path)
         lock = mapfiles.lock(path)
         try:
@@ -103,7 +103,8 @@ class MapConnection:
         self.close()
 
     def close(self) -> None:
-        """Close the file. A map that was written becomes one plain file again, readable from a read-only card."""
+        """Close the file. If it was open for adding, first merge SQLite's log into it: one file, also readable from a
+        read-only medium, is left."""
         if self._lock is not None:
             sqlite.settle(self.db)
         self.db.close()
@@ -112,10 +113,10 @@ class MapConnection:
             self._lock = None
 
     def require_unchanged(self) -> None:
-        """Raise MapError where the file is gone, cannot be read, or is another map than the one that was opened.
+        """Raise MapError if the file is gone, cannot be read, or has been replaced by another map since it was opened.
 
-        This is cheap: only when another program has touched the file is it opened anew, and its map_id compared. The
-        new connection is then used, since the old one may have kept pages of another file.
+        This is cheap: only when another program has touched the file is it opened again, and its map_id and technique
+        compared. The new connection then replaces `db`, since the old one may have cached pages of a replaced file.
         """
         with sentences(self.path):
             state = self._state_now()
@@ -138,13 +139,14 @@ class MapConnection:
             self._state = self._version(), *state[1:]
 
     def wait_at_most(self, wait_s: float) -> None:
-        """From now on, wait at most so long for another program that is writing; then MapBusyError is raised."""
+        """Set how many seconds to wait for another program that is writing, before MapBusyError is raised."""
         self._wait_s = wait_s
         self.db.execute(f"PRAGMA busy_timeout = {round(1000 * wait_s)}")
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Commit what is written inside this context, or nothing of it. Raises sqlite3.Error."""
+        """Run the body of `with` as one transaction: commit all it writes, or nothing if it raises an exception. Raises
+        sqlite3.Error."""
         self.db.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -155,12 +157,14 @@ class MapConnection:
             raise
 
     def scan(self, columns: str) -> Iterator[tuple[int, Values | None]]:
-        """Yield (place id, row) of every place (see `rows.scan`). Raises MapError."""
+        """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan`). Raises
+        MapError."""
         with sentences(self.path):
             yield from rows.scan(self.db, columns, self._file_bytes())
 
     def row(self, place_id: int, columns: str) -> Values | None:
-        """Read the row of one place, None where it is gone. Raises PlaceError for one that SQLite cannot read."""
+        """Return the values of `columns` of one place; None if it does not exist. Raises PlaceError if SQLite cannot
+        read its row."""
         with sentences(self.path):
             try:
                 found = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
@@ -171,7 +175,7 @@ class MapConnection:
         return tuple(found) if found else None
 
     def __len__(self) -> int:
-        """Return the number of places; in a damaged file, of those that can be read. Raises MapError."""
+        """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
         with sentences(self.path):
             try:
                 # Counted row by row: SQLite's own count of a table that refers to itself need not end.
@@ -187,8 +191,8 @@ class MapConnection:
         return int(pages * page_bytes)
 
     def _take(self, connection: sqlite3.Connection) -> None:
-        """Use this connection, and refuse to read any row that is larger than one of this map, before it is in
-        memory. Python 3.10 cannot ask SQLite for this."""
+        """Make `connection` the current one. Let SQLite refuse to load any row that is larger than the rows of this map
+        can be. Python 3.10 cannot set this limit."""
         self.db = connection
         if sys.version_info >= (3, 11):
             fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
@@ -196,8 +200,8 @@ class MapConnection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
 
     def _version(self) -> int | None:
-        """Return a number that changes when another program has written to the file; None where this connection cannot
-        read it any more."""
+        """Return SQLite's data_version, which changes when another program has written to the file; None if this
+        connection can no longer read the file."""
         try:
             return int(self.db.execute("PRAGMA data_version").fetchone()[0])
         except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -206,7 +210,7 @@ class MapConnection:
             return None
 
     def _state_now(self) -> tuple[int | None, ...]:
-        """Return numbers that change when another program writes to the file, or puts another one in its place."""
+        """Return numbers that differ from the last ones if another program has written to the file or replaced it."""
         try:
             file = self.path.stat()
         except OSError as error:

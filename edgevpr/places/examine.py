@@ -1,4 +1,4 @@
-"""A whole map, row by row: its check, its repair, its merging with another, and a smaller copy of it."""
+"""Operations on a whole map, for `edgevpr map`: check, repair, merge with another map, copy the best places."""
 
 import os
 import sqlite3
@@ -21,18 +21,18 @@ from edgevpr.places.sqlite import sentences
 from edgevpr.places.thin import best_places
 
 T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]  # passes a number of things through, and shows progress
+Watch = Callable[[Iterable[T], int], Iterable[T]]  # takes items and their number, yields the same items, shows progress
 
-_MOST_FAULTS = 20  # of the file, that SQLite lists
-_AT_ONCE = 100  # places in a transaction of a copy
-_EMPTY_BYTES = 45_056  # of a map without places
-_LOW = 0.5  # of its worth is left to a place that was kept only to bound a gap
+_MOST_FAULTS = 20  # most faults of a file that SQLite lists
+_AT_ONCE = 100  # places copied in one transaction
+_EMPTY_BYTES = 45_056  # size of a map file without places
+_LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """One place of a map: `problem` says in a few words what is damaged (None: nothing), `content` is its row, and
-    `has_checksums` tells whether all that should have one does."""
+    """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` is its
+    row by columns, empty if unreadable. `has_checksums` is True if no value of the row lacks its checksum."""
 
     place_id: int
     problem: str | None
@@ -42,9 +42,9 @@ class Examined:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCheck:
-    """State of a map: `places` can be read, `damaged` cannot (number and what is wrong, in a few words). `faults` are
-    what SQLite finds wrong with the file as a whole. `without_checksums` of the readable places lack some, so that
-    damage of those cannot be seen: rows that other programs wrote."""
+    """The result of checking a map. `places` is the number of readable places. `damaged` has (place id, problem in few
+    words) of each other place. `faults` are SQLite's messages about the file as a whole. `without_checksums` readable
+    places lack a checksum, because another program wrote them: damage to their values cannot be detected."""
 
     path: str
     places: int
@@ -58,7 +58,7 @@ class MapCheck:
 
 
 def examine(place_map: PlaceMap) -> Iterator[Examined]:
-    """Read everything of every place, in the order they were added."""
+    """Read and check all values of every place, and yield the results in the order the places were added."""
     spec = place_map.spec
     for place_id, row in place_map.scan(rows.ALL):
         if row is None:
@@ -80,10 +80,10 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
 
 
 def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
-    """Copy every place of another map of the same technique, all or none; return (copied, already here).
+    """Copy all places of `other` into `place_map` in one transaction; return (copied, already there) as numbers.
 
-    A place is already here when image name and time are the same, and the coarse part nearly (`PlaceMap.is_of`). Raises
-    MapError as `PlaceMap.require` does and where a file cannot be read or written, and PlaceError for a damaged place.
+    A place is already there if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). Raises
+    MapError if the techniques differ or a file cannot be read or written, and PlaceError if a place is damaged.
     """
     place_map.require(other.spec)
     copied = already_here = 0
@@ -103,8 +103,8 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
 
 
 def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
-    """Read everything in a map; `watch` passes the places through and shows progress. Raises MapError for a file that
-    cannot be opened as a map at all."""
+    """Read and check everything in the map file `path`; `watch` shows progress. Raises MapError for a file that cannot
+    be opened as a map at all."""
     places = without = 0
     damaged = []
     with PlaceMap.open(path) as place_map:
@@ -121,18 +121,18 @@ def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
 
 
 def repair(path: str | Path, watch: Watch[Examined]) -> Path:
-    """Put a copy of all whole places in the place of a map, and return the path of the original, which is kept.
+    """Replace the map by a copy of its undamaged places; keep the original as `*.damaged` and return its path.
 
-    The places keep their numbers, and all get checksums. Mask and calibration are kept where they can be read. Raises
-    MapError where no place can be read, where the file of an earlier repair is there, and where the copy cannot be
-    written: the map is then as it was.
+    The places keep their ids, and all get checksums. Mask hash and calibration are copied if they can be read. Raises
+    MapError if no place can be read, if the original of an earlier repair exists, or if the copy cannot be written. The
+    map is then unchanged. `watch` shows progress.
     """
     path = mapfiles.existing(path)
     original = path.with_name(path.name + ".damaged")
     if original.exists():
         raise MapError(f"{original} is there already, from an earlier repair: move it away first.")
     copy = path.with_name(f".{path.name}.{os.getpid()}")
-    lock = mapfiles.lock(path)  # nobody adds places that the copy would lack
+    lock = mapfiles.lock(path)  # meanwhile no program can add places, which the copy would lack
     try:
         with PlaceMap.open(path) as damaged, PlaceMap.create(copy, damaged.spec) as repaired:
             whole = (each for each in watch(examine(damaged), len(damaged)) if not each.problem)
@@ -153,14 +153,15 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
 
 
 def places_in(file_bytes: int, place_map: PlaceMap) -> int:
-    """Return how many places like those of a map a file of this size holds."""
+    """Return how many places of a map fit into a file of `file_bytes`, from the mean file size of its places."""
     places = len(place_map)
     each = (place_map.path.stat().st_size - _EMPTY_BYTES) / max(places, 1)
     return places if each <= 0 else min(places, max(0, int((file_bytes - _EMPTY_BYTES) / each)))
 
 
 def worth_of(place: Place) -> float:
-    """Return what a place is worth, 0..1: its quality, times its memorability and staticity where they are known."""
+    """Return the value of keeping a place, 0..1: quality times memorability and staticity, if known; half of that for a
+    place that was added only because there would have been too wide a gap."""
     salience = place.salience
     if salience is None:
         return place.quality
@@ -169,11 +170,11 @@ def worth_of(place: Place) -> float:
 
 
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
-    """Copy the `count` best places of a map to a new one, all or none; return how many were kept, of how many.
+    """Copy the `count` best places of a map to the new file `out`; return (places copied, readable places of the map).
 
-    The places keep their numbers, and the map its calibration, which knows places by number. A place that cannot be
-    read is left behind. Raises MapError for a map that cannot be read, or an `out` that is there already or cannot be
-    written.
+    The places keep their ids. Mask hash and calibration are copied; the calibration refers to places by id. Places that
+    cannot be read are not copied. Raises MapError if the map cannot be read, or if `out` exists or cannot be written;
+    no part of a file is then left.
     """
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
         whole = [each.place_id for each in examine(place_map) if not each.problem]
@@ -190,7 +191,7 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
 
 
 def chosen(places: list[Place], count: int) -> Ints:
-    """Choose `count` of the places by worth and coverage; return their numbers in the list, ascending."""
+    """Choose `count` of the places for high `worth_of` and small gaps; return their indices in `places`, ascending."""
     points = [
         (place.position.lat_deg, place.position.lon_deg) if place.position else (np.nan, np.nan) for place in places
     ]
@@ -199,14 +200,14 @@ def chosen(places: list[Place], count: int) -> Ints:
 
 
 def _exchange(path: Path, copy: Path, original: Path) -> None:
-    """Rename the map to `original`, with what SQLite has beside it, and the copy to the map."""
+    """Rename the map, and the files that SQLite keeps beside it, to `original`; then rename the copy to `path`."""
     for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
-        if left.exists():  # the log of the damaged map must not be taken for one of the copy
+        if left.exists():  # else SQLite would apply the log of the damaged map to the copy
             left.rename(kept)
     try:
-        os.link(path, original)  # so that there is a map under its name at every moment
+        os.link(path, original)  # a link first, so that there is a map at `path` at every moment
     except OSError:
-        path.rename(original)  # FAT has no links
+        path.rename(original)  # a FAT file system has no links
     copy.replace(path)
     with suppress(OSError):
         folder = os.open(path.parent, os.O_RDONLY)
@@ -217,7 +218,7 @@ def _exchange(path: Path, copy: Path, original: Path) -> None:
 
 
 def _faults(place_map: PlaceMap) -> list[str]:
-    """Return what SQLite finds wrong with the file as a whole, a sentence each; empty for a sound one."""
+    """Return SQLite's messages about faults of the file as a whole; empty if it finds none."""
     try:
         found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
     except (sqlite3.Error, UnicodeDecodeError) as error:

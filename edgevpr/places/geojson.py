@@ -1,4 +1,4 @@
-"""A map as GeoJSON (RFC 7946): the places without their descriptors, for any map viewer."""
+"""Export of a map as GeoJSON (RFC 7946), the places without their descriptors, for any map viewer."""
 
 import json
 from collections.abc import Mapping
@@ -9,13 +9,13 @@ from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
 
 _LOW, _USUAL = "#e0b060", "#2060c0"
-# From hardly recognisable to surely, in five equal steps; red and blue are told apart by every eye.
+# From hardly to surely recognisable, in five equal steps. Colour-blind people can tell red from blue too.
 _RECOGNISABLE = ("#d73027", "#fc8d59", "#fee090", "#91bfdb", "#4575b4")
 
 
 def write_geojson(place_map: PlaceMap, out: TextIO, recognisable: Mapping[int, float] | None = None) -> int:
-    """Write all places as one FeatureCollection, one feature a line, and return their number. `recognisable` is how
-    surely places are recognised, 0..1 by their numbers, as far as it is known; it gives them their colours."""
+    """Write all places to `out` as one FeatureCollection, one feature per line; return their number. `recognisable`
+    maps place ids to the confidence with which a place is recognised, 0..1; where known, it sets the place's colour."""
     recognisable = recognisable or {}
     count = 0
     out.write('{"type": "FeatureCollection", "features": [')
@@ -28,7 +28,8 @@ def write_geojson(place_map: PlaceMap, out: TextIO, recognisable: Mapping[int, f
 
 
 def _feature(place: Place, recognisable: float | None) -> dict[str, Any]:
-    """Return a place as a feature. Viewers that know the simplestyle keys (geojson.io, GitHub) draw its colour."""
+    """Return a place as a GeoJSON feature. Its marker-color is a simplestyle key, which geojson.io and GitHub draw.
+    `recognisable`: see `write_geojson` (None: unknown)."""
     position, pose, salience = place.position, place.pose, place.salience
     geometry, known = None, dict[str, Any]()
     if position:

@@ -1,4 +1,5 @@
-"""The GeoPackage side of a map file: tables that QGIS, GDAL and `sqlite3` can read (OGC 12-128r18, version 1.3)."""
+"""The GeoPackage standard (OGC 12-128r18, version 1.3) as map files use it: tables, points and times that QGIS, GDAL
+and `sqlite3` can read."""
 
 import struct
 from datetime import datetime, timezone
@@ -13,9 +14,9 @@ _WGS84_WKT = (
     'AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
 )
 
-# The checksums (CRC-32 of zlib) stand before the BLOBs: what comes after a large BLOB is found only by reading all of
-# that. A program that moves a place (QGIS) knows nothing of checksums: the trigger takes that of the position away, and
-# the position that was recorded before the place was refined, which is not the one to refine from any more.
+# The checksums (CRC-32 of zlib) stand before the BLOBs: SQLite reads all of a large BLOB to find what comes after it. A
+# program that moves a place (QGIS) does not know the checksums. So a trigger deletes those of position and pose, and
+# the recorded position (see `core.types.Pose`), from which the place must not be refined again after it was moved.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
     srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -128,21 +129,21 @@ _KINDS_OF_POINT = (1, 1001, 2001, 3001)  # xy, xyz, xym, xyzm; z and m are ignor
 
 
 def point_blob(lat_deg: float, lon_deg: float) -> bytes:
-    """Encode a WGS-84 point (degrees) as a GeoPackage geometry."""
+    """Encode a WGS-84 point, in degrees, as the bytes of a GeoPackage geometry."""
     return _POINT.pack(b"GP", 0, 1, WGS84, 1, 1, lon_deg, lat_deg)
 
 
 def read_point(blob: object) -> tuple[float, float]:
-    """Return (lat_deg, lon_deg) of a point written by `point_blob`, or by another tool with or without an envelope.
+    """Decode a GeoPackage point, written by `point_blob` or another program, as (lat_deg, lon_deg).
 
-    Raises ValueError, in a few words, for anything that is not a WGS-84 point on the Earth.
+    Raises ValueError with a short message for anything that is not a WGS-84 point on the Earth.
     """
     try:
         if not isinstance(blob, bytes) or blob[:2] != b"GP" or len(blob) > _MOST_POINT_BYTES:
             raise ValueError("its geometry is no point")
         order = "<" if blob[3] & 1 else ">"
         (srs_id,) = struct.unpack_from(f"{order}i", blob, 4)
-        wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # the header, and the envelope that its flags announce
+        wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # bytes of header and envelope, whose kind is in the flags
         order = {0: ">", 1: "<"}[blob[wkb]]
         kind, lon_deg, lat_deg = struct.unpack_from(f"{order}Idd", blob, wkb + 1)
     except (IndexError, KeyError, struct.error) as error:
@@ -157,7 +158,7 @@ def read_point(blob: object) -> tuple[float, float]:
 
 
 def point_or_none(geom: object) -> tuple[float, float] | None:
-    """Read a point as `read_point` does; None for a value that is none."""
+    """Decode a point like `read_point`, but return None for anything that is not a WGS-84 point."""
     try:
         return read_point(geom)
     except ValueError:
@@ -165,8 +166,8 @@ def point_or_none(geom: object) -> tuple[float, float] | None:
 
 
 def utc_text(t_utc_s: float | None) -> str | None:
-    """Return seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None, and for a number that
-    is no date of the years 1 to 9999."""
+    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds. Return None for None, and for a time
+    outside the years 1 to 9999."""
     if t_utc_s is None:
         return None
     try:
@@ -177,7 +178,7 @@ def utc_text(t_utc_s: float | None) -> str | None:
 
 
 def utc_seconds(text: object) -> float | None:
-    """Reverse `utc_text`; return None for a value of another form, as other tools may write."""
+    """Parse a text of the form of `utc_text` as seconds since 1970; return None for anything else."""
     try:
         return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if isinstance(text, str) else None
     except (ValueError, OverflowError):

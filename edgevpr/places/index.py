@@ -1,6 +1,7 @@
-"""The part of a map that is in RAM: one row a place, in arrays that are made once and never exceed the budget.
+"""The index: the part of a map that is held in RAM, in arrays that are allocated once, within a memory budget.
 
-An index may take new places while it is in use (`GrowingIndex`): when its arrays are full, it drops its worst places.
+`load_index` makes the index of a map that does not change. A `GrowingIndex` takes new places while it is in use, and
+drops its worst places when its arrays are full. `retrieve` searches an index.
 """
 
 import logging
@@ -20,20 +21,20 @@ from edgevpr.places.thin import best_places
 
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
-_PACKED_AT_ONCE = 32
-_MOVED_AT_ONCE = 256
+_PACKED_AT_ONCE = 32  # places
+_MOVED_AT_ONCE = 256  # places
 
-CoarsePart = tuple[int, LatLon | None, float | None, Array]  # of `PlaceMap.coarse_parts`
+CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.coarse_parts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
-    """The arrays of N places, all contiguous. The number of a place in them is its *slot*; slots follow the order of
-    mapping.
+    """The arrays of N places, all contiguous. A place's index in them is its *slot*; slots follow the order in which
+    the places were mapped.
 
-    `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN where a place has no position.
-    `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN where unknown. `rows` is (N, *row shape).
-    `mean` is the mean of the coarse parts, None for a technique that does not pack them.
+    `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN for a place without a position.
+    `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN if unknown. `rows` (N, *row shape) has the
+    coarse parts, packed if the technique packs them. `mean` is the mean coarse part used for packing, else None.
     """
 
     place_ids: Ints
@@ -48,7 +49,7 @@ class PlaceIndex:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """The arrays with one entry a place, by name."""
+        """The arrays that have one entry per place, by name of the field."""
         return {name: getattr(self, name) for name in ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")}
 
     @property
@@ -57,44 +58,44 @@ class PlaceIndex:
 
     @property
     def knows_headings(self) -> bool:
-        """True where at least one place has a heading."""
+        """True if at least one place has a heading."""
         return not np.isnan(self.heading_deg).all()
 
     def first(self, count: int) -> "PlaceIndex":
-        """Return the index of the first `count` places: the same arrays, seen in part."""
+        """Return the index of the first `count` places, as views of these arrays."""
         return replace(self, **{name: array[:count] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
-        """Return the median distance in metres between places mapped one after the other; None where no such pair has
+        """Return the median distance in metres between successive places; None if no two successive places have
         positions."""
         away_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
         known = away_m[~np.isnan(away_m)]
         return float(np.median(known)) if len(known) else None
 
     def within(self, position: Position, radius_m: float) -> Bools:
-        """Tell which places are within `radius_m` metres of `position`, bool (N,); False for one without a position.
+        """Return True for each place within `radius_m` metres of `position`, bool (N,); False without a position.
 
-        The map file can be searched by area too. But 10 000 distances from these arrays take less than half a
-        millisecond, of a query of tens of milliseconds. They need no file, and they are ordered by slot.
+        SQLite could search the map file by area too. But 10 000 distances from these arrays take less than half a
+        millisecond, of tens of milliseconds for a query. They need no file access, and are in the order of the slots.
         """
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 
 def bytes_per_place(spec: TechniqueSpec) -> int:
-    """Return the resident bytes of one place of the index."""
+    """Return how many bytes of RAM one place of the index takes."""
     return spec.row.nbytes + _BYTES_BESIDE_ROW
 
 
 def load_index(
     place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None, beside_bytes: int = 0
 ) -> PlaceIndex:
-    """Load the coarse parts of a map, packed by the technique, into new arrays or those of `into`; return the index of
-    the places that were loaded.
+    """Load the coarse parts of a map, packed by the technique, into the arrays of `into` (None: into new ones). Return
+    the index of the places that were loaded.
 
-    Where the budget does not hold all places, the best ones are loaded (see `thin`); the map file keeps all. For each
-    place, `beside_bytes` of the budget are left to other arrays that grow with the index (see `sequence`). Places that
-    cannot be read are left out (see `PlaceMap.left_out`). Raises MapError for a map without places, for one of which no
-    place can be read, and for a budget that holds no place.
+    If `budget_bytes` is too small for all places, only the best ones are loaded (see `thin`). Per place, `beside_bytes`
+    of the budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are
+    skipped and noted in `PlaceMap.left_out`. Raises MapError if the map has no places, if none of them can be read, or
+    if the budget is too small for one place.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
@@ -129,7 +130,8 @@ def load_index(
 
 
 def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
-    """Make arrays for `capacity` places. The system provides the memory of ids and rows only as they are written."""
+    """Allocate the arrays of `capacity` places, with `mean` as in `PlaceIndex`. The operating system provides memory
+    for `place_ids` and `rows` only when they are written."""
     return PlaceIndex(
         place_ids=np.empty(capacity, np.int64),
         lat_deg=np.full(capacity, np.nan),
@@ -141,8 +143,8 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> Pla
 
 
 def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> Iterator[int]:
-    """Write as many `parts` as the index has slots, a block at a time, and yield how many are written after each block:
-    in the end fewer than there are slots, where there are fewer parts. A slot is written completely or not at all."""
+    """Write `parts`, packed by the technique, to the slots of `index` in blocks, until parts or slots run out. After
+    each block, yield how many slots are written so far: each of them completely."""
     spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
     filled = 0
@@ -160,7 +162,7 @@ def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -
 
 
 def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: int) -> int:
-    """Return how many places the budget holds, `wanted` at most. Raises MapError for none."""
+    """Return how many places of `place_bytes` fit into the budget, at most `wanted`. Raises MapError if none does."""
     if budget_bytes < place_bytes:
         raise MapError(
             f"{place_map.path}: a place takes {place_bytes} bytes in RAM and the budget is {budget_bytes}: "
@@ -170,7 +172,7 @@ def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: 
 
 
 def _outlines(place_map: PlaceMap, places: int) -> Doubles:
-    """Return id, lat_deg, lon_deg and quality of the first `places` places that can be read, float64 (4, N)."""
+    """Return float64 (4, N): id, lat_deg, lon_deg and quality of the first N places that can be read, N <= `places`."""
     columns = np.empty((4, places))
     count = 0
     for count, outline in enumerate(islice(place_map.outlines(), places), start=1):
@@ -186,17 +188,17 @@ def _holds(ascending: Array, number: int) -> bool:
 class GrowingIndex:
     """The index of an open map, with free slots for more places.
 
-    Retrieval takes `index`, which holds views that are valid until the next `add`. When all slots are taken, the best
-    three quarters of the places stay (see `thin`). The map file keeps every place.
+    `index` is a PlaceIndex of the present places, for retrieval; its arrays are views, valid until the next `add`. When
+    a place is added to full arrays, a quarter of the places is dropped first (see `thin`). The map file keeps them all.
     """
 
     def __init__(
         self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
     ) -> None:
-        """Read the map, which may be empty, and leave slots for `room` more places as far as the budget allows.
+        """Load the map, which may be empty, and allocate slots for `room` more places as far as the budget allows.
 
-        For each place, `beside_bytes` of the budget are left to other arrays that grow with the index (see
-        `sequence`). Raises MapError for a budget that holds no place.
+        Per place, `beside_bytes` of `budget_bytes` stay free for other arrays that grow with the index (see
+        `sequence`). Raises MapError if the budget is too small for one place.
         """
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
@@ -204,7 +206,7 @@ class GrowingIndex:
         self._map, self._technique = place_map, technique
         self._packs = technique.spec.packed is not None
         self._mean = place_map.mean_coarse() if self._packs else None
-        self._mean_of = self._in_file  # number of places in this mean
+        self._mean_of = self._in_file  # number of places that this mean was computed from
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
         if self._in_file:
@@ -218,14 +220,15 @@ class GrowingIndex:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all slots, taken or free: the index never takes more."""
+        """Bytes of all slots, used or free: the index never takes more."""
         return self._slots.nbytes
 
     def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
-        """Add a place that `PlaceMap.add` has confirmed. Its id must be larger than all ids in the index.
+        """Add a place that is already in the map file, with an id larger than all ids in the index (position and
+        heading None: unknown).
 
-        Raises MapError where the file cannot be read. The index can still be used after that: it holds the places
-        that it could read, all packed with the same mean. A place that is damaged is left out, and raises nothing.
+        Raises MapError if the file cannot be read. The index can still be used after that: it has the places that could
+        be read, all packed with the same mean. If only some places are damaged, they are left out without an error.
         """
         if self._taken == len(self._slots):
             self._thin()
@@ -242,7 +245,7 @@ class GrowingIndex:
 
     def _thin(self) -> None:
         index = self.index
-        # Quality is read from the file: thinning is too rare to justify four more bytes a place in RAM.
+        # Quality is read from the file: places are dropped too rarely to justify four more bytes per place in RAM.
         quality = np.full(len(index), np.nan)
         for place_id, _, _, known in self._map.outlines():
             at = int(np.searchsorted(index.place_ids, place_id))
@@ -259,7 +262,8 @@ class GrowingIndex:
         self._taken = len(kept)
 
     def _repack(self) -> None:
-        """Pack all places anew. One that can no longer be read is dropped: its row is packed with the old mean."""
+        """Pack all places again with the new mean. A place that can no longer be read is dropped, since its row is
+        packed with the old mean."""
         mean = self._map.mean_coarse()
         packed = 0
         try:
@@ -270,8 +274,8 @@ class GrowingIndex:
                 self._mean, self._mean_of, self._taken = mean, self._in_file, packed
 
     def _held_parts(self) -> Iterator[CoarsePart]:
-        """Yield the parts of the places in the index that can be read. What is written into the index meanwhile is what
-        has been yielded, so it never overtakes the ids that are still to be found."""
+        """Yield the coarse parts of the places in the index that can be read. The caller may write each part back to
+        the index from slot 0 on: it never overwrites an id that is still needed here."""
         held = 0
         for part in self._map.coarse_parts():
             while held < self._taken and self._slots.place_ids[held] < part[0]:

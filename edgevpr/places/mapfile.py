@@ -1,8 +1,8 @@
-"""The place map: one GeoPackage file, and the places in it.
+"""The place map: reads and writes the places of one GeoPackage file.
 
-Every place is committed before it is confirmed, so a battery pulled while mapping loses at most the place that was
-being written, and never the file. What is read is checked (see `rows`): a place that cannot be read is left out, and
-the others are used. The open file itself is a `MapConnection`.
+`PlaceMap.add` returns only after a place is committed, so a power failure while mapping loses at most the place that
+was being written, and never the file. All values read are checked (see `rows`): a place that cannot be read is left
+out, and the others are used. The base class `MapConnection` holds the open file.
 """
 
 import json
@@ -23,15 +23,15 @@ from edgevpr.places.connection import MapConnection
 from edgevpr.places.rows import Content, Unreadable, Values
 from edgevpr.places.sqlite import is_of_one_row, sentences
 
-_OTHERS = 0.05  # of the numbers of a coarse part
-_SAME_PICTURE = 0.01  # of the length of a coarse part: far more than rounding, far less than another picture
+_OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
+_SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
 
 
 class PlaceMap(MapConnection):
-    """An open map. Use `create`, `open` or `open_for_adding`, and close it (it is a context manager).
+    """An open map. Make it with `create`, `open` or `open_for_adding`, and close it or use `with`.
 
-    `left_out` are the places that could not be read so far, with what is wrong with each in a few words, in the order
-    in which they were found.
+    `left_out` maps the id of each place that could not be read so far to the reason in a few words, in the order in
+    which they were found.
     """
 
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
@@ -40,12 +40,12 @@ class PlaceMap(MapConnection):
 
     @property
     def map_id(self) -> str | None:
-        """The id that was drawn when the map was made; None where the file does not say it."""
+        """The random id that the map was given when it was created; None if the file has none."""
         return self._stored_text("map_id")
 
     @property
     def made_by(self) -> str | None:
-        """The program that made the map; None where the file does not say it."""
+        """Name and version of the program that created the map; None if the file has none."""
         return self._stored_text("made_by")
 
     def require(self, spec: TechniqueSpec) -> None:
@@ -59,17 +59,18 @@ class PlaceMap(MapConnection):
     def add(
         self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None, landmarks: bytes | None = None
     ) -> int:
-        """Add one place and return its id once it is safe on the disk. Raises MapError (disk full, ...).
+        """Add one place, and return its id once it is safe on the disk. Raises MapError (disk full, ...).
 
-        A time that is no date is unknown, and so is an altitude at which nothing flies. In a name that is not UTF-8,
-        the bytes that are not are written as escapes.
+        `salience` and `landmarks` (encoded bytes) are None if there are none. An impossible time or altitude is stored
+        as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
         """
         content = rows.frame_content(frame, descriptor, self.spec, salience, landmarks)
         with sentences(self.path), self.transaction():
             return self.insert(content)
 
     def insert(self, content: Content, place_id: int | None = None) -> int:
-        """Insert a place inside a `transaction`, with the checksums of its content. Raises sqlite3.Error."""
+        """Insert a row with its checksums, inside a `transaction`; return its id. `place_id` None: SQLite chooses the
+        next id. Raises sqlite3.Error."""
         row = {"place_id": place_id, **content, **rows.checksums_of(content)}
         marks = ", ".join("?" * len(row))
         cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
@@ -78,10 +79,9 @@ class PlaceMap(MapConnection):
         return int(cursor.lastrowid or 0)
 
     def lay(self, place_id: int, position: Position, pose: Pose | None) -> None:
-        """Move a place inside a `transaction`, and keep how its picture lies there (None: unknown). Raises
-        sqlite3.Error."""
+        """Set position and pose (None: unknown) of an existing place, inside a `transaction`. Raises sqlite3.Error."""
         geom, content = geopackage.point_blob(position.lat_deg, position.lon_deg), rows.pose_content(pose)
-        # The trigger that follows a move takes away what is written after it.
+        # The trigger `places_moved` sets columns to NULL when geom changes, so they are written in a second statement.
         self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
         row = {**content, "geom_crc32": rows.crc32(geom), "pose_crc32": rows.pose_crc32(tuple(content.values()))}
         columns = ", ".join(f"{name} = ?" for name in row)
@@ -90,26 +90,26 @@ class PlaceMap(MapConnection):
 
     @property
     def mask_sha256(self) -> str | None:
-        """The overlay mask that the places were made with; None: none, or unknown."""
+        """SHA-256 of the overlay mask that was used to make the places; None: no mask, or unknown."""
         return self._text_beside(mapspec.MASK)
 
     def record_mask(self, sha256: str | None) -> None:
-        """Record the overlay mask that the places are made with (None: none). Raises MapError."""
+        """Store the SHA-256 of the overlay mask that is used to make the places (None: no mask). Raises MapError."""
         self._record_beside(mapspec.MASK, sha256)
 
     @property
     def calibration(self) -> str | None:
-        """Text that was recorded of how sure the map can be (see `calibrate`); None: none, or none that is a text."""
+        """The map's calibration of confidences, as text (see `mapmaking.calibrate`); None: none, or not a text."""
         return self._text_beside(mapspec.CALIBRATION)
 
     def record_calibration(self, text: str | None) -> None:
-        """Record how sure the map can be (None: unknown). Raises MapError."""
+        """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""
         self._record_beside(mapspec.CALIBRATION, text)
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """Yield the places of `place_ids` in the order given, or (None) all places in the order they were added.
+        """Yield the places with `place_ids` in the order given (None: all places, in the order they were added).
 
-        Raises PlaceError for one that is missing or damaged.
+        Raises PlaceError for a place that is missing or damaged.
         """
         found: Iterable[tuple[int, Values | None]]
         if place_ids is None:
@@ -122,8 +122,8 @@ class PlaceMap(MapConnection):
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
-        """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part) of every place that can be
-        read, in the order they were added; the others are added to `left_out`."""
+        """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
+        every readable place, in the order they were added. Note the other places in `left_out`."""
         for place_id, row in self.scan(f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"):
             try:
                 *values, geom_checksum, coarse, checksum = rows.present(row)
@@ -135,7 +135,7 @@ class PlaceMap(MapConnection):
             yield place_id, point, heading_deg, part
 
     def mean_coarse(self) -> Singles:
-        """Return the mean of all coarse parts that can be read, float32 with the shape of one part."""
+        """Return the mean of all coarse parts that can be read, float32, in the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan("coarse, coarse_crc32"):
             with suppress(Unreadable):
@@ -146,9 +146,10 @@ class PlaceMap(MapConnection):
         return mean.astype(np.float32)
 
     def fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
-        """Read the fine part of one place from the file (read-only array of `spec.fine`), and its position.
+        """Read one place from the file: return its fine part, a read-only array of `spec.fine`, and its (lat_deg,
+        lon_deg), None if it has no position.
 
-        Raises PlaceError for one that is missing or damaged.
+        Raises PlaceError for a place that is missing or damaged.
         """
         place_id = int(place_id)
         with self._named(place_id):
@@ -159,19 +160,19 @@ class PlaceMap(MapConnection):
             return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
 
     def footprint_m(self) -> float | None:
-        """Return the median footprint of the places whose pose is known, None where none is."""
+        """Return the median footprint in metres of the places with a known pose; None if there are none."""
         footprints_m = [row[0] for _, row in self.scan("footprint_m") if row]
         known = [value for value in footprints_m if isinstance(value, float) and 0 < value < math.inf]
         return float(np.median(known)) if known else None
 
     def landmarks_of(self, place_id: int) -> bytes | None:
-        """Read the landmarks of one place from the file, None where it has none. Raises PlaceError for one that is
-        missing or damaged."""
+        """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
+        is missing or damaged."""
         with self._named(place_id):
             return rows.landmarks_of(*rows.present(self.row(int(place_id), "landmarks, landmarks_crc32")))
 
     def ids_by(self, columns: str) -> dict[Values, list[int]]:
-        """Return the ids of the places that can be read, by their values in these columns."""
+        """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
         ids: dict[Values, list[int]] = {}
         for place_id, row in self.scan(columns):
             if row:
@@ -179,10 +180,11 @@ class PlaceMap(MapConnection):
         return ids
 
     def is_of(self, place_id: int, coarse: Array) -> bool:
-        """Tell whether a place was made of the picture with this coarse part; False for a place that cannot be read.
+        """Return True if a place's coarse part nearly equals `coarse`, so that both are of the same picture. Return
+        False if the place cannot be read.
 
-        The last bits of a descriptor may differ from one run of a program to the next: sums depend on where an array
-        lies in memory. Of numbers that stand for something, a few are then others.
+        The last bits of a descriptor may differ between two runs of a program: floating-point sums depend on where an
+        array lies in memory. If the numbers are codes, a few of them may then be quite different.
         """
         try:
             (blob,) = rows.present(self.row(place_id, "coarse"))
@@ -194,7 +196,8 @@ class PlaceMap(MapConnection):
         return bool(near or np.mean(there != here) <= _OTHERS)
 
     def outlines(self) -> Iterator[tuple[int, float, float, float]]:
-        """Yield (place_id, lat_deg, lon_deg, quality) of every place that can be read; NaN where it has no position."""
+        """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Note
+        the other places in `left_out`."""
         for place_id, row in self.scan("geom, quality, geom_crc32"):
             try:
                 geom, quality, checksum = rows.present(row)
@@ -211,7 +214,8 @@ class PlaceMap(MapConnection):
         return text if isinstance(text, str) else None
 
     def _text_beside(self, key: str) -> str | None:
-        """Read what is kept beside the places; None for nothing, or for a row that cannot be read. Raises MapError."""
+        """Return the text stored under `key` in edgevpr_map; None if there is none or it cannot be read. Raises
+        MapError."""
         with sentences(self.path):
             try:
                 row = self.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
@@ -230,7 +234,7 @@ class PlaceMap(MapConnection):
 
     @contextmanager
     def _named(self, place_id: int) -> Iterator[None]:
-        """Turn what is wrong with a row into a PlaceError."""
+        """Turn an Unreadable of the body of `with` into a PlaceError with the place's id."""
         try:
             yield
         except Unreadable as error:

@@ -1,4 +1,4 @@
-"""Names of map files and of the files that SQLite keeps beside them, and the lock of the one program that adds."""
+"""Paths of map files and of the files that SQLite keeps beside them, and the lock of the program that adds places."""
 
 import fcntl
 import os
@@ -13,12 +13,12 @@ _BESIDE = ("-wal", "-shm", "-journal")
 
 
 def beside(path: Path) -> list[Path]:
-    """Return the files that SQLite keeps beside a map: its log, the index of the log, and the journal."""
+    """Return the paths at which SQLite may keep files of a map: write-ahead log, index of the log, rollback journal."""
     return [path.with_name(path.name + end) for end in _BESIDE]
 
 
 def map_path(name: str | Path) -> Path:
-    """Return the path of a map. Raises UsageError for a name that no file can have."""
+    """Return `name` as a path. Raises UsageError for a name that no file can have."""
     text = str(name)
     possible = False
     with suppress(UnicodeEncodeError):
@@ -29,8 +29,8 @@ def map_path(name: str | Path) -> Path:
 
 
 def existing(name: str | Path) -> Path:
-    """Return the path of a map that is there. Raises UsageError as `map_path`, and MapError for a map that is missing
-    or is no regular file."""
+    """Return the path of an existing map file. Raises UsageError as `map_path` does, and MapError if the file is
+    missing or is not a regular file."""
     path = map_path(name)
     try:
         if not path.exists():
@@ -45,19 +45,19 @@ def existing(name: str | Path) -> Path:
 
 
 def require_regular(path: Path) -> None:
-    """Raise MapError where the map, or a file of SQLite's beside it, is anything but a file: a folder, or a pipe, whose
-    reading would never end."""
+    """Raise MapError if the map, or a file of SQLite beside it, exists but is not a regular file: a folder, or a pipe,
+    from which a program would read for ever."""
     for each in (path, *beside(path)):
         if each.exists() and not stat.S_ISREG(each.stat().st_mode):
             raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")
 
 
 def lock(path: Path, make: bool = False) -> int:
-    """Lock a map for the one program that adds places to it, until the descriptor that is returned is closed.
+    """Lock a map for the one program that may add places; return a file descriptor, whose closing ends the lock.
 
-    Readers need no lock. It is not SQLite's own, which holds for one place only: two programs that map the same
-    pictures would add every place twice. With `make`, a missing file is made. Raises MapBusyError where another program
-    has the lock, and MapError where the file cannot be opened.
+    Readers need no lock. SQLite's own lock is not enough, since it lasts for one transaction only: two programs that
+    map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
+    program has the lock, and MapError if the file cannot be opened.
     """
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
@@ -74,14 +74,14 @@ def lock(path: Path, make: bool = False) -> int:
             f"{path}: another program is adding places to this map: wait until it has finished, or stop it."
         ) from None
     except OSError:
-        pass  # a file system without locks
+        pass  # a file system without locks: go on
     return descriptor
 
 
 @contextmanager
 def whole_or_none(out: Path) -> Iterator[Path]:
-    """Give the path of a file to write a new map to; at the end it becomes `out`. Where anything fails it is removed:
-    half a map would look like a whole one. Raises MapError where a map is there already."""
+    """Yield the path of a temporary file to write a new map to, and rename it to `out` at the end of `with`. Remove it
+    if the body fails: half a map would look like a complete one. Raises MapError if `out` has content already."""
     require_regular(out)
     if out.exists() and out.stat().st_size:
         raise MapError(f"{out} is there already: choose another name.")
@@ -94,6 +94,6 @@ def whole_or_none(out: Path) -> Iterator[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a map that was not finished, with the files beside it."""
+    """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
     for each in (path, *beside(path)):
         each.unlink(missing_ok=True)

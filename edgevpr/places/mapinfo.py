@@ -1,4 +1,4 @@
-"""Quick looks at a whole map by SQLite: its summary, its identity, and which of its places is near a position."""
+"""Queries about a whole map that read no descriptors: its summary, its identity, the distance to its nearest place."""
 
 import hashlib
 import math
@@ -27,11 +27,11 @@ WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapInfo:
-    """Summary of a map; `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees, None without positions or where
-    the file does not say it. What the file has in another form than edgevpr writes is None too. `of_low_quality` counts
-    the places that were kept only to bound a gap. Of `with_pose` places it is known how the picture lies on the ground:
-    `footprint_m` is the mean length of its longest side there, and `position_sd_m` how exactly the positions are known,
-    one axis, root mean square (None: of none)."""
+    """Summary of a map. `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees. Any field is None if no place has
+    the value, or if another program wrote it in another form. `with_position` and `with_pose` are numbers of places.
+    `of_low_quality` is the number added only because there would have been too wide a gap. `mean_quality` is 0..1. Of
+    the places with a pose, `footprint_m` is the mean length on the ground of a picture's longest side, and
+    `position_sd_m` the standard deviation of the positions along one axis, as root mean square."""
 
     path: str
     spec: TechniqueSpec
@@ -51,9 +51,9 @@ class MapInfo:
 
 @dataclass(frozen=True, slots=True)
 class MapIdentity:
-    """The identity of a map: the same for every copy of its file, another as soon as one place is another. `map_id`
-    was drawn when the map was made. `sha256` is of all `places` (positions, poses, names of pictures, checksums of what
-    is larger) and of all else the map says of itself, such as its calibration."""
+    """Identity of a map: equal for all copies of its file, different as soon as one place differs. `map_id` is the
+    random id given at its creation (None: the file has none). `places` is their number. `sha256` covers all places
+    (positions, poses, picture names, checksums of larger values) and the table edgevpr_map, with the calibration."""
 
     map_id: str | None
     places: int
@@ -61,7 +61,7 @@ class MapIdentity:
 
 
 def info_of(place_map: PlaceMap) -> MapInfo:
-    """Summarise a map. Raises MapError where it cannot be read."""
+    """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
         summary = place_map.db.execute(_SUMMARY).fetchone()
         extent = place_map.db.execute(
@@ -88,10 +88,10 @@ def info_of(place_map: PlaceMap) -> MapInfo:
 
 
 def identity_of(place_map: PlaceMap) -> MapIdentity:
-    """Return the identity of an open map, as it is now. Raises MapError where it cannot be read.
+    """Return the identity of an open map as it is now. Raises MapError if it cannot be read.
 
-    A hash of the file would read all of it at every start, which takes a small board seconds. The checksums of the
-    places stand before their descriptors, so reading them is quick, and they say as much.
+    Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors stand
+    before them in the file, so they are read quickly, and change whenever a descriptor changes.
     """
     digest, places = hashlib.sha256(), 0
     with sentences(place_map.path):
@@ -104,7 +104,8 @@ def identity_of(place_map: PlaceMap) -> MapIdentity:
 
 
 def index_positions(place_map: PlaceMap) -> None:
-    """Add the R-tree, unless the map has it. A damaged position is not in it. Raises MapError."""
+    """Add an R-tree of the positions to the map file, unless it has one. Damaged positions are left out. Raises
+    MapError."""
     db = place_map.db
     with sentences(place_map.path):
         if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
@@ -117,10 +118,10 @@ def index_positions(place_map: PlaceMap) -> None:
 
 
 def nearest_m(place_map: PlaceMap, position: Position, within_m: float) -> float | None:
-    """Return the metres to the nearest place of the file that can be read; None where none lies within `within_m`
-    metres.
+    """Return the distance in metres from `position` to the nearest readable place of the file; None if it is greater
+    than `within_m`.
 
-    Call `index_positions` before. Raises MapError where the file cannot be read.
+    Call `index_positions` before. Raises MapError if the file cannot be read.
     """
     lat_deg, lon_deg = position.lat_deg, position.lon_deg
     north_deg = math.degrees(within_m / EARTH_RADIUS_M)

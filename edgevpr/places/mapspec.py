@@ -1,4 +1,4 @@
-"""The table edgevpr_map of a map file: the format of the file, and the technique that made its descriptors."""
+"""The table edgevpr_map of a map file: it stores the format version, and the technique that made the descriptors."""
 
 import json
 import math
@@ -17,17 +17,17 @@ from edgevpr.core.errors import MapError
 from edgevpr.places import geopackage, rows
 
 FORMAT_VERSION = 1
-_BEFORE_RELEASE = 4  # the number of the same format in maps that were made before it was released
+_BEFORE_RELEASE = 4  # format version in maps made before the first release; their format is the same
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
-BESIDE = MASK, CALIBRATION = ("mask_sha256", "calibration")  # keys of what is kept beside the places
-_MOST_STORED = 1000  # rows of the table, and characters that a message shows of a damaged one
+BESIDE = MASK, CALIBRATION = ("mask_sha256", "calibration")  # keys of texts that a map may lack
+_MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
 
 
 def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
-    """Write the table, which must be there and empty. Raises sqlite3.Error."""
+    """Fill the table edgevpr_map, which must exist and be empty, for a new map of `spec`. Raises sqlite3.Error."""
     described = {
         "format_version": FORMAT_VERSION,
         "map_id": uuid.uuid4().hex,
@@ -46,17 +46,18 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
-    """Read the table of the map file `path`, open as `db`, after a look at the form of the table of places.
+    """Return the values of edgevpr_map by key, without mask and calibration, and check the columns of `places`.
 
-    Raises MapError for a file that is no place map or has another format, and sqlite3.Error.
+    `db` is the connection to the map file `path`. Raises MapError for a file that is not a place map or has an unknown
+    format version, and sqlite3.Error.
     """
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
-    # A view or a virtual table has no page of its own in the file; a query of one need not end.
+    # A view or virtual table, which has no page of its own in the file, is refused: a query of it may never end.
     tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}
     if application_id != geopackage.APPLICATION_ID or not {"edgevpr_map", "places"} <= tables:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
-        # What is kept beside the places is read when it is asked for: a map is of use without it.
+        # Mask and calibration are read only when they are needed: a map can be used without them.
         said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?)", BESIDE).fetchmany(_MOST_STORED)
         stored = {key: json.loads(value) for key, value in said}
         version = stored["format_version"]
@@ -74,7 +75,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
 
 
 def spec_of(path: Path, stored: Stored) -> TechniqueSpec:
-    """Return the specification of the technique that made the map. Raises MapError for one that makes no sense."""
+    """Return the specification of the technique that made the map, from `stored`. Raises MapError if it is invalid."""
     try:
         coarse, model = _part_spec(stored["coarse"]), stored["model_sha256"]
         parameters = dict(stored["parameters"])
@@ -95,13 +96,13 @@ def spec_of(path: Path, stored: Stored) -> TechniqueSpec:
 
 
 def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
-    """List, in words, in what the technique of a map differs from ours."""
+    """Return one phrase for each difference between the technique of a map and ours; empty if they are equal."""
     return [f"{what} is {there}, not {here}" for what, there, here in _compared(theirs, ours) if there != here]
 
 
 def _require_layer(path: Path, db: sqlite3.Connection) -> None:
-    """Raise MapError where the table of places has not the columns and the kind of positions that every map has."""
-    # A generated column is hidden: it stands in no row, and may be as large as its expression says.
+    """Raise MapError unless the table of places has the columns, and the kind of geometry, that every map has."""
+    # Generated columns (marked hidden) are refused: they are computed when read, so their size has no limit.
     there = {name: (hidden, kind, key) for _, name, kind, _, _, key, hidden in db.execute("PRAGMA table_xinfo(places)")}
     wrong = sorted(name for name in ("place_id", *rows.ALL.split(", ")) if there.get(name, (True,))[0])
     if wrong or there["place_id"][1:] != ("INTEGER", 1):
