@@ -1,6 +1,5 @@
-"""Decoding with FFmpeg (PyAV), which tells what OpenCV hides: packets that were lost, pictures that are not whole.
-
-Only what opens a stream or a video file imports this: the library takes room.
+"""Decoding of streams and video files with FFmpeg (PyAV), which reports lost packets and incomplete pictures, as OpenCV
+does not. Imported only when a stream or video file is opened, because the library takes memory.
 """
 
 import logging
@@ -21,21 +20,21 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.frame import VideoFrame
 
-# FFmpeg's messages are listened to for packets that went missing; what else it says is said in edgevpr's own words.
+# FFmpeg's messages are searched for lost packets. All others are dropped: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
 _MISSED = "missed"  # "RTP: missed 3 packets", the only sign of it
 
-_PACKETS_IN_DOUBT = 2
-_UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: what looks like a time stamp has been made up from a frame rate
+_PACKETS_IN_DOUBT = 2  # after a sign of loss: this packet and the next
+_UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
 
 
 def open_pictures(
     uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
 ) -> "WholePictures | None":
-    """Open a stream or file with FFmpeg's options, and the time-outs for opening and for every reading; None where
-    nothing is there that holds pictures."""
+    """Open a stream or file with `options` of FFmpeg. `timeouts_s` are those for opening and for each read (None: no
+    time-outs). Returns None if it cannot be opened or has no pictures."""
     with av.logging.Capture() as said:
         try:
             container = av.open(uri, options=options, timeout=timeouts_s)
@@ -49,7 +48,7 @@ def open_pictures(
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A packet; `is_doubtful` where others may be missing before it."""
+    """A packet of the stream. `is_doubtful`: packets before it may be missing."""
 
     packet: "Packet[Any]"
     is_doubtful: bool
@@ -60,33 +59,33 @@ def _is_missed(said: list[tuple[int, str, str]]) -> bool:
 
 
 class WholePictures:
-    """The pictures of one container that are whole: `fetch` a packet, then `decode` it. A picture that is damaged, and
-    all that are predicted from it until the next one that stands alone, are refused before they cost anything.
+    """The complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is rejected,
+    and so are all pictures after it up to the next key frame, which is decoded without others.
 
-    FFmpeg reads ahead while it opens a stream. Where packets `are_missed` then, it is not known which, and no packet is
-    trusted until `caught_up` is called."""
+    FFmpeg reads ahead while it opens a stream. `are_missed`: it reported lost packets then. As it is not known which,
+    all packets are rejected until `caught_up` is called."""
 
     def __init__(self, container: "InputContainer", are_missed: bool) -> None:
         self.container, self.stream = container, container.streams.video[0]
         self.time_base = self.stream.time_base or Fraction(1, 1_000_000)  # seconds of a time stamp's unit
         self.is_stamped = not container.format.flags & _UNSTAMPED
         self._codec = self.stream.codec_context
-        self._codec.thread_count = 1  # pictures decoded side by side come late, and each takes memory
-        self._codec.options = {"err_detect": "explode"}  # what cannot be decoded is not filled in
+        self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory
+        self._codec.options = {"err_detect": "explode"}  # damaged data is an error, and not filled in
         self._packets = container.demux(self.stream)
         self._reformatter = VideoReformatter()
         self._is_backlog_doubtful = are_missed
-        self._doubtful = 0  # so many packets from now on are not to be trusted, where it is above zero
-        self._refusal: Refusal | None = Refusal.LATE  # of all until the next one that stands alone
+        self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
+        self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
         self._has_begun = False
 
     def caught_up(self) -> None:
-        """Take note that what is fetched from now on came after the opening."""
+        """Trust the packets that are fetched from now on: they were sent after the opening."""
         self._is_backlog_doubtful = False
 
     def fetch(self) -> Fetched | None:
-        """Wait for the next packet and return it; None at the end, and where the stream is lost. One thread may do this
-        while another one decodes."""
+        """Wait for the next packet and return it; None at the end of the file, or if the stream is lost. One thread may
+        fetch while another one decodes."""
         with av.logging.Capture() as said:
             try:
                 packet = next(self._packets, None)
@@ -95,17 +94,18 @@ class WholePictures:
         if packet is None:
             return None
         if packet.is_corrupt or _is_missed(said):
-            # FFmpeg notices a gap while it puts together the picture after the one that it hands out.
+            # FFmpeg reports a gap while it assembles the picture after the one that it returns.
             self._doubtful = _PACKETS_IN_DOUBT
         self._doubtful -= 1
         return Fetched(packet, self._doubtful >= 0)
 
     def skip(self) -> Refusal:
-        """Leave a packet out, and say why it and those that are built on it are refused."""
+        """Reject the packet just fetched, and those after it up to the next key frame; return the reason."""
         return self._refuse(Refusal.LATE)
 
     def decode(self, fetched: Fetched) -> "list[VideoFrame] | Refusal":
-        """Return the pictures that are ready after this packet: none, one, or at the end several."""
+        """Return the pictures that are complete after this packet (none, one, or at the end several), or the reason why
+        it is rejected."""
         packet = fetched.packet
         if not packet.size:
             return [] if self._refusal else self._decoded(packet)
@@ -117,15 +117,15 @@ class WholePictures:
             if self._has_begun:
                 self._codec.flush_buffers()
             self._refusal, self._has_begun = None, True
-        # Bytes that were changed within the data of a JPEG are noticed where they make no sense or data run out. Most
-        # make sense: they give a picture whose rest is shifted or of another brightness, but is no older.
+        # Changed bytes within a JPEG are detected only if they are invalid or data run out. Most are valid and give a
+        # picture whose remainder is shifted or brighter, but that contains nothing of an older picture.
         if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
             return self._refuse()
         return self._decoded(packet)
 
     def pixels(self, picture: "VideoFrame", form: str = "bgr24") -> np.ndarray:
-        """Return the pixels of a picture, uint8: (H, W, 3) BGR, or (H, W) for the form "gray". Maps and queries go
-        through this alike, so that the same picture gives the same pixels."""
+        """Return the pixels of a picture, uint8: (H, W, 3) BGR, or (H, W) for the form "gray". Maps and queries are
+        both converted here, so that equal pictures give equal pixels."""
         return self._reformatter.reformat(picture, format=form, interpolation="BICUBIC").to_ndarray()
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
-"""Image files: the list of a folder, the pixels of one file, and pictures made into files. An incomplete file is
-refused, never half decoded.
+"""Image files: listing the images of a folder, decoding one, and encoding pictures. An incomplete file is an error,
+never decoded in part.
 
 All modules that read pictures or streams import `cv2` from here. OpenCV's own log messages are turned off, as edgevpr
 reports each fault once, in its own words; to get them back, set OPENCV_LOG_LEVEL before the start.
@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2 as cv2  # the one that other rooms import from here
+import cv2 as cv2  # other packages import it from here
 import numpy as np
 
 from edgevpr.core.arrays import Image
@@ -27,13 +27,13 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-_MAX_FILE_BYTES = 4 * MAX_PIXELS  # such a picture with transparency, not compressed at all
-_FOLDERS_NAMED = 3  # in a sentence
+_MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
+_FOLDERS_NAMED = 3  # subfolders suggested in an error message
 _SMALL_PX, _SMALL_QUALITY, _TAPE_QUALITY = 640, 80, 95
 
 _JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_STARTS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s")  # TIFF, BMP, WebP and PNM are the last
+_STARTS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s")  # JPEG, PNG, TIFF (2), BMP, WebP, PNM
 # In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
@@ -41,9 +41,9 @@ _MOST_SCANS = 100  # of a progressive JPEG, which has about ten; each costs the 
 
 
 def list_images(folder: str | Path) -> list[Path]:
-    """List the images that lie in `folder`, sorted by name, with numbers in counting order (2 before 10).
+    """List the paths of the images directly in `folder`, sorted by name, numbers in counting order (2 before 10).
 
-    Raises SourceError for a folder that is missing, cannot be read or holds no images.
+    Raises SourceError for a folder that is missing, cannot be read or has no images.
     """
     folder = Path(folder)
     try:
@@ -60,7 +60,7 @@ def list_images(folder: str | Path) -> list[Path]:
 
 
 def is_image(name: str) -> bool:
-    """Tell whether a file of this name is taken for an image."""
+    """Return True if the file name is that of an image."""
     # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
 
@@ -73,16 +73,16 @@ def _holds_images(folder: Path) -> bool:
 
 
 def counting_order(name: str) -> tuple[list[str | int], str]:
-    """Return the key that sorts names with their numbers in counting order (2 before 10)."""
+    """Return the sort key of a file name; numbers within names sort in counting order (2 before 10)."""
     parts = re.split(r"(\d+)", name.lower())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
 def read_image(path: str | Path) -> Image:
-    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey; turned as its EXIF says, without transparency.
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated as its EXIF data say, without transparency.
 
     Raises ImageError for a file that is missing, no regular file, cut short, no image, not 8 bit, smaller than 16x16
-    pixels, or of more than `MAX_PIXELS`, of which nothing is decoded.
+    pixels, or larger than `MAX_PIXELS`.
     """
     try:
         data = read_file(path, _MAX_FILE_BYTES)
@@ -102,7 +102,7 @@ def read_image(path: str | Path) -> Image:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         is_too_large = "MAX_IMAGE" in str(error)
-    # The second is of a program that has imported OpenCV before edgevpr: its limit is another then.
+    # A program that has imported OpenCV before edgevpr has another limit there: so the size is checked here as well.
     if is_too_large or (image is not None and image.shape[0] * image.shape[1] > MAX_PIXELS):
         raise ImageError(
             f"{path} has too many pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: give a smaller image."
@@ -121,24 +121,23 @@ def read_image(path: str | Path) -> Image:
 
 
 def decoded(jpeg: bytes) -> Image:
-    """Decode a JPEG that edgevpr has written, (H, W, 3) BGR or (H, W) grey."""
+    """Decode a JPEG that edgevpr has written to uint8, (H, W, 3) BGR or (H, W) grey."""
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_ANYCOLOR)  # type: ignore[return-value]  # uint8
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write a picture, uint8, (H, W, 3) BGR or (H, W) grey, without losses. Raises OSError where the disk does not take
-    it."""
+    """Write a picture, uint8 (H, W, 3) BGR or (H, W) grey, as PNG. Raises OSError."""
     path.write_bytes(_encoded(".png", image))
 
 
 def as_jpeg(image: Image) -> bytes:
-    """Return a picture, uint8, (H, W) grey or (H, W, 3) BGR, as the JPEG that the tape of a flight keeps."""
+    """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in recordings of flights."""
     return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))
 
 
 def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
-    """Return a picture for people to look at, uint8, grey or BGR, as a JPEG whose longest side has 640 pixels at most,
-    or `longest_px`."""
+    """Encode a picture, uint8 (H, W[, 3]), as a small JPEG for people to look at: its longest side is scaled down to
+    `longest_px` if it is longer."""
     scale = min(1.0, longest_px / max(image.shape[:2]))
     if scale < 1:
         width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
@@ -147,7 +146,7 @@ def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
 
 
 def resized(image: Image, size_px: tuple[int, int]) -> Image:
-    """Return a picture in another size (width, height), smaller ones with the mean of the pixels that become one."""
+    """Scale a picture to `size_px` (width, height). In a smaller picture each pixel is the mean of those it covers."""
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
@@ -156,10 +155,10 @@ def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes
 
 
 def _is_incomplete(data: bytes) -> bool:
-    """Tell whether a JPEG ends before its end mark, or a PNG does not have all its chunks intact.
+    """Return True for a JPEG without its end mark, or a PNG in which a chunk is missing or damaged.
 
-    OpenCV 4 fills the missing part of a JPEG with grey without an error, and does not check the checksums of a PNG. The
-    decoders of the other formats detect damage themselves. Bytes after the end mark are harmless.
+    OpenCV 4 fills the missing part of a JPEG with grey without an error, and ignores the checksums of a PNG. Its
+    decoders of the other formats detect damage themselves. Bytes after the end mark are allowed.
     """
     if data.startswith(_JPEG_START):
         return not jpeg_is_whole(data)
@@ -167,9 +166,10 @@ def _is_incomplete(data: bytes) -> bool:
 
 
 def jpeg_is_whole(data: bytes) -> bool:
-    """Walk from marker to marker (ITU-T T.81, annex B); return True where the end mark of the image is reached.
+    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there.
 
-    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not taken for the image's.
+    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not mistaken for the image's. An
+    image of more than 100 scans counts as damaged.
     """
     position, scans = 2, 0
     while marker := _MARKER.search(data, position):
@@ -184,7 +184,7 @@ def jpeg_is_whole(data: bytes) -> bool:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Walk from chunk to chunk (length, kind, content, checksum); return True where the end chunk is reached."""
+    """Walk through the chunks (length, kind, content, checksum) of a PNG; return True if all are intact to the end."""
     position = len(_PNG_START)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")

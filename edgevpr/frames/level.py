@@ -1,4 +1,8 @@
-"""Levelling: lays the picture of a camera that looks down on flat ground, north-up and to scale, in one warp."""
+"""Levelling: warps the picture of a camera that looks down, as if taken straight from above, north-up and to scale.
+
+The ground is taken as flat. "Level" means without roll and pitch. The footprint of a picture is the ground that it
+shows. Recognition and mapping level their pictures by `runtime.recognise.levelling`, which calls this module.
+"""
 
 import math
 from collections.abc import Iterator
@@ -13,12 +17,12 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import resized
 
 MOST_TILT_DEG = 45.0
-_MOST_OFF_DOWN_DEG = 85.0  # of a corner's ray: beyond it are the horizon and ground that fills no pixel
+_MOST_OFF_DOWN_DEG = 85.0  # between a corner's ray and straight down: beyond are the horizon and far too distant ground
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # less than these changes no match
-# Ground length of the picture over the length it is scaled to. Beyond these limits too few of its pixels are left, or
-# too little of the output is filled; a height that is so far from the map's is likelier to be wrong.
+# Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
+# of the output is filled, and the height is more likely wrong than so far from the map's.
 _ZOOMS = (0.3, 4.0)
-_LEAST_FILLED = 1 / 3  # of what the same picture would fill if it were taken straight down
+_LEAST_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
 _HIGHEST_M = 10_000.0
 _LONGEST_PX = 1024  # of a warped picture: no technique sees more
 _SUBPIXEL_BITS = 4
@@ -35,12 +39,14 @@ class Lens:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
-    """The way a picture lies on the ground (None: unknown). `up_deg` is the compass direction (0..360) of its top, and
-    `footprint_m` the length on the ground of its longest side. `aside` is the point straight under the camera, from the
-    middle of the picture, (right, up) as shares of the longest side. By `zoom` it was scaled, so that it shows as much
-    less ground. `lean_m` is the way on the ground, metres east and north, from what the middle of the picture shows to
-    the point straight under the camera, of a picture that was left as it is since its lens is unknown. `reason` tells
-    why the picture was left tilted (None: it was not)."""
+    """Direction, size and offset of a picture on the ground (None: unknown).
+
+    `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
+    `aside`: the point straight under the camera, from the picture's middle, (right, up) in shares of the longest side.
+    `zoom`: factor by which the picture was enlarged, so that its longest side shows that many times less ground.
+    `lean_m`: offset on the ground (east, north) in metres from the point in the picture's middle to the point straight
+    under the camera. Set only for a picture that was not warped because its lens is unknown.
+    `reason`: words that say why a tilted picture was not warped (None: it was, or needed no warp)."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -50,7 +56,7 @@ class View:
     reason: str | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields that the flight log has for a view."""
+        """Return the fields of the flight log for this view, rounded."""
         return {
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
@@ -65,8 +71,8 @@ UNKNOWN_VIEW = View()
 
 @dataclass(frozen=True, slots=True)
 class Levelled:
-    """A picture as it is encoded: `image` uint8 (H, W[, 3]), `mask` bool (H, W), False where it does not show ground
-    (None: it does everywhere), and how it lies on the ground."""
+    """A picture ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it does not show ground
+    (None: it shows ground everywhere); and `view`, its direction, size and offset on the ground."""
 
     image: Image
     mask: Mask | None
@@ -82,13 +88,14 @@ def levelled(
     overlay: Mask | None = None,
     below: bool = False,
 ) -> Levelled:
-    """Lay a picture on flat ground, as far as the frame, else the vehicle, tells how it was taken.
+    """Warp a picture as if it had been taken straight from above. Roll, pitch, heading and height are those of the
+    frame, or where it has none those of `vehicle` (None: no report).
 
-    It is untilted by roll and pitch (unknown: it counts as level), turned north-up by the heading (unknown: its top
-    stays), and scaled by the height so that its longest side shows `footprint_m` (None, or height unknown: it keeps its
-    own scale). In the middle is what the middle of the picture shows, or with `below` the point under the camera.
-    `overlay`, bool (H, W), is False where the picture shows no ground. What needs no warp keeps its image, and so does
-    what bears none: then `View.reason` says why. No value of frame or vehicle raises.
+    The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
+    scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). The middle of the result
+    shows the same point as the middle of the picture or, with `below`, the point under the camera. `overlay`, bool
+    (H, W), is False where the picture shows no ground (None: nowhere). If no warp is needed, or the picture is tilted
+    too far (see `View.reason`), the image is returned as it is. No value of frame or vehicle raises.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
@@ -129,8 +136,9 @@ def levelled(
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
-    """Return how far a picture of an unknown lens looks aside, as far as the frame, else the vehicle, tells how it was
-    taken; of a picture that bears no warp, the reason. No value of frame or vehicle raises."""
+    """Return the view of a picture whose lens is unknown: `lean_m`, from the roll, pitch, heading and height of the
+    frame, or where it has none of `vehicle`; or `reason` if it is tilted too far; or neither if too little is known.
+    No value of frame or vehicle raises."""
     roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -147,9 +155,12 @@ def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
 
 
 class _Taking:
-    """The way in which a picture was taken, as far as it is known. Rotations are (3, 3), between the axes of the lens
-    (right and back in the picture, and ahead of it), of the airframe (nose, right, down), and of the level picture
-    (right, back, down)."""
+    """The geometry of a picture when it was taken, as far as known. `top_deg` to `objection` explain its results.
+
+    Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
+    looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
+    `straight` is the rotation from lens to level picture without a turn. `own_m` is the ground length of the longest
+    side if the picture were level (None: height unknown). `corners` (3, 4) are homogeneous pixels."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
@@ -173,17 +184,17 @@ class _Taking:
 
     @property
     def top_deg(self) -> float | None:
-        """Compass direction of the top of the picture."""
+        """Compass direction of the top of the picture, None if the heading is unknown."""
         return None if self.heading_deg is None else (self.heading_deg + self._lens.up_deg) % 360
 
     @property
     def turn_deg(self) -> float:
-        """Degrees between the top of the picture and north, 0 where the heading is unknown."""
+        """Degrees between the top of the picture and north (0..180), 0 if the heading is unknown."""
         return 0.0 if self.top_deg is None else abs((self.top_deg + 180) % 360 - 180)
 
     @property
     def objection(self) -> str | None:
-        """The reason why the picture bears no warp, None where there is none."""
+        """The reason why the picture is tilted too far to be warped, None if it is not."""
         rays = self.straight @ self.lens_from_pixel @ self.corners
         lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
         if self.tilt_deg <= MOST_TILT_DEG and lowest >= math.cos(math.radians(_MOST_OFF_DOWN_DEG)):
@@ -191,25 +202,26 @@ class _Taking:
         return f"it is tilted {self.tilt_deg:.0f} degrees"
 
     def level_from_lens(self, up_deg: float) -> Doubles:
-        """Return the rotation to a level picture whose top points `up_deg` to the right of the nose."""
+        """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
         rotation: Doubles = _body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg)
         return rotation
 
     def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
-        """Return `View.aside` of a picture that is turned like this; None where the attitude is unknown."""
+        """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the attitude is unknown."""
         right, back = turned[:2, 2] / turned[2, 2] * zoom * self.focal_px / self.longest_px
         return (float(-right), float(back)) if self.is_attitude_known else None
 
 
 def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
-    """Yield roll, pitch, heading and height of a picture, as the frame, else the vehicle, knows them."""
+    """Yield roll, pitch, heading (degrees) and height (m) of the frame, or where it has none those of the vehicle."""
     for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
         values = (getattr(frame, name), getattr(vehicle, name, None))
         yield next((value for value in values if value is not None and math.isfinite(value)), None)
 
 
 def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
-    """Return the rotation (3, 3) from nose, right, down of the airframe to those of a level one with its heading."""
+    """Return the rotation (3, 3) from the axes (nose, right, down) of the airframe to those of a level airframe with
+    the same heading."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
@@ -218,28 +230,28 @@ def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
 
 
 def _body_from_lens(up_deg: float) -> Doubles:
-    """Return the rotation (3, 3) to nose, right, down from right, back, down of a picture whose top points `up_deg` to
-    the right of the nose."""
+    """Return the rotation (3, 3) to the axes (nose, right, down) from the axes (right, down in the picture, viewing
+    direction) of a camera that looks straight down, the picture's top `up_deg` clockwise from the nose."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
 
 
 def _quadrangle(corners: Doubles, side: int) -> Mask:
-    """Return bool (side, side), True inside the quadrangle of homogeneous corners (3, 4)."""
+    """Return bool (side, side), True inside the quadrangle whose corners are homogeneous pixels, float (3, 4)."""
     points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
     return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS).view(np.bool_)
 
 
 def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
-    """Warp an image to (side, side). Where `shrink` pixels become one, and they are more than two, their mean is taken
-    first: a warp alone would leave most of them out."""
+    """Warp an image to (side, side) pixels by the homography `out_from_pixel` (3, 3). Along a side, `shrink` pixels
+    become one. If more than two, the image is averaged first, since a warp alone would ignore most pixels."""
     if shrink > 2:
         height, width = image.shape[:2]
         small = max(1, round(width / shrink)), max(1, round(height / shrink))
         across, along = width / small[0], height / small[1]
         image = resized(image, small)
         out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
-    # The edge goes on outside, where the mask is False, so that it makes no gradient inside.
+    # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
     warped = cv2.warpPerspective(
         image, out_from_pixel, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -248,8 +260,8 @@ def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink:
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """A rectangle on flat ground: its middle (east, north), metres from a common point, the lengths of its sides from
-    left to right and from top to bottom of the picture, and the direction of the top of the picture (0..360)."""
+    """The rectangle of flat ground that a picture shows: its middle (east, north) in metres from a common origin, its
+    width and height in metres, and the compass direction (0..360) of the picture's top."""
 
     middle_m: tuple[float, float]
     sides_m: tuple[float, float]
@@ -257,22 +269,22 @@ class Footprint:
 
     @property
     def rectangle(self) -> tuple[tuple[float, float], tuple[float, float], float]:
-        """The rectangle in the coordinates of a picture, whose rows go south, as OpenCV takes it."""
+        """The rectangle as OpenCV's rotated rectangle (middle, sides, degrees), x to the east and y to the south."""
         return (self.middle_m[0], -self.middle_m[1]), self.sides_m, self.up_deg
 
 
 def footprint(
     middle_m: tuple[float, float], height_m: float, fov_deg: float, size_px: tuple[int, int], up_deg: float
 ) -> Footprint:
-    """Make the footprint of a picture of this size (width, height), taken from `height_m` above flat ground with a
-    field of view of `fov_deg` across its longest side."""
+    """Return the footprint of a picture of `size_px` (width, height) taken straight down from `height_m` above flat
+    ground, with a field of view of `fov_deg` across its longest side. `middle_m` and `up_deg` are as in `Footprint`."""
     longest_m = 2 * height_m * math.tan(math.radians(fov_deg) / 2)
     width_m, depth_m = (longest_m * each / max(size_px) for each in size_px)
     return Footprint(middle_m, (width_m, depth_m), up_deg)
 
 
 def shared(one: Footprint, other: Footprint) -> float:
-    """Return the share of the smaller footprint that lies in the other, 0..1."""
+    """Return the area that two footprints share, as a share of the area of the smaller one, 0..1."""
     kind, corners = cv2.rotatedRectangleIntersection(one.rectangle, other.rectangle)
     if kind == cv2.INTERSECT_NONE:
         return 0.0

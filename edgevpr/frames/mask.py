@@ -1,6 +1,6 @@
-"""The overlay mask: which part of every frame shows ground, and which a display or the aircraft itself.
+"""The overlay mask: marks the part of every frame that shows ground, and not an on-screen display or the aircraft.
 
-A mask can be learnt from a recording: the edges that stay where they are while the rest of the picture moves.
+`edgevpr mask` learns a mask from a recording: edges that stay in place while the rest of the picture moves are masked.
 """
 
 import hashlib
@@ -18,20 +18,20 @@ from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.files import write_whole
 from edgevpr.frames.images import read_image, write_png
 
-MOST_MASKED = 0.6  # share of the frame; too little ground is left beside more
-_WHITE = 128
+MOST_MASKED = 0.6  # share of the frame: with more masked, too little ground is left
+_WHITE = 128  # grey level from which on a pixel of a mask file shows ground
 FEWEST_FRAMES = 20
 _LONGEST_SIDE_PX = 640
-_STRONG = 12.0  # grey levels a pixel: the mean gradient of an edge; weaker ones are noise
-# Mean of the gradients over the mean of their lengths: 1 where an edge stands still, near 0 where edges pass.
+_STRONG = 12.0  # mean gradient, in grey levels per pixel, of an edge of a display; weaker ones are noise
+# Length of the mean gradient vector over the mean length: 1 if an edge stands still, near 0 if many edges pass.
 _STILL = 0.75
-_ANY_EDGE = 2.0  # grey levels a pixel: less has no edge at all
-_MOVING_AT_LEAST = 0.5  # share of the picture with edges; the rest may be the display
-_AROUND_PX = 4  # masked beside each edge: figures of a display change, and a codec smears them
+_ANY_EDGE = 2.0  # mean gradient, in grey levels per pixel, below which a pixel has no edge
+_MOVING_AT_LEAST = 0.5  # share of the pixels with edges that must move; the others may be the display
+_AROUND_PX = 4  # pixels masked around each edge: digits of a display change, and video compression smears them
 
 
 class NoMask:
-    """Stands in for a `Mask` where the whole frame shows ground."""
+    """Used in place of a `Mask` if the whole frame shows ground."""
 
     sha256 = None
 
@@ -41,14 +41,14 @@ class NoMask:
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """A mask: `allowed` bool (H, W) is True where frames show ground. It is scaled to each frame. `sha256` is that of
-    the pixels, not of the file."""
+    """A mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to the size of a frame.
+    `sha256` is the hash of the mask's pixels, not of its file."""
 
     allowed: Bools
     sha256: str
 
     def fitted(self, image: Image) -> arrays.Mask:
-        """Return the mask in the size of an image, bool (H, W)."""
+        """Return the mask scaled to the size of `image`, bool (H, W), True where it shows ground."""
         height, width = image.shape[:2]
         return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
@@ -57,15 +57,16 @@ AnyMask = NoMask | Mask
 
 
 def encoded(technique: Technique, image: Image, allowed: arrays.Mask | None) -> Descriptor:
-    """Encode the part of an image that `allowed`, bool (H, W), lets through; None: all of it."""
+    """Encode the pixels of `image` where `allowed`, bool (H, W), is True (None: all pixels)."""
     return technique.encode(image) if allowed is None else technique.encode(image, allowed)
 
 
 def mask_of(path: str | None) -> AnyMask:
-    """Read the mask of a configuration (`source.mask`); None gives `NoMask`. Raises as `read_mask`."""
+    """Read the mask file that the configuration names (`source.mask`). None gives `NoMask`. Raises the errors of
+    `read_mask`."""
     try:
         return NoMask() if path is None else read_mask(path)
-    except ImageError as error:  # it speaks of an image, as of a frame
+    except ImageError as error:  # its message sounds as if a frame were meant
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
 
 
@@ -87,10 +88,11 @@ def _grey(image: Image) -> Image:
 
 
 def learn_overlay(images: Iterable[Image], where: str) -> arrays.Mask:
-    """Find what stands still in pictures that otherwise move; return bool (H, W), True where they show ground.
+    """Find the overlay in pictures of a moving scene: the edges that stand still. Returns the mask, bool (H, W), True
+    where pictures show ground, with the pictures' aspect ratio and a longest side of 640 pixels at most.
 
     `images` are uint8 (H, W[, 3]) of one size, some time apart; `where` names their source in messages. Raises
-    SourceError for too few pictures, for a scene that stands still as a whole, and where too much would be masked.
+    SourceError for too few pictures, for a scene that does not move, and if too much would be masked.
     """
     count, size, sums = 0, None, np.zeros((3, 1, 1), np.float32)
     for image in images:
@@ -123,11 +125,11 @@ def learn_overlay(images: Iterable[Image], where: str) -> arrays.Mask:
 
 
 def require_png(path: Path) -> None:
-    """Raise UsageError for a file name that is not one of a PNG."""
+    """Raise UsageError for a file name that does not end in .png."""
     if path.suffix.lower() != ".png":
         raise UsageError(f"{path}: a mask is a PNG file: choose a name that ends in .png.")
 
 
 def write_mask(path: Path, allowed: arrays.Mask) -> None:
-    """Write a mask as PNG: white where frames show ground, black elsewhere. Raises OSError."""
+    """Write the mask `allowed`, bool (H, W), as PNG: white where it is True, else black. Raises OSError."""
     write_whole(path, lambda unfinished: write_png(unfinished, allowed.astype(np.uint8) * 255))

@@ -1,8 +1,9 @@
-"""One picture of a camera or stream as it arrives, the contract of all that gives such pictures, and the second line
-of defence against old ones.
+"""One picture of a camera or stream (`Shot`), the contract of devices and streams that give pictures (`Capture`), and
+the detection of repeated pictures (`Newness`). `frames.live` uses them.
 
-A decoder that fills in what it did not get, and a camera that hangs, do not always say so. Nothing that a camera sees
-from the air repeats itself to the grey level, though: its noise alone does not. All is done on a coarse copy.
+A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But from the
+air no two pictures are exactly equal, because of the camera's noise. Pictures are compared by coarse grey copies, in
+twelve horizontal bands of rows.
 """
 
 from collections import deque
@@ -18,19 +19,19 @@ from edgevpr.core.arrays import Image
 
 _LOOK_PX = (60, 80)  # of the coarse copy, at least: rows and columns
 _BANDS = 12
-_REMEMBERED = 6  # pictures: decoders use as many buffers by turns
-_SAME_LEVELS, _SAME_SHARE = 1, 0.99  # so many pixels of what is the same differ by no more
-_TEXTURE_LEVELS = 8.0  # standard deviation of a band of which it can be said that it stands still
-_MOVED_LEVELS = 3.0  # mean difference of a band that has moved for certain
+_REMEMBERED = 6  # pictures: decoders use about as many buffers in rotation
+_SAME_LEVELS, _SAME_SHARE = 1, 0.99  # bands are equal if this share of their pixels differs by at most this many levels
+_TEXTURE_LEVELS = 8.0  # least standard deviation of a band with enough texture to be judged, in grey levels
+_MOVED_LEVELS = 3.0  # mean difference, in grey levels, of a band that has certainly changed
 _BANDS_TO_TELL = 2
-_PICTURES_TO_LEARN = 8  # as a time constant
-_MOVES_ALWAYS = 0.75  # share of pictures: of a scene that stands nothing is asked
+_PICTURES_TO_LEARN = 8  # time constant, in pictures, of the share of pictures in which a band changed
+_MOVES_ALWAYS = 0.75  # least share of pictures in which a band changed; a band that changes less often is not judged
 
 
 class Condition(Enum):
-    """The condition of a source: OPENING until the first picture comes or the opening fails, RUNNING while new and
-    whole pictures come, DAMAGED while none of those that come is whole, FROZEN while the same picture comes over and
-    over, LOST while none come and the source is reopened again and again, ENDED when no more will come."""
+    """The condition of a source. OPENING: until the first picture comes or the opening fails. RUNNING: new and complete
+    pictures come. DAMAGED: pictures come, but none is complete. FROZEN: the same picture comes again and again. LOST:
+    no pictures come, and the source is being reopened. ENDED: no more pictures will come."""
 
     OPENING = auto()
     RUNNING = auto()
@@ -41,9 +42,12 @@ class Condition(Enum):
 
 
 class Refusal(Enum):
-    """The reason for which a picture is refused. DAMAGED: it is not whole, or predicted from one that is not. PATCHED:
-    parts of it are those of an older one. FROZEN: it is the one before again. LATE: how old it is cannot be told, as it
-    has waited since before the opening, or comes out of turn; or it came sooner than those before could be decoded."""
+    """The reason why a picture is rejected.
+
+    DAMAGED: it is incomplete, or was decoded with the help of an incomplete one.
+    PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before.
+    LATE: its age is unknown, because it was buffered before the source was opened or arrived out of order; or it was
+    skipped, because decoding lags behind."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"
@@ -53,9 +57,9 @@ class Refusal(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
-    """A whole picture. `t_mono_s` is the time at which it was taken, as far as that is known: never later than it
-    arrived. `look` is a coarse copy in grey, uint8, (h, w). `pixels` makes the picture, uint8, (H, W, 3) BGR or (H, W)
-    grey: only a picture that is read costs its conversion."""
+    """A complete picture. `t_mono_s`: time at which it was taken, as far as known, at most that of its arrival (seconds
+    of the monotonic clock). `look`: coarse grey copy, uint8 (h, w), see `coarse`. `pixels`: function that converts and
+    returns the picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for pictures that are used."""
 
     t_mono_s: float
     look: Image
@@ -66,7 +70,7 @@ class Capture(Protocol):
     """An open camera or stream, used by one thread from opening to release."""
 
     def read(self) -> Shot | Refusal | None:
-        """Wait for the next picture and return it, or the reason why it is refused; None where the source is lost."""
+        """Wait for the next picture and return it, or the reason why it is rejected; None if the source is lost."""
         ...
 
     def release(self) -> None:
@@ -75,25 +79,25 @@ class Capture(Protocol):
 
 
 def coarse(plane: Image) -> Image:
-    """Return a copy of every n-th row and column of a picture's plane, (H, W) uint8: 60 x 80 pixels or a few more.
-    Pixels are picked and not averaged, which would hide the noise by which a picture is known as new."""
+    """Return a small copy of a picture's grey plane, uint8 (H, W): every n-th row and column, 60 x 80 pixels or a few
+    more. Pixels are not averaged, as that would remove the noise that tells a new picture from a repeated one."""
     height, width = plane.shape
     return plane[:: max(1, height // _LOOK_PX[0]), :: max(1, width // _LOOK_PX[1])].copy()
 
 
 class Newness:
-    """Compares every picture of one source with the ones before.
+    """Compares every picture of one source with the six before.
 
-    A picture is patched where textured bands of rows, which have moved in every picture so far, are exactly those of an
-    older picture while the rest has moved. Other bands say nothing: borders, text over the picture, a scene that stands
-    and of which parts move."""
+    A picture is PATCHED if at least two bands of rows equal those of an older picture, while at least two others have
+    changed. Only bands count that have texture and changed in nearly all pictures so far. That excludes borders, text
+    over the picture, and static parts of a scene."""
 
     def __init__(self) -> None:
         self._before: deque[NDArray[np.int16]] = deque(maxlen=_REMEMBERED)  # pictures as bands, the newest first
         self._moving = np.zeros(_BANDS)  # share of the latest pictures in which each band moved
 
     def refusal(self, look: Image) -> Refusal | None:
-        """Tell why the picture with this coarse copy is not new; None where it is."""
+        """Return why the picture with the coarse copy `look`, uint8 (h, w), is not new; None if it is new."""
         bands = look[: len(look) // _BANDS * _BANDS].reshape(_BANDS, -1).astype(np.int16)
         if not self._before or self._before[0].shape != bands.shape:
             self._before.clear()
@@ -102,12 +106,12 @@ class Newness:
         apart = np.abs(np.stack(self._before) - bands)
         same = (apart <= _SAME_LEVELS).mean(-1) >= _SAME_SHARE  # (pictures, bands)
         if same[0].all():
-            return Refusal.FROZEN  # and not remembered: the older ones would be forgotten for it
+            return Refusal.FROZEN  # not remembered, so that it does not push out an older picture
         self._before.appendleft(bands)
         moved = (apart[0].mean(-1) > _MOVED_LEVELS) & ~same[0]
         must_move = (bands.std(-1) > _TEXTURE_LEVELS) & (self._moving > _MOVES_ALWAYS)
         is_patched = ((same & must_move).sum(-1) >= _BANDS_TO_TELL).any()
         if is_patched and moved.sum() >= _BANDS_TO_TELL:
-            return Refusal.PATCHED  # and nothing is learnt from it: what is patched for long is not a scene that stands
+            return Refusal.PATCHED  # no update below: a band that is patched for long must not count as a static one
         self._moving += (moved - self._moving) / _PICTURES_TO_LEARN
         return None

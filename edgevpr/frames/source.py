@@ -1,4 +1,5 @@
-"""Sources of frames: a folder of images, a video file, a camera or a network stream, all read in the same way."""
+"""Sources of frames: a folder of images, a video file, a camera or a network stream. All have the interface `Source`,
+and `open_source` opens each. Flights, mapping and all commands that read pictures use them."""
 
 import os
 import time
@@ -23,12 +24,13 @@ _SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
 class Source(Protocol):
     """A source of frames.
 
-    `is_live`: pictures are taken while they are read, and the newest counts; a recording is read in order to its end.
-    `ended`: no more frames will come. `total`: approximate number of frames, 0 where unknown. `dropped`: number of
-    pictures not read in time, None for a recording, which drops none. `refused`: numbers of pictures that were not new
-    and whole, by the reason. `latency_s`: seconds from the taking of the newest picture until it could be read, None
-    where unknown. `condition`: the condition for programs. `state`: the same in a few words for people ("reading",
-    "streaming", "lost, reopening in 2 s")."""
+    `is_live`: True for a camera or stream, of which only the newest picture is read. False for a recording, which is
+    read in order to its end.
+    `ended`: no more frames will come. `total`: approximate number of frames, 0 if unknown.
+    `dropped`: number of pictures not read in time; None for a recording, which drops none.
+    `refused`: numbers of rejected pictures by reason (values of `Refusal`).
+    `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
+    `condition`: the state of the source. `state`: the same for people ("reading", "lost, reopening in 2 s")."""
 
     is_live: bool
 
@@ -54,9 +56,9 @@ class Source(Protocol):
     def state(self) -> str: ...
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame (of a live source the newest), or None where there is none within `timeout_s` seconds.
+        """Return the next frame (of a live source the newest), or None if there is none within `timeout_s` seconds.
 
-        Raises ImageError for an image that cannot be used; the next call goes on with the image after it.
+        Raises ImageError for an image that cannot be used; the next call continues with the image after it.
         """
         ...
 
@@ -74,13 +76,14 @@ def open_source(
     clock: Callable[[], float] = time.monotonic,
     only: Collection[str] | None = None,
 ) -> Source:
-    """Open the source that `uri` names. `live` allows cameras and streams, which never end.
+    """Open the source that `uri` names: a path, device or address.
 
-    `step_s` is the least video time in seconds between two frames of a video file. `positions` is the positions.csv of
-    a folder of images; without it, the one in or beside the folder is used, else EXIF. Of a video it is the table that
-    `track.read_track` reads; without it, its frames have no positions. Of a recording, the frames whose
-    names are in `only` are read (None: all). A stream that is not there yet is waited for. Raises SourceError for a
-    source that is unknown, missing or not allowed, and UsageError for positions that make no sense.
+    `step_s`: least video time in seconds between two frames of a video file (None: every frame).
+    `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
+    video the table that `positions.read_track` reads (None: frames have no positions).
+    `live`: allow cameras and streams, which never end. A stream that is not there yet is opened as soon as it is.
+    `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all).
+    Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
@@ -102,8 +105,8 @@ def open_source(
 
 
 def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Iterator[Frame | None]:
-    """Read a source that ends, and close it. An image that cannot be used is handed to `left_out`; for it, and where no
-    frame has come yet, None is yielded."""
+    """Yield all frames of a recording, and close it at the end. For an image that cannot be used, `left_out` is called
+    with the error, and None is yielded. None is also yielded when reading the next frame takes longer than a second."""
     while not source.ended:
         try:
             yield source.read(_READ_TIMEOUT_S)
@@ -114,13 +117,14 @@ def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Itera
 
 
 def is_live(uri: str) -> bool:
-    """Tell whether `uri` names a camera or a stream; anything else is a recording."""
+    """Return True if `uri` names a camera or a stream; anything else is a recording."""
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
     return "://" in uri or is_device or uri.lower().endswith(".sdp")
 
 
 def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
-    """Return the function that opens the camera or stream; raises SourceError for one that can never be opened."""
+    """Return a function that opens the camera or stream `uri` and returns None if that fails. Raises SourceError if
+    opening can never succeed."""
     if "://" in uri:
         _check_address(uri)
     elif not Path(uri).exists():

@@ -1,7 +1,8 @@
-"""Network streams, decoded by FFmpeg: every picture is whole, and is as old as its time stamp says.
+"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken.
 
-A thread takes packets from the network as they come (`Arrivals`), another one decodes them (`StreamCapture`), and the
-time at which each picture was taken is worked out on this machine's clock (`StampedTime`, `UnstampedTime`).
+A thread receives packets from the network as they come (`Arrivals`), the thread of `frames.live` decodes them
+(`StreamCapture`). The time at which each picture was taken is estimated on this machine's clock, with the time stamps
+of the stream (`StampedTime`) or without (`UnstampedTime`).
 """
 
 import math
@@ -23,24 +24,25 @@ if TYPE_CHECKING:
 
 OPEN_TIMEOUT_S = 5.0
 READ_TIMEOUT_S = 3.0
-# RTSP over its own connection loses nothing, but the camera may lose packets before, in the air or for want of room.
-# FFmpeg says so only where it may hold packets back to see whether the missing one follows: two are the least. It
-# connects to the addresses in an .sdp file only where it is allowed.
+# RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
+# packets back to wait for the missing one: at least two. It opens the addresses in an .sdp file only if these protocols
+# are allowed.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
 _SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
 _BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # pixel formats that begin with a plane of brightness
-_BEHIND_S = 0.3  # a packet that has waited longer is left out, as soon as pictures can be decoded without it
-_TOO_OLD_S = 5.0  # a packet that has waited longer is left out in any case
-_RESTART_S = 5.0  # a longer jump of the delay: the sender has begun anew, or something has held the stream up
-_BACKLOG_S = 0.005  # a picture that comes sooner than all before it by more has waited to be fetched
-_IN_TIME = 3  # pictures in a row after which none is waiting any more
-_WAITED_S = 0.002  # a picture that took longer to get was not there before
-_USUAL_OF, _AS_USUAL = 9, 1.5  # waits whose median is the usual one, and the share of it that is no delay
-_WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that differ by no more for so long are the way, and not a jam
+_BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
+_TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
+_RESTART_S = 5.0  # a larger change of the delay: the sender has restarted, or something has held the stream up
+_BACKLOG_S = 0.005  # while the delay falls by more than this from picture to picture, a backlog is being fetched
+_IN_TIME = 3  # pictures in a row without such a fall after which the backlog is over
+_WAITED_S = 0.002  # a picture that was returned sooner than this was in a buffer already
+_USUAL_OF, _AS_USUAL = 9, 1.5  # number of waits whose median is the usual one, and the multiple of it that is normal
+_WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due to the path, and not to congestion
 
 
 def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
-    """Open a network stream or an .sdp file with time-outs; None where nothing is there."""
+    """Open a network stream or an .sdp file, with time-outs; None if it cannot be opened. `clock` is the monotonic
+    clock, in seconds."""
     opened_s = clock()
     options = _OPTIONS if "://" in uri else _SDP_OPTIONS
     whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
@@ -48,7 +50,7 @@ def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
 
 
 class StreamCapture:
-    """The pictures of an open stream."""
+    """The pictures of an open stream: a `Capture`. `opened_s` is the time on `clock` just before the opening."""
 
     def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
         self._whole, self._clock = whole, clock
@@ -59,7 +61,7 @@ class StreamCapture:
         self._arrivals = Arrivals(whole.fetch, clock)
 
     def read(self) -> Shot | Refusal | None:
-        """Wait for the next picture and return it, or the reason why it is refused; None where the stream is lost."""
+        """Wait for the next picture and return it, or the reason why it is rejected; None if the stream is lost."""
         while not self._ready:
             arrival = self._arrivals.next()
             if arrival is None:
@@ -108,7 +110,7 @@ class StreamCapture:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A packet that was asked for at `asked_s` and came at `t_mono_s`."""
+    """A packet. The call that fetched it began at `asked_s` and returned at `t_mono_s` (seconds, monotonic)."""
 
     fetched: Fetched
     asked_s: float
@@ -116,8 +118,8 @@ class Arrival:
 
 
 class Arrivals:
-    """Takes the packets from a stream as they come, in a thread of its own: on a board that is too slow to decode them
-    they wait here, where it is known how long, and not in the network, where it is not."""
+    """A queue filled by a thread that fetches packets as soon as they come. If the board decodes too slowly, packets
+    wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown."""
 
     def __init__(self, fetch: Callable[[], Fetched | None], clock: Callable[[], float]) -> None:
         self._fetch, self._clock = fetch, clock
@@ -128,18 +130,18 @@ class Arrivals:
         self._thread.start()
 
     def next(self) -> Arrival | None:
-        """Wait for the next packet and return it; None where the stream is lost."""
+        """Wait for the next packet and return it; None if the stream is lost."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_over)
             return self._waiting.popleft() if self._waiting else None
 
     def can_begin_anew(self) -> bool:
-        """Tell whether a picture waits that can be decoded without those before it."""
+        """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
         with self._changed:
             return any(arrival.fetched.packet.is_keyframe for arrival in self._waiting)
 
     def close(self) -> None:
-        """Take no more, and wait for the packet that is being fetched."""
+        """Stop the thread, and wait until its current fetch has returned."""
         self._is_closing = True
         self._thread.join()
 
@@ -161,12 +163,13 @@ class Arrivals:
 
 
 class StampedTime:
-    """Time by the stream's own time stamps.
+    """Estimates when pictures were taken, from the stream's time stamps.
 
-    They share no zero with this machine's clock: the least delay seen so far is taken for none, and all that a picture
-    took longer is its age. That least delay is forgotten only for another one that has been steady for five seconds, as
-    when clocks drift or the sender has paused: delays in a jam waver, and may last. `is_live`: what waited for the
-    opening has been fetched."""
+    The stamps count from an unknown zero. The delay of a picture is its arrival time minus its stamp. The least delay
+    so far is assumed to be that of a picture that arrives at once; a picture with a longer delay is older by the
+    difference. A larger value replaces the least delay only if delays have been steady for five seconds, as after a
+    clock drift or a pause of the sender; in a congested network they vary. `is_live`: True once the pictures that were
+    buffered before the opening have been fetched."""
 
     is_live: bool
     _in_time: int
@@ -180,8 +183,8 @@ class StampedTime:
         self._begin_anew()
 
     def arrived(self, stamp_s: float, order_s: float, t_mono_s: float) -> None:
-        """Take note that a picture with this stamp has arrived. `order_s` is its stamp in the order of decoding, the
-        same but for pictures that are sent out of turn."""
+        """Record the arrival at `t_mono_s` of a picture with the stamp `stamp_s`. `order_s` is its decoding time stamp,
+        which differs only in streams that send pictures in another order than they were taken. All in seconds."""
         delay_s, order_delay_s = t_mono_s - stamp_s, t_mono_s - order_s
         if order_s < self._order_s or abs(order_delay_s - self._order_delay_s) > _RESTART_S:
             self._begin_anew()
@@ -193,8 +196,8 @@ class StampedTime:
         self._least_s = min(self._least_s, delay_s)
 
     def taken_s(self, stamp_s: float, t_mono_s: float) -> float | None:
-        """Return the time at which the picture with this stamp was taken, `t_mono_s` at the latest. None while what has
-        waited since the opening is still being fetched: how old that is cannot be known."""
+        """Return the time at which the picture with the stamp `stamp_s` was taken, at most its arrival `t_mono_s`. None
+        while pictures that were buffered before the opening are still being fetched: their age is unknown."""
         return min(t_mono_s, stamp_s + self._least_s) if self.is_live else None
 
     def _look_back(self, t_mono_s: float, delay_s: float, order_delay_s: float) -> None:
@@ -213,17 +216,18 @@ class StampedTime:
 
 
 class UnstampedTime:
-    """Time for streams without time stamps (MJPEG over HTTP). A picture that was waited for, for no longer than usual,
-    has just come. One that took longer may have been held up on its way: it has come since it was asked for. One that
-    was there already may have come at any moment since the last one that was waited for."""
+    """Estimates when pictures were taken, for streams without time stamps (MJPEG over HTTP), by the wait for each.
+
+    After a wait of usual length, the picture has just arrived. After a longer wait it may have been delayed on its way,
+    by as much as the wait. A picture returned without any wait was in a buffer, at most since the last wait ended."""
 
     def __init__(self, opened_s: float) -> None:
         self._since_s = opened_s
         self._waits_s: deque[float] = deque(maxlen=_USUAL_OF)
 
     def taken_s(self, asked_s: float, t_mono_s: float) -> float:
-        """Return the time of the picture asked for at `asked_s` and got at `t_mono_s`: where that is in doubt, the
-        earliest at which it can have come."""
+        """Return the earliest time at which the picture can have arrived whose fetch began at `asked_s` and ended at
+        `t_mono_s`. All in seconds of the monotonic clock."""
         wait_s = t_mono_s - asked_s
         if wait_s > _WAITED_S:
             usual_s = median(self._waits_s) if len(self._waits_s) == _USUAL_OF else 0.0
