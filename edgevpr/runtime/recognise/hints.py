@@ -1,7 +1,8 @@
-"""Hints for a query beside its picture: where the aircraft can be, which way its nose points, and how high it flies.
+"""Hints for a query beside its picture: where the aircraft can be, its heading, and the height it flies at. They narrow
+the recogniser's search of the map.
 
-They narrow the search, and none is ever the only way to find a place: a compass may be wrong and a satellite
-position false. A query that is not accepted with hints is therefore followed by one without.
+No hint is ever the only way to find a place: a compass may be wrong and a satellite position false. A query that is not
+accepted with hints is therefore followed by one without.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ _FIX_GOOD_FOR_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
-    """A position, and the time at which the aircraft was there, on the clock of the frames."""
+    """A position of the aircraft and the time it was there, seconds on the clock of the frames."""
 
     position: Position
     t_mono_s: float
@@ -26,7 +27,7 @@ class KnownPosition:
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """The aircraft is within `radius_m` metres of `position`."""
+    """Area in which the aircraft is: within `radius_m` metres of `position`."""
 
     position: Position
     radius_m: float
@@ -34,18 +35,19 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class Hints:
-    """Hints for one query: where the aircraft can be, and the heading of its nose. None: unknown."""
+    """Hints for one query: the area in which the aircraft is, and the heading of its nose, degrees. None: unknown."""
 
     reach: Reach | None = None
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Return the fields that the flight log has for hints that were used."""
+        """Return the fields of the flight log for hints that were used."""
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
     def agree_with(self, found: Candidate, heading_within_deg: float | None) -> bool:
-        """Tell whether a place found agrees with these hints; a position or heading that is unknown agrees with any."""
+        """Return True if a match agrees with these hints. `heading_within_deg` is the largest error of a heading (None:
+        headings are not compared). A position or heading that is unknown counts as agreeing."""
         place, turned_deg = found.place, found.match.rotation_deg
         if self.reach and place.position:
             here, there = self.reach.position, place.position
@@ -58,13 +60,13 @@ class Hints:
 
 
 class Prior:
-    """Hints for the next query, and a memory of whether hints can be believed. `height_ratio` is the height to look
-    from first (see `FineMatch`), and `looks_again` tells whether a query not accepted from there is looked for from all
-    heights.
+    """Makes the hints for each query, and decides whether hints are to be trusted.
 
-    `reach_m_s` is the highest speed of the aircraft, m/s (None: its position narrows nothing). `heading_within_deg` is
-    the largest error of a known heading, degrees (None: no heading narrows anything; see `TechniqueSpec`). `is_live` is
-    False for frames of a recording, of which the autopilot knows nothing.
+    `height_ratio` is the height to search at first, relative to that of the map's pictures (see `FineMatch`).
+    `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
+    highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
+    known heading, degrees (None: headings give no hint; see `TechniqueSpec`). `is_live` is False for recorded frames,
+    for which the autopilot's reports do not hold.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
@@ -76,9 +78,9 @@ class Prior:
         self._are_believed = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame, None where there are none or they are not believed at present.
+        """Return the hints for a frame; None if there are none, or if they are not trusted now.
 
-        `vehicle` is the autopilot's last report; `margin_m` metres are added to the distance that the aircraft can have
+        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that the aircraft can have
         flown.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
@@ -92,13 +94,13 @@ class Prior:
         return self._known if self._are_believed else None
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Learn from what a query found whether the next one is to use hints, and keep the position and the height of
-        an accepted match.
+        """Decide from the result of a query whether the next one uses hints. If the match was accepted, keep its
+        position and height ratio.
 
-        Queries with hints and without take turns until a match is accepted. That match then tells whether the hints can
-        be believed.
+        Until a match is accepted, queries alternate between using hints and not. That match then decides whether the
+        hints are trusted: whether it agrees with them.
         """
-        # Over ground that is not in the map every second query is looked for from all heights: it takes twice as long.
+        # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
         if self._known is None:
             self._are_believed = True
@@ -113,8 +115,8 @@ class Prior:
 
 
 def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None) -> Hints | None:
-    """Return the hints of a reach and of a heading, as far as they leave any place out of the search; None where
-    neither does. Where no place is in reach, all are searched."""
+    """Return those hints, of the area `around` and `heading_deg`, that exclude any place of the index; None if neither
+    does. An area that holds no place at all is not used."""
     if around and not 0 < index.within(around.position, around.radius_m).sum() < len(index):
         around = None
     if heading_deg is not None and not index.knows_headings:
@@ -125,10 +127,11 @@ def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None)
 def reach_of(
     now_s: float, vehicle: Vehicle | None, own_fix: KnownPosition | None, reach_m_s: float, margin_m: float
 ) -> Reach | None:
-    """Return where the aircraft must be at `now_s`, by how far it may have flown since its last known position.
+    """Return the area where the aircraft must be at `now_s` by its last known position, its highest speed `reach_m_s`
+    and a margin; None if no position is known.
 
-    This is that of an autopilot that has GPS and has reported within a second, else our own last fix if it is at most a
-    minute old. None where there is neither.
+    The position is the autopilot's, if it has GPS and is at most a second old, else our own fix (`own_fix`), if that is
+    at most a minute old.
     """
     seen = own_fix if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S else None
     if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
@@ -137,7 +140,7 @@ def reach_of(
 
 
 def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
-    """Return hints and height as expectations for every place of the index."""
+    """Convert hints and height into what a search expects of each place of the index (see `Expectation`)."""
     in_reach = turned_deg = None
     if hints and hints.reach:
         in_reach = index.within(hints.reach.position, hints.reach.radius_m)
@@ -147,7 +150,7 @@ def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> 
 
 
 def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
-    """Return the heights to look from after the first: all but the one that is nearest to it."""
+    """Return the height ratios to search at after `first`: all but the one nearest to it."""
     if not height_ratios:
         return []
     tried = nearest_height(height_ratios, first)

@@ -1,4 +1,7 @@
-"""The one judge: decides when a match is accepted as the place. A match that is not accepted carries no position."""
+"""Decides when a match is accepted as the place. No other code does, and a match that is not accepted has no position.
+
+A place *elsewhere* is farther than `neighbour_m` from the best place, and the *lead* is measured over the best of them.
+"""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +19,7 @@ from edgevpr.runtime.recognise.confidence import Evidence, Model, prior
 from edgevpr.runtime.recognise.evidence import MapCalibration, described, kind_of, kinds_of
 from edgevpr.runtime.recognise.locate import Located
 
-NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the autopilot has just said
+NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
 
 # Trajectories at other speeds are many, so one of them scores well by chance: half the margin over them is enough. With
 # it, no wrong sequence of the corridor set was accepted from hog, seqslam or cohog, flown as it was mapped, twice as
@@ -24,55 +27,55 @@ NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats what the au
 _OF_MARGIN_AT_OTHER_SPEEDS = 0.5
 _LONGEST = 10
 
-# Looking down, a place elsewhere that agrees without any step or rotation, as the best one does, shares with it what is
+# Looking down, if a place elsewhere agrees without any shift or rotation, as the best one does, both share what is
 # drawn over every frame. Such places scored .14 or more behind a display, and .05 or less in all sets without one.
 _DISPLAY_SCORE = 0.08
 _AT_REST_CELLS = 1.5
 _AT_REST_DEG = 7.5
 _AT_REST_HEIGHT = 0.2
 
-# A match that scores so much has landmarks that agree: all of the 413 right ones that do, of all sets from the air, had
-# six or more. Weaker ones, of grass under other light, may have none. Asked where both pictures have enough of them.
+# A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had
+# six or more. Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
 _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
-# Landmarks that agree make up for a score that is too low, down to so much of it.
+# Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
 _OF_SCORE_WHEN_PROVEN = 0.5
-# Of a place less far ahead than by this factor, landmarks must tell it from the best one elsewhere.
+# A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
 _HARDLY_AHEAD = math.log(1.5)
 _NO_LEAD = math.log(1.05)
-# Probabilities: at best where a place elsewhere agrees as well; and at least, whatever precision is asked for, by the
-# match and by the flight so far.
+# Probabilities: the highest where a place elsewhere agrees as well; the least for accepting, at any precision, by the
+# match alone, and by the flight so far.
 _EVEN, _LEAST_SURE, _SURE_BY_FLIGHT = 0.5, 0.9, 0.99
-_LEAST_FOLLOWED = 0.5  # of the probability by the flight so far, for a match that is sure by itself
+_LEAST_FOLLOWED = 0.5  # least probability by the flight so far, for a match that is sure by itself
 
 
 @dataclass(frozen=True, slots=True)
 class Sureness:
-    """Decision by confidence: a match is accepted whose confidence, by the model of its kind of evidence, is at least
-    that from which on `precision` of the matches are right."""
+    """Acceptance by confidence. `models` gives a model for each kind of evidence. A match is accepted if its confidence
+    is at least the threshold at which the share `precision` of the matches is right."""
 
     models: Mapping[str, Model]
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match with this evidence is right: an even chance at best where a place
-        elsewhere agrees as well."""
+        """Return the probability that the match with this evidence is right: at most 0.5 if a place elsewhere agrees as
+        well."""
         confidence = self.models[kind_of(evidence)].confidence(evidence)
         return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, _EVEN)
 
     def of_map(self, evidence: Evidence) -> float:
-        """Return the probability that the query with this evidence shows ground of the map."""
+        """Return the probability that the query of this evidence shows ground of the map."""
         return self.models[kind_of(evidence)].confidence_of_map(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
-        """Return the confidence that is needed."""
+        """Return the confidence needed to accept a match with this kind of evidence."""
         return max(_LEAST_SURE, self.models[kind_of(evidence)].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptRule:
-    """Least score, and least lead over the best place farther away than `neighbour_m` metres, of an accepted match; and
-    least quality of its picture. With `sure` the confidence decides, and both limits come on top where they are set. A
-    match whose score is below `worth_a_look` is never accepted, and its landmarks are not asked."""
+    """Conditions for accepting a match: the least score, the least lead over the best place farther than `neighbour_m`
+    metres away, and the least quality of the query's picture. With `sure`, the confidence decides, and both limits hold
+    in addition. A match with a score below `worth_a_look` is never accepted, and its landmarks are not compared."""
 
     min_score: float
     min_margin: float
@@ -89,12 +92,11 @@ ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
 class Findings:
     """All that is known of the best place of a `ranking` when it is judged.
 
-    `is_new` tells whether the place was learnt within the last `NEW_FOR_S` seconds. `proof` is how the landmarks of
-    query and place agree (None: nothing is known of it), and `rival` the number of those of the best place elsewhere
-    that agree. `where` is the position that the best places say together (None: only that of the best one is known); a
-    place that says the same as the best one is no rival. `evidence` is that of the match (None: the rule has no use for
-    it), and `by_flight` the probability that the aircraft is there by all of the flight (None: the query is taken by
-    itself).
+    `is_new` is True for a place learnt within the last `NEW_FOR_S` seconds. `proof` is the agreement of the landmarks
+    of query and place (None: not compared), and `rival` the number of agreeing landmarks of the best place elsewhere.
+    `where` is the position computed from the best places (None: only that of the best place is known); the places it
+    was computed from are not elsewhere. `evidence` is that of the match (None: the rule needs none), and `by_flight`
+    the probability of the place by the flight so far (None: the query is judged alone).
     """
 
     ranking: Ranking = field(kw_only=False)
@@ -108,7 +110,7 @@ class Findings:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Decision on the best place: accepted as the place or not, and the reason in a few words for the log."""
+    """Decision on the best place: whether it is accepted, and the reason in a few words for the log."""
 
     accepted: bool
     reason: str
@@ -117,12 +119,12 @@ class Verdict:
 def accept_rule(
     technique: Technique, config: MatchConfig, length: int = 1, calibration: MapCalibration | None = None
 ) -> AcceptRule:
-    """Return the rule of a technique: by confidence where there is a model of its evidence, else by its own limits,
-    where the configuration leaves them open. `calibration` is that of the map.
+    """Return the rule for a technique: by confidence if a model of its evidence exists, else by its own limits. Limits
+    in the configuration come first. `calibration` is that of the map (None: the shipped models are used).
 
-    A technique's margin is that of one query. The mean score of `length` queries varies less, so the margin of a
-    sequence is divided by the root of its length. Lengths above ten count as ten: queries that show the same ground are
-    not independent. A sequence is judged by limits.
+    A technique's margin is meant for one query. The mean score of `length` queries varies less, so the margin for a
+    sequence is divided by the root of its length. Lengths above ten count as ten, because queries that show the same
+    ground are not independent. A sequence is always judged by limits.
     """
     kinds = kinds_of(technique.spec) if length == 1 else ()
     own_score, own_margin = (0.0, 0.0) if kinds else (technique.min_score, technique.min_margin)
@@ -141,12 +143,10 @@ def accept_rule(
 
 
 def says_nothing(query: Descriptor, min_quality: float) -> str | None:
-    """Return the reason why a picture says too little to be recognised, None where it says enough: its quality is at
-    least `min_quality`.
+    """Return the reason if a picture shows too little to be recognised, None if its quality is at least `min_quality`.
 
-    Screens without a signal, displays on a dark ground, bare sky, a covered lens: such a picture has few regions that
-    hold information. The share of regions that agree on a place is then the share of a few, and reaches any limit by
-    chance.
+    Examples are screens without a signal, displays on a dark ground, bare sky, or a covered lens. Few regions of such a
+    picture hold information. The share of regions that agree is then one of a few, and exceeds any limit by chance.
     """
     if query.quality >= min_quality:  # False for NaN
         return None
@@ -154,8 +154,8 @@ def says_nothing(query: Descriptor, min_quality: float) -> str | None:
 
 
 def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
-    """Decide whether the best place of a ranking is accepted; `search` is the search of sequences that made it (None:
-    the query is ranked alone)."""
+    """Decide whether the best place of a ranking is accepted. `search` is the search over sequences that made the
+    ranking (None: the query was ranked alone)."""
     if search and search.frames < search.length:
         return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
     ranking, proof, where = findings.ranking, findings.proof, findings.where
@@ -187,8 +187,8 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
 
 
 def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | None:
-    """Return the reason why a score, `ahead` of any place elsewhere by so much, is below the limits of a rule, None
-    where it is not."""
+    """Return the reason if a match fails the limits of `rule`, else None. `ahead` is the lead of its `score` over the
+    best place elsewhere (None: there is none)."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
         return f"score {score:.3f} is below {least:.3f}"
@@ -200,7 +200,7 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
 
 
 def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
-    """Decide by the confidence of a match, or of the flight so far; say it in words and figures."""
+    """Decide by the confidence of the match, or by the flight so far; the reason gives the figures."""
     evidence, followed, rival = findings.evidence, findings.by_flight, findings.rival
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
@@ -220,12 +220,12 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
 
 
 def is_hardly_ahead(evidence: Evidence | None) -> bool:
-    """Tell whether a place elsewhere agrees nearly as well, so that its landmarks must be asked too."""
+    """Return True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
     return evidence is not None and evidence["lead"] < _HARDLY_AHEAD
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:
-    """Return the reason why landmarks show that it is another place, None where they do not."""
+    """Return the reason if the landmarks show that it is another place, else None."""
     if not proof.is_expected:
         return f"its landmarks lie otherwise than its regions: {proof.inliers} agree on another step"
     if score >= _CLEAR_SCORE and proof.inliers < _LEAST_INLIERS and proof.possible >= _LANDMARKS_ENOUGH:
@@ -234,8 +234,8 @@ def _disproves(proof: Agreement, score: float) -> str | None:
 
 
 def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:
-    """Return the reason why what agrees may be a display over every frame, None where nothing points to one. Only a
-    camera that looks down can tell: ahead, places one after the other agree without a step."""
+    """Return the reason if what agrees may be a display drawn over every frame, else None. Only a camera that looks
+    down can tell: ahead, places along the way agree without a shift."""
     best = int(ranking.slots[0])
     if not _is_at_rest(ranking.compared.get(best)):
         return None
@@ -247,6 +247,7 @@ def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | 
 
 
 def _is_at_rest(match: FineMatch | None) -> bool:
+    """Return True if a match has about no shift, rotation or change of height."""
     if match is None or match.rotation_deg is None or match.shift_cells is None:
         return False
     off_deg = abs((match.rotation_deg + 180) % 360 - 180)
@@ -256,7 +257,7 @@ def _is_at_rest(match: FineMatch | None) -> bool:
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
-    """Return the reason why the mean of a sequence is not to be believed, None where there is none."""
+    """Return the reason if the mean score of a sequence is not to be trusted, else None."""
     away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"

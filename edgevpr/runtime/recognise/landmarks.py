@@ -1,7 +1,8 @@
-"""Landmarks of a picture: points that are found again in another picture of the same ground, and 256 bits of each.
+"""Landmarks of a picture: points that can be found again in another picture of the same ground, each described by 256
+bits. `verify` compares those of query and place.
 
-The points are the corners of FAST and the bits those of ORB (Rublee et al. 2011). A place keeps few of them, spread
-over the picture; a query has more, so that most of the place's points that it shows are among them.
+The points are FAST corners and the bits are ORB descriptions (Rublee et al. 2011). A place keeps few of them, spread
+over the picture. A query has more, so that most of the place's visible points are among them.
 """
 
 import struct
@@ -14,25 +15,27 @@ from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
 
 OF_PLACE, OF_QUERY = 250, 1000  # points
 _LONGEST_SIDE_PX = 640
-_FOUND = 4 * OF_PLACE  # corners among which those of a place are chosen
+_FOUND = 4 * OF_PLACE  # least number of corners to choose from
 _LEVELS, _FACTOR = 8, 1.2  # of the pyramid
-_CORNER = 5  # grey levels between a corner and what is around it, so that dark pictures have some
-_PATCH_PX = 31  # of which the bits of a point are made, on its level of the pyramid
-_CELLS = 8  # along the longest side: each has about as many points
-_APART_PX = 3.0  # the same corner is found on several levels, and is one landmark
+_CORNER = 5  # grey levels between a corner and its surroundings; low, so that dark pictures have corners
+_PATCH_PX = 31  # width of the patch that a point is described by, on its level of the pyramid
+_CELLS = 8  # along the longest side; each has about the same number of points
+_APART_PX = 3.0  # a corner found on several levels of the pyramid is one landmark
 
 _VERSION = 1
 _HEADER = struct.Struct("<BH")
 _STORED = np.dtype([("x", "<u2"), ("y", "<u2"), ("angle", "u1"), ("size", "u1"), ("bits", "u1", 32)])
-_SIZES = 0.001  # of the longest side: the step in which sizes are stored
+_SIZES = 0.001  # resolution of stored sizes, as a share of the longest side
 
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
-    """K points of a picture. `points` float32 (K, 2) are x to the right and y down from the middle of the picture, as
-    shares of its longest side, so that the numbers of pixels of two cameras do not matter. `angle_deg` float32 (K,) is
-    the direction of each, clockwise from the right. `size` float32 (K,) is the width of the patch it was described by,
-    as a share of the longest side, and `bits` uint8 (K, 32) the description."""
+    """K points of a picture, best first.
+
+    `points` float32 (K, 2): x to the right and y down from the middle, as shares of the longest side, so that pictures
+    of different sizes compare. `angle_deg` float32 (K,): direction of each, clockwise from the right. `size` float32
+    (K,): width of the patch that describes it, as a share of the longest side. `bits` uint8 (K, 32): the description.
+    """
 
     points: Singles
     angle_deg: Singles
@@ -46,8 +49,8 @@ class Landmarks:
 def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> Landmarks:
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first.
 
-    None touches a pixel where `mask` bool (H, W) is False. A picture without corners, or one smaller than a patch, has
-    none.
+    No patch covers a pixel where `mask`, bool (H, W), is False. A picture without corners, or smaller than a patch, has
+    no landmarks.
     """
     height, width = image.shape[:2]
     scale = _LONGEST_SIDE_PX / max(height, width)
@@ -77,9 +80,9 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
 
 
 def _spread(at_px: Singles, most: int) -> Ints:
-    """Choose `most` of the points float32 (K, 2), best first: in turn the best, second best, ... of every cell. Returns
-    their numbers int (up to `most`,)."""
-    # Of the same corner on several levels the best one is left.
+    """Choose at most `most` points, float32 (K, 2) in pixels, best first: the best of every cell, then the second best,
+    and so on. Returns their indices, int (n,)."""
+    # Keep only the best of the points of one corner.
     _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)
     _, cell = np.unique((at_px[kept] // (_LONGEST_SIDE_PX / _CELLS)).astype(int), axis=0, return_inverse=True)
@@ -92,7 +95,7 @@ def _spread(at_px: Singles, most: int) -> Ints:
 
 
 def packed(landmarks: Landmarks) -> bytes:
-    """Return landmarks as a map file keeps them: 38 bytes each, and 3 before them."""
+    """Convert landmarks to the form of map files: a header of 3 bytes, then 38 bytes for each."""
     stored = np.empty(len(landmarks), _STORED)
     at = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
     stored["x"], stored["y"] = at[:, 0], at[:, 1]
@@ -103,7 +106,7 @@ def packed(landmarks: Landmarks) -> bytes:
 
 
 def unpacked(blob: bytes) -> Landmarks:
-    """Return the landmarks that `packed` has written. Raises ValueError for anything else."""
+    """Convert bytes made by `packed` back to landmarks. Raises ValueError for anything else."""
     if len(blob) < _HEADER.size:
         raise ValueError("its landmarks have no header")
     version, count = _HEADER.unpack_from(blob)
