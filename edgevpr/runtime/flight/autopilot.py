@@ -1,5 +1,6 @@
 """Exchange of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and gives the
-state of the link. The loop of `flight` uses `ToAutopilot`, or `NoAutopilot` if there is no link."""
+state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses `ToAutopilot` or, if there is
+no link, `NoAutopilot`."""
 
 import logging
 import math

@@ -28,7 +28,7 @@ class Commands:
         return ", ".join(filter(None, off)) or None
 
     def obey(self) -> None:
-        """Carry out the requests received since the last call, and tell the link which requests to accept from now
+        """Carry out the requests received since the last call. Then tell the link which requests to accept from now
         on."""
         if self._link is None:
             return

@@ -72,15 +72,15 @@ class DriftFilter:
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
 
     def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
-        """Correct the state by GPS, whose position is `off_m` (2,) beside the path and whose velocity exceeds that of
-        the path by `off_m_s` (2,). The standard deviations are those of one axis."""
+        """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
+        that of the path by `off_m_s` (2,). The standard deviations are those of one axis."""
         look = np.zeros((4, 8))
         look[:2, _C] = look[2:, _S] = _EYE
         self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
 
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Correct the state by a fix with a covariance (2, 2) that lay `off_m` (2,) beside the path `age_s` seconds
-        ago."""
+        """Correct the state by a fix with a covariance (2, 2) that lay `off_m` (2,) metres beside the path `age_s`
+        seconds ago."""
         self._correct(_seen(age_s), off_m, covariance_m2)
 
     def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:

@@ -1,8 +1,8 @@
 """A flight from start to end: `Flight.open` opens everything, `run` flies, and `close` closes everything.
 
-Each pass of the loop takes the newest frame, recognises it, and reports the result to the autopilot and to observers
-(the functions that count, watch, log and learn). The same code flies in the air and in a replay: only its `World`, all
-that is outside of it, differs.
+Each pass of the loop takes the newest frame, recognises it, and reports the event, the `Recognition` of this frame, to
+the autopilot and to observers (functions that count, watch, log and learn). The same code flies in the air and in a
+replay: only its `World`, all that is outside of it, differs.
 """
 
 import logging

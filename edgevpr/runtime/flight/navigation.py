@@ -25,8 +25,8 @@ _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Whereabouts:
-    """Position and velocity (m/s, east and north) of the aircraft at `t_s`. The accuracies are standard deviations
-    along the worst direction."""
+    """Position and velocity (m/s, east and north) of the aircraft at `t_s`. The accuracies (metres, m/s) are standard
+    deviations along the worst direction."""
 
     t_s: float
     position: Position

@@ -1,5 +1,5 @@
 """The status of a flight at one moment, and the file in which people and programs beside the flight read it: one JSON
-object, replaced as a whole once a second. `vitals` writes it, the command `status` reads it."""
+object, replaced as a whole once a second. `vitals` writes it, the command `edgevpr top` reads it."""
 
 import json
 import os
@@ -41,8 +41,8 @@ class SeenQuery:
 class LinkState:
     """State of the link to the flight controller. `trouble`: why it is not open (None: it is). `autopilot`: system id
     of the autopilot heard (None: none is). `channel`: how positions are sent. `fixes`: counts of fixes in a few words.
-    `answers`: counts of answers to fixes, by result. `accuracy_m`: how well the position is known (one axis, 1 sigma;
-    None: it is not)."""
+    `answers`: counts of answers to fixes, by result; `unanswered`: count of fixes without. `accuracy_m`: how well the
+    position is known (one axis, 1 sigma; None: it is not)."""
 
     connected: bool
     trouble: str | None

@@ -146,7 +146,7 @@ class Vitals:
         )
 
     def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
-        """Return (queries per second, cores kept busy) since the oldest measurement kept; None for both if there is no
+        """Return (queries per second, cores kept busy) since the oldest measurement kept, (None, None) if there is no
         other."""
         self._looks.append((elapsed_s, self._tally.queries, cpu_s))
         begin_s, queries, begin_cpu_s = self._looks[0]

@@ -1,5 +1,6 @@
-"""Observers of the events of a flight: they count them, and report when something goes wrong and when it is right
-again. The loop of `flight` calls `tell` of each class with every event; an exception in it ends no flight."""
+"""Observers of the events of a flight (each the `Recognition` of a frame): they count them, and report when something
+goes wrong and when it is right again. The loop of `flight` calls `tell` of each class with every event; an exception in
+it ends no flight."""
 
 import logging
 
