@@ -1,4 +1,5 @@
-"""A flight beside its replay: the lines of both logs, what was said on the links, to the byte, and the queries."""
+"""Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, the packets sent on the links, byte
+by byte, and the queries. In names here, "then" is the flight and "now" its replay."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,15 +14,15 @@ Line = dict[str, Any]
 
 _SIGNATURE_BYTES = 13
 
-# Of the first line: they tell of the program that flew, and not of the flight.
+# Fields of a log's first line that describe the program that flew, not the flight.
 PROGRAM = "version", "machine", "python", "libraries"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """A line that differs: its kind, its time, the query that it tells of (None: it tells of none), and what differs:
-    of each field, by its dotted name, the value then and now. `in_flight` and
-    `in_replay` tell whether there is such a line at all."""
+    """A line that differs: its kind, its time and the name of its query (None: it is about no query). `fields` has the
+    fields that differ, by dotted name (like "fix.sent"), as (value in the flight, value in the replay). `in_flight` and
+    `in_replay` are False if that log has no such line."""
 
     kind: str
     t_mono_s: float
@@ -33,8 +34,8 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Comparison of two logs: how many lines are `alike`, which ones differ, how many of the flight come after the end
-    of the replay, and what differs in the `program`s that flew, by its name: then and now."""
+    """Comparison of two logs: how many lines are `alike`, the `others`, which differ, and how many lines of the flight
+    come `after` the end of the replay. `program` has the fields of `PROGRAM` that differ, by name, as (then, now)."""
 
     alike: int
     others: list[Difference]
@@ -43,8 +44,8 @@ class Lines:
 
 
 def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
-    """Compare the lines of a flight's log with those of its replay. A line that a full disk has cost the flight is no
-    difference: its log says so, in a line of kind "gap"."""
+    """Compare the lines of a flight's log with those of its replay. If a full disk has cost the flight lines (its log
+    then has a line of kind "gap"), lines that only the replay has are no differences."""
     before, after = dict(_keyed(then)), dict(_keyed(now))
     has_gaps = any(line["kind"] == "gap" for line in before.values())
     last_s = max((line["t_mono_s"] for line in after.values()), default=0.0)
@@ -77,7 +78,8 @@ def _difference(key: tuple[Any, ...], fields: dict[str, tuple[Any, Any]], **wher
 
 
 def _keyed(lines: Iterable[Line]) -> Iterator[tuple[tuple[Any, ...], Line]]:
-    """Yield each line with what names it: its kind, time and query, and which it is of several with the same."""
+    """Yield each line as (its key, the line). The key is its kind, time and query, and its number among the lines in
+    which these three are equal."""
     seen: Counter[tuple[Any, ...]] = Counter()
     for line in lines:
         name = line.get("kind"), line.get("t_mono_s") or 0.0, line.get("query")
@@ -95,8 +97,8 @@ def _differing(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple
 
 @dataclass(frozen=True, slots=True)
 class PacketDifference:
-    """A packet that differs: the time, the link's name, the packet of the flight and that of the replay (None: there
-    was none)."""
+    """A pair of packets that differ: the time on the flight's clock, the name of the link, the packet of the flight and
+    that of the replay (None: there was none)."""
 
     t_s: float
     link: str
@@ -105,15 +107,15 @@ class PacketDifference:
 
 
 class Packets:
-    """Comparison of the packets that were said with those that are said now: how many are `alike`, how many are
-    `renumbered` (the same but for the sequence number, after one that is not), and the others."""
+    """Comparison of the packets that the flight sent with those that its replay sends: how many are `alike`, how many
+    `renumbered` (equal but for the sequence number, which an earlier difference has shifted), and the `others`."""
 
     def __init__(self) -> None:
         self.alike = self.renumbered = 0
         self.others: list[PacketDifference] = []
 
     def compare(self, t_s: float, link: str, then: bytes | None, now: bytes | None) -> None:
-        """Compare two packets. A signature needs the key, which no recording holds: it is not compared."""
+        """Compare two packets (None: none was sent). Signatures are left out: no recording holds the key for them."""
         if then is None and now is None:
             return
         if then and now and _unsigned(then) == _unsigned(now):
@@ -125,7 +127,7 @@ class Packets:
 
 
 def described(packet: bytes | None) -> str:
-    """Return a packet in words."""
+    """Return a MAVLink packet as text; "nothing" for None."""
     if packet is None:
         return "nothing"
     (message,) = mavlink.MAVLink(None).parse_buffer(packet)
@@ -138,7 +140,7 @@ def _unsigned(packet: bytes) -> bytes:
 
 
 def _unnumbered(packet: bytes) -> bytes:
-    """Return a packet without its sequence number, and without the checksum over it."""
+    """Return a packet without its sequence number, checksum (which depends on that number) and signature."""
     at = 4 if packet[0] == mavlink.PROTOCOL_MARKER_V2 else 2
     unsigned = _unsigned(packet)
     return unsigned[:at] + unsigned[at + 1 : -2]
@@ -146,9 +148,9 @@ def _unnumbered(packet: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryResult:
-    """The outcome of a query: whether it was `accepted`, and why (not), its `place` and `confidence`, the
-    position `at` of the match (degrees), `off_gps_m`, how far that is from an autopilot that has GPS, and whether a
-    fix was sent (`has_fix`). None is unknown, of whatever it is."""
+    """The outcome of a query: whether it was `accepted`, and the reason, the number of its `place` and its confidence.
+    `at` is the position of the match (latitude, longitude in degrees), `off_gps_m` its distance from the position of an
+    autopilot that has GPS, and `has_fix` says whether a fix was sent. None: unknown."""
 
     accepted: bool
     reason: str
@@ -161,7 +163,7 @@ class QueryResult:
 
 @dataclass(frozen=True, slots=True)
 class QueryPair:
-    """One query of both flights; None where one has none of that name."""
+    """The outcomes of one query in the flight and in the replay; None: there is no query of that name."""
 
     query: str
     then: QueryResult | None
@@ -169,7 +171,7 @@ class QueryPair:
 
     @property
     def apart_m(self) -> float | None:
-        """Metres from one position to the other; None where one of them is missing."""
+        """Metres between the positions of both matches; None if one of them is missing."""
         if not (self.then and self.now and self.then.at and self.now.at):
             return None
         return float(distance_m(*self.then.at, *self.now.at))
@@ -186,7 +188,7 @@ class QueryPair:
 
 
 def beside(then: Sequence[Line], now: Sequence[Line]) -> list[QueryPair]:
-    """Put the queries of two logs side by side, by their names, in the order of the flight."""
+    """Pair the queries of two logs by their names, in the order of the flight."""
     one, other = (
         {line["query"]: _result(line) for line in lines if line.get("kind") == "query"} for lines in (then, now)
     )
@@ -194,7 +196,7 @@ def beside(then: Sequence[Line], now: Sequence[Line]) -> list[QueryPair]:
 
 
 def table(pairs: Sequence[QueryPair]) -> list[tuple[str, Any, Any]]:
-    """Return the rows of a summary: what, of the flight, of the other one."""
+    """Return the rows of a summary, each as (label; value of the flight; value of the replay)."""
     both = [[getattr(pair, side) for pair in pairs if getattr(pair, side)] for side in ("then", "now")]
     off_m = [[each.off_gps_m for each in seen if each.off_gps_m is not None] for seen in both]
     return [

@@ -1,4 +1,4 @@
-"""The points of a flight for other programs, as GeoJSON (RFC 7946), CSV and KML 2.2."""
+"""Writes the points of a flight for other programs, as GeoJSON (RFC 7946), CSV or KML 2.2: `edgevpr export`."""
 
 import csv
 import json
@@ -18,8 +18,8 @@ _OF_FIX = ("why", "accuracy_m", "latency_ms")
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A point: its kind ("match", "fix", "place", "learnt", "autopilot" or "gps"), where it is, and what is known of
-    it."""
+    """A point to export: its kind ("match", "fix", "place", "learnt", "autopilot" or "gps"), its position `at`, and its
+    properties by name."""
 
     kind: str
     at: Point
@@ -27,8 +27,8 @@ class Feature:
 
 
 def features_of(flight: LoggedFlight) -> list[Feature]:
-    """Return the points of a flight: of every query the accepted match, the fix that was made of it, and where
-    autopilot and receiver were; then the places that were found, each once, and those that were learnt."""
+    """Return the points of a flight: for every query the accepted match, the fix made from it, and the positions by
+    autopilot and GPS receiver; then the places that were found, each once, and those learnt in flight."""
     features = [feature for query in flight.queries for feature in _of_query(query)]
     at_place = [(query.place, query.place_at, query.reference_image) for query in flight.queries if query.place_at]
     times_found = Counter(number for number, _, _ in at_place)
@@ -54,7 +54,7 @@ def _of_query(query: LoggedQuery) -> Iterator[Feature]:
 
 
 def write_geojson(features: Sequence[Feature], out: TextIO) -> None:
-    """Write a FeatureCollection, one feature a line."""
+    """Write a GeoJSON FeatureCollection, one feature a line."""
     out.write('{"type": "FeatureCollection", "features": [')
     for count, each in enumerate(features):
         lat_deg, lon_deg = each.at
@@ -68,7 +68,7 @@ def write_geojson(features: Sequence[Feature], out: TextIO) -> None:
 
 
 def write_csv(features: Sequence[Feature], out: TextIO) -> None:
-    """Write a table with a heading, one point a line; a property that a point lacks is empty."""
+    """Write a CSV table with a heading, one point a line; the cell of a property that a point lacks is empty."""
     names = list(dict.fromkeys(name for each in features for name in each.properties))
     table = csv.writer(out, lineterminator="\n")
     table.writerow(("kind", "lat_deg", "lon_deg", *names))
@@ -78,7 +78,7 @@ def write_csv(features: Sequence[Feature], out: TextIO) -> None:
 
 
 def write_kml(features: Sequence[Feature], out: TextIO) -> None:
-    """Write a document with a folder for each kind of points."""
+    """Write a KML document with a folder for each kind of point."""
     root = ElementTree.Element("kml", xmlns=_KML)
     document = ElementTree.SubElement(root, "Document")
     for kind in dict.fromkeys(each.kind for each in features):

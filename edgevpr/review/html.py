@@ -1,4 +1,7 @@
-"""A page that needs nothing else: no network, no script, in the colours that the reader's machine has."""
+"""Parts of HTML pages that need no network and no script, in the light or dark colours that the reader has chosen.
+
+The reports of flights (`review.page`) and of evaluations (`lab.evaluate.page`) are made of them.
+"""
 
 import base64
 from collections.abc import Callable, Iterable, Sequence
@@ -7,12 +10,12 @@ from pathlib import Path
 
 from edgevpr.core.text import shown
 
-# The browser is told to load nothing from anywhere, whatever a foreign name looks like.
+# Content security policy: the browser loads nothing from anywhere, even if a file name in the page contains HTML.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def page(title: str, style: Path, body: Iterable[str]) -> str:
-    """Return a whole page. `style` is a file of what it needs beside the style that all pages have; `body` is HTML."""
+    """Return a whole page. `style` is a CSS file that is added to the style of all pages; `body` is HTML."""
     common = Path(__file__).with_name("common.css").read_text("utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -25,37 +28,37 @@ def page(title: str, style: Path, body: Iterable[str]) -> str:
 
 
 def foreign(text: str) -> str:
-    """Return foreign text fit for a page."""
+    """Return `text`, which may come from anywhere, as HTML: escaped, without passwords and control characters."""
     return escape(shown(text))
 
 
 def heading(title: str, known: Iterable[str]) -> str:
-    """Return the title of a page, with what is known of it below."""
+    """Return the title of a page, and below it the texts `known`, separated by commas."""
     return f'<h1>{foreign(title)}</h1><p class="soft">{foreign(", ".join(known))}</p>'
 
 
 def section(title: str, content: str) -> str:
-    """Return a section, "" where it has no content. `title` and `content` are HTML."""
+    """Return a section; "" if `content` is empty. `title` (may be empty) and `content` are HTML."""
     if not content:
         return ""
     return f"<section>{f'<h2>{title}</h2>' if title else ''}{content}</section>\n"
 
 
 def notes(sentences: Iterable[str]) -> str:
-    """Return the box of what a reader must know; "" where there is nothing."""
+    """Return a box with a list of `sentences` that a reader must know; "" if there are none."""
     items = "".join(f"<li>{foreign(sentence)}</li>" for sentence in sentences)
     return f'<section class="notes"><ul>{items}</ul></section>' if items else ""
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], cell: Callable[[str], str] = foreign) -> str:
-    """Return a table that scrolls where there is no room for it. `cell` makes HTML of what stands in a cell."""
+    """Return a table, which scrolls sideways on a narrow screen. `cell` turns the text of each cell into HTML."""
     head = "".join(f"<th>{text}</th>" for text in headings)
     lines = "".join(f"<tr>{''.join(f'<td>{cell(text)}</td>' for text in row)}</tr>" for row in rows)
     return f'<div class="scroll"><table><tr>{head}</tr>{lines}</table></div>'
 
 
 def picture(name: str, caption: str, jpeg: bytes) -> str:
-    """Return a picture with all of it inside the page (data:), and a caption."""
+    """Return a picture with a caption. The JPEG is stored inside the page, as a data: address."""
     data = base64.b64encode(jpeg).decode()
     return (
         f'<figure><img alt="{foreign(name)}" src="data:image/jpeg;base64,{data}">'

@@ -1,4 +1,5 @@
-"""A flight as its log tells it, in values that are small and sure."""
+"""Reads a flight log into checked values, for the report and the exports. A field that a log lacks, or that is damaged
+or of another type, becomes None."""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -9,14 +10,14 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.runtime.flight.wholeflight import flight_of
 
 Point = tuple[float, float]  # latitude and longitude, degrees
-_FRESH_S = 1.0  # an older report of the autopilot says nothing of a frame
-_CONTINUOUS = "taken into the continuous position"  # which is sent all the time and not answered
-_WORDS = ("said", "state", "problem", "why")  # the field of a line that people read, the first that is there
-_LARGEST = 1e15  # what is larger is no figure of a flight; comparing excludes NaN, and integers that no float can hold
+_FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
+_CONTINUOUS = "taken into the continuous position"  # `why` of a fix in the stream of positions, which is not answered
+_WORDS = ("said", "state", "problem", "why")  # fields with a text for people: the first that a line has is shown
+_LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
 
 
 class FixOutcome(Enum):
-    """Fate of a fix, in the words of the page."""
+    """Outcome of a fix, in the words of the report. KEPT: it was not sent, see its `why`."""
 
     TAKEN = "fix taken"
     REFUSED = "fix refused"
@@ -27,8 +28,8 @@ class FixOutcome(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query: `outcome`, `why` it was not sent or not taken, the position that it says (None: there was
-    nothing to send), and how long the answer took."""
+    """The fix of a query: its outcome, `why` it was not sent or not taken (None: no reason is given), its position `at`
+    (None: there was nothing to send), and the time until the autopilot's answer, `latency_ms` (None: unknown)."""
 
     outcome: FixOutcome
     why: str | None
@@ -39,10 +40,13 @@ class LoggedFix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedQuery:
-    """One query, `t_s` seconds after the start. `at` is the position of an accepted match, `place_at` that of the place
-    found, `autopilot_at` and `gps_at` where autopilot and receiver say that the aircraft was when the frame was taken,
-    and `off_m` is from there to the match: from the autopilot that has GPS, else from the receiver. `cores` are those
-    that the process kept busy since the query before. None is unknown, of whatever it is."""
+    """One query, whose frame was taken `t_s` seconds after the start of the flight. None in any field: unknown.
+
+    `at` is the position of an accepted match, `place_at` that of the place found. `autopilot_at` and `gps_at` are the
+    aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the distance from the match to
+    `autopilot_at` if the autopilot has GPS, else to `gps_at`. `wall_ms` is the time of encoding and matching,
+    `latency_ms` the age of the newest picture, `cores` how many cores the process kept busy since the query before, and
+    `has_link` says whether the autopilot was heard."""
 
     name: str
     t_s: float
@@ -71,7 +75,7 @@ class LoggedQuery:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """A line that says something in words: `kind` of the line, and the words."""
+    """A line of the log with a text for people: its time in seconds after the start, its kind, and the text `said`."""
 
     t_s: float
     kind: str
@@ -80,9 +84,10 @@ class Remark:
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
-    """One flight of a log: `number` of `flights` in it. `start` and `end` are the first and the last line ({}: it lacks
-    one). `unusable` are the times of frames that never became queries, `learnt` the positions of new places. `missing`
-    is a sentence about files of the flight that are not there (None: none)."""
+    """One flight of a log, which has `flights` of them; `number` counts from 1. `start` and `end` are its first and
+    last line ({}: missing). `unusable` are times (seconds after the start) of frames that never became queries,
+    `learnt` the positions of places learnt in flight. `missing` is a sentence about files of the flight that are not
+    there (None: all are). `span_s` is the length of the flight."""
 
     path: Path
     number: int
@@ -98,18 +103,18 @@ class LoggedFlight:
 
     @property
     def map_path(self) -> str | None:
-        """The map, as the first line names it."""
+        """The path of the map in the first line; None if there is none."""
         return text(self.start, "map")
 
     @property
     def recording(self) -> str | None:
-        """The folder of its recording, as the first line names it."""
+        """The folder of the recording in the first line; None if there is none."""
         return text(self.start, "recording")
 
 
 def read_flight(path: str | Path, number: int | None = None) -> LoggedFlight:
-    """Read one flight of a log, with the files before it where it is one of several (see `wholeflight.flight_of`, also
-    for what is raised): the last flight in the file unless its `number` (1, 2, ...) is given."""
+    """Read one flight of a log: that of `number` (1, 2, ...; None: the last in the file). If it began in an earlier
+    file of the log, that is read too. `wholeflight.flight_of` explains this, and what is raised."""
     lines = flight_of(path, number)
     flight = LoggedFlight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
     if lines.missing:
@@ -121,7 +126,7 @@ def read_flight(path: str | Path, number: int | None = None) -> LoggedFlight:
 
 
 class _Reading:
-    """Reads the lines of one flight in their order."""
+    """Fills a `LoggedFlight` from the lines of its log, given one by one in their order."""
 
     def __init__(self, flight: LoggedFlight) -> None:
         self.flight = flight
@@ -130,7 +135,7 @@ class _Reading:
         self._start_s: float | None = None
 
     def read(self, kind: str, line: dict[str, Any]) -> None:
-        """Read a line."""
+        """Add one line of this `kind` to the flight."""
         flight, t_s = self.flight, self._since_start(number(line, "t_mono_s"))
         flight.span_s = max(flight.span_s, t_s)
         if kind == "start":
@@ -151,7 +156,7 @@ class _Reading:
             flight.remarks.append(Remark(t_s, kind, _words(line)))
 
     def _since_start(self, t_mono_s: float | None) -> float:
-        """Return the seconds since the first line that has a time; of a line without, those of the latest before it."""
+        """Return the seconds from the first line with a time to `t_mono_s`; None stands for the latest time so far."""
         if t_mono_s is None:
             return self.flight.span_s
         if self._start_s is None:
@@ -159,13 +164,14 @@ class _Reading:
         return max(0.0, t_mono_s - self._start_s)
 
     def _take_answer(self, line: dict[str, Any], key: str, answer: str) -> None:
-        """Add to an earlier query what became of its fix since."""
+        """Update the fix of an earlier query. `key` is the object in `line` that tells of it; its field `answer` is the
+        autopilot's answer."""
         at, told = self._at.get(text(line, key, "query") or ""), value(line, key)
         if at is None or not isinstance(told, dict):
             return
         query = self.flight.queries[at]
         if query.fix is None or (query.fix.outcome is not FixOutcome.UNANSWERED and key == "last_fix"):
-            return  # its line of kind "answer" knows more
+            return  # a line of kind "answer" has said more
         fix = replace(
             query.fix,
             outcome=_outcome(told, told.get(answer)),
@@ -247,7 +253,8 @@ def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
 
 
 def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
-    """Return where the receiver was when the frame was taken: its newest position, moved on by the velocity."""
+    """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
+    if that is unknown or not fresh."""
     at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
     if at is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None
@@ -268,27 +275,27 @@ def _words(line: dict[str, Any]) -> str:
 
 
 def value(record: Any, *keys: str) -> Any:
-    """Return what stands under `keys`, one inside the other; None where anything is missing."""
+    """Return the value at `keys` in the nested dictionaries of `record`; None if any of them is missing."""
     for key in keys:
         record = record.get(key) if isinstance(record, dict) else None
     return record
 
 
 def number(record: Any, *keys: str) -> float | None:
-    """Return a number, as `value` finds it."""
+    """Return the number at `keys`, as `value` does; None if it is missing or no plausible number."""
     found = value(record, *keys)
     is_number = isinstance(found, (int, float)) and not isinstance(found, bool)
     return float(found) if is_number and -_LARGEST < found < _LARGEST else None
 
 
 def text(record: Any, *keys: str) -> str | None:
-    """Return a text, as `value` finds it; None for an empty one."""
+    """Return the text at `keys`, as `value` does; None if it is missing, empty or no text."""
     found = value(record, *keys)
     return found if isinstance(found, str) and found else None
 
 
 def point(record: Any, *keys: str) -> Point | None:
-    """Return the position (lat_deg, lon_deg) of the object under `keys`; None where it has none on the Earth."""
+    """Return the position (lat_deg, lon_deg) of the object at `keys`; None if it is missing or out of range."""
     lat_deg, lon_deg = number(record, *keys, "lat_deg"), number(record, *keys, "lon_deg")
     if lat_deg is None or lon_deg is None or abs(lat_deg) > 90 or abs(lon_deg) > 180:
         return None

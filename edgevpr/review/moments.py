@@ -1,5 +1,5 @@
-"""The moments of a flight that are worth a look: where a match is far from GPS, the autopilot refused, nothing was
-recognised for long, or little was sure."""
+"""Chooses the moments of a flight that its report shows: matches far from GPS, fixes refused or held back, long times
+without a match, the least exact match, the slowest query. Each kind is a function that yields the worst first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery
 from edgevpr.review.svg import clock
 
 _FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
-_HELD = "held back"  # how the reason begins, why a fix that contradicts the autopilot was not sent
+_HELD = "held back"  # begins the `why` of a fix that was not sent because it contradicts the autopilot
 _LONG_S = 5.0
-_NEAR_S = 5.0  # two moments that are nearer show the same
-_OF_A_KIND, _MOST = 2, 6
+_NEAR_S = 5.0  # of two moments that are closer in time only the first is shown
+_OF_A_KIND, _MOST = 2, 6  # moments at most, of one kind and in all
 
 
 @dataclass(frozen=True, slots=True)
 class WorstMoment:
-    """A query worth a look, and why it is."""
+    """A query to show in the report, and a sentence on why."""
 
     query: LoggedQuery
     why: str
 
 
 def worst(flight: LoggedFlight) -> list[WorstMoment]:
-    """Return the worst moments, those first that could have been dangerous."""
+    """Return the worst moments, at most `_MOST`; those that could have been dangerous come first."""
     chosen: list[WorstMoment] = []
     for moments in (_far, _refused, _held, _nothing, _unsure, _slow):
         of_kind = 0

@@ -1,4 +1,5 @@
-"""The ground as seen from above: the places of the map with what their pictures show, and the flight over them."""
+"""Draws the ground as seen from above, for the report: the places of the map with the ground that their pictures show,
+and the flight over them."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -18,7 +19,7 @@ from edgevpr.review.svg import Points, dots, way
 
 _WIDE = 1000.0  # of the drawing, in its own units
 _MARGIN = 0.04
-_SHAPES = 0.55, 1.8  # the least and the most height that a drawing has for its width
+_SHAPES = 0.55, 1.8  # the least and the greatest ratio of a drawing's height to its width
 _MOST_VH = 80  # of the height of the window
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
 _ROUND = (1, 2, 5)
@@ -31,8 +32,9 @@ _FIXES = (
 
 @dataclass(frozen=True, slots=True)
 class MapGround:
-    """Ground of a map: its positions and how their pictures lie there (None: unknown), and `places` in all, also those
-    without position. `trouble` says in a sentence why there is no more of it."""
+    """The places of a map that can be drawn: `at` has (position; pose of the picture, None if unknown) for each place
+    with a position. `places` counts all, also those without. `trouble` is a sentence on why places are missing (None:
+    none are)."""
 
     at: Sequence[tuple[Point, Pose | None]] = ()
     places: int = 0
@@ -41,8 +43,8 @@ class MapGround:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Part of the drawing that a person may hide: its name, the class that colours it, and the ways through points; or,
-    with `are_dots`, one way of dots."""
+    """Layer of the drawing, which the reader can hide: its name, the CSS class that colours it, and its `ways`, each a
+    sequence of points. With `are_dots` the points are drawn as dots, else each way is a line."""
 
     name: str
     colour: str
@@ -51,7 +53,8 @@ class Layer:
 
 
 def read_ground(path: str | Path) -> MapGround:
-    """Read the places of a map; what cannot be read of it is left out. Raises MapError where that is all."""
+    """Read the places of the map file `path`. If it is damaged, the places up to there are returned, with `trouble`.
+    Raises MapError if nothing can be read."""
     with PlaceMap.open(path) as place_map:
         places = 0
         at = []
@@ -67,7 +70,7 @@ def read_ground(path: str | Path) -> MapGround:
 
 
 def layers_of(flight: LoggedFlight) -> list[Layer]:
-    """Return what there is to draw of a flight, from the bottom to the top."""
+    """Return the layers of a flight, from the bottom to the top. Those without points are left out."""
     queries = flight.queries
     found = list(dict.fromkeys(query.place_at for query in queries if query.place_at))
     layers = [
@@ -84,12 +87,13 @@ def layers_of(flight: LoggedFlight) -> list[Layer]:
 
 
 def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
-    """Return the lines through points, each up to one that is not known."""
+    """Return the runs of successive known points: None, an unknown point, ends a run."""
     return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
 
 
 def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
-    """Draw the ground with the layers over it, and labels at the `named` points; "" where nothing has a position."""
+    """Return HTML with the ground, the layers over it, and a label at each of the `named` points (its name, position);
+    "" if nothing has a position."""
     everything = [at for at, _ in ground.at] + [at for layer in layers for way in layer.ways for at in way]
     if not everything:
         return ""
@@ -114,7 +118,7 @@ def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, 
         f"{escape(layer.name)}</label>"
         for layer in ([Layer("places of the map", "places", ())] if shown else []) + list(layers)
     )
-    shape = _WIDE / view.high  # labels lie right only while the view has exactly this
+    shape = _WIDE / view.high  # labels are placed in per cent of width and height: they fit this shape only
     length_m, share = view.ruler()
     ruler = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:.0f} km"
     return (
@@ -127,7 +131,8 @@ def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, 
 
 
 class _View:
-    """The window on the ground, north up: turns positions into points of the drawing, `high` units high."""
+    """Converts positions into points of the drawing, which has north up and is `_WIDE` x `high` units large.
+    `everything` are all positions to draw; `footprint_m`, the ground length of a picture, sets the room around them."""
 
     def __init__(self, everything: Sequence[Point], footprint_m: float) -> None:
         self._origin = everything[0]
@@ -141,19 +146,19 @@ class _View:
         self._middle_m = (np.min(east_m) + np.max(east_m)) / 2, (np.min(north_m) + np.max(north_m)) / 2
 
     def on(self, points: Sequence[Point]) -> Points:
-        """Return points of the drawing."""
+        """Convert positions into points (x, y) of the drawing."""
         east_m, north_m = self._metres(points)
         return list(zip(*self._drawn(east_m, north_m), strict=True))
 
     def square(self, at: Point, pose: Pose) -> str:
-        """Return the path of the ground that a picture shows, as a square of its longest side."""
+        """Return SVG path data of the ground that a picture shows, drawn as a square with its longest side."""
         east_m, north_m = self._metres([at])
         corners = axes_of(pose.up_deg) @ np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * pose.footprint_m / 2
         x, y = self._drawn(east_m + corners[0], north_m + corners[1])
         return "M" + "L".join(f"{a:.0f} {b:.0f}" for a, b in zip(x, y, strict=True)) + "z"
 
     def ruler(self) -> tuple[float, float]:
-        """Return a round length, metres, of about a fifth of the width, and its share of it."""
+        """Return (a round length in metres, at most a quarter of the drawing's width; its share of that width)."""
         wide_m = _WIDE / self._scale
         power = 10.0 ** math.floor(math.log10(wide_m / 4))
         length_m = max(each * power for each in _ROUND if each * power <= wide_m / 4)

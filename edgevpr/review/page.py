@@ -1,4 +1,7 @@
-"""A flight as one page that needs nothing else: no network, no script, in the colours that the reader's machine has."""
+"""The report of a flight (`edgevpr report`): one HTML page with its pictures inside, without network or script.
+
+Functions that return a str return HTML.
+"""
 
 import json
 import re
@@ -39,9 +42,9 @@ _CHARTS = (
 
 
 class Album:
-    """Folders in which pictures are looked for by the names that the log gives them; `recorded` are those of a
-    recording, by these names. A flight and the map it flies over each have one: pictures of both often have the same
-    names. Raises UsageError for a folder that is not there."""
+    """Finds pictures by the names that the log gives them: in `recorded`, the frames of a recording by name, else as
+    files in `folders`. The flight and the map have an album each, since their pictures often have equal names. Raises
+    UsageError for a folder that does not exist."""
 
     def __init__(self, folders: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
         self._recorded = recorded
@@ -51,7 +54,7 @@ class Album:
                 raise UsageError(f"{given}: there is no such folder: give one that holds pictures.")
 
     def picture(self, name: str | None) -> bytes | None:
-        """Return a picture as a small JPEG; None where there is none, or none that can be read."""
+        """Return the picture `name` as a small JPEG; None if there is none that can be read."""
         if not name or not (self._folders or name in self._recorded):
             return None
         from edgevpr.frames.images import EXTENSIONS, read_image, small_jpeg  # a page without pictures needs no OpenCV
@@ -62,15 +65,14 @@ class Album:
         for folder, ending in product(self._folders, ("", *EXTENSIONS)):
             with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
                 path = (folder / f"{name}{ending}").resolve()
-                # A log of somebody else may name any file of this machine: only what is in the folder is shown.
+                # A log from somebody else may name any file of this machine: show only files in the folder.
                 if path.is_relative_to(folder) and path.is_file():
                     return small_jpeg(read_image(path))
         return None
 
 
 def page_of(flight: LoggedFlight, ground: MapGround, frames: Album, references: Album) -> str:
-    """Return the page: HTML with all that it shows inside. `frames` has the pictures of the flight, `references` those
-    that the map was made of."""
+    """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of."""
     moments = worst(flight)
     named = [
         (str(number), where)
@@ -250,7 +252,8 @@ def _objections(flight: LoggedFlight) -> Iterator[str]:
 
 
 def _counts(reasons: Iterable[str]) -> str:
-    """Return how often each reason was given; figures, which differ every time, are left out."""
+    """Return a table of how often each reason was given. Numbers in reasons become "…", so that equal ones count
+    together."""
     counted = Counter(_NUMBER.sub("…", reason) for reason in reasons)
     return table(("times", "why"), [(str(count), why) for why, count in counted.most_common(20)]) if counted else ""
 

@@ -1,4 +1,5 @@
-"""A recorded flight, flown again by the same code with the same clocks, frames and messages."""
+"""Flies a recorded flight again, for `edgevpr replay`: the code of a flight, with clocks, frames and messages from the
+recording in place of the real ones."""
 
 import logging
 import shutil
@@ -27,14 +28,14 @@ from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.flight.world import Stop, World
 
-Say = Callable[[int, int], None]  # told of the frames so far, and of all
+Say = Callable[[int, int], None]  # shows progress: takes the number of the frame, and how many there are
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recorded flight: the lines of its log, and the folder of its recording."""
+    """A recorded flight: the lines of its log, each a dictionary, and the folder of its recording."""
 
     lines: list[Line]
     folder: Path
@@ -42,8 +43,8 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Result of a replay: the lines of its log, the comparison of the packets, why it has ended before the flight
-    (None: it has not), and how many answers had to be guessed, since the code asks something else than it did then."""
+    """Result of a replay: the lines of its log, the comparison of its packets with those of the flight, why it ended
+    before the flight did (None: it did not), and how many answers it had to guess (see `Playback`)."""
 
     lines: list[Line]
     packets: Packets
@@ -52,8 +53,8 @@ class Replayed:
 
 
 def recorded(log: str | Path) -> Recorded:
-    """Find the last flight of a log, and its recording: where the log says, or in a folder of that name beside it.
-    Raises UsageError where there is none, and EdgevprError for a file without a line of a flight."""
+    """Find the last flight of `log` and its recording, in the folder that the log names or in one of that name beside
+    the log. Raises UsageError if there is no recording, and EdgevprError for a file without a line of a flight."""
     whole = flight_of(log)
     if whole.missing:
         _log.warning("%s", whole.missing)
@@ -68,9 +69,9 @@ def recorded(log: str | Path) -> Recorded:
 
 
 def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Path | None = None) -> Replayed:
-    """Fly a recorded flight again; with `changes`, a YAML file, fly with its frames and messages, and with the keys of
-    that file in place of those that it had. `place_map` is its map, where that is not where it was. Raises an
-    EdgevprError where recording or map cannot be opened."""
+    """Fly a recorded flight again. `place_map` is the path of its map (None: the path that it had). `changes` is a YAML
+    file (None: none) whose keys override the configuration of the flight; frames and messages stay those of the flight.
+    Raises EdgevprError if recording or map cannot be opened."""
     notes = read_tape(flight.folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
@@ -110,7 +111,8 @@ def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Pa
 
 
 def _pictures_of(folder: Path, say: Say) -> Callable[[int], Image]:
-    """Return the function that reads the frame of a number. It raises TapeEnded for one that a power cut has cost."""
+    """Return a function that reads a recorded frame, given its number, and calls `say`. It raises TapeEnded for a frame
+    that cannot be read, for instance after a power cut."""
     total = sum(1 for _ in (folder / FRAMES).iterdir())
 
     def picture(number: int) -> Image:
@@ -124,7 +126,8 @@ def _pictures_of(folder: Path, say: Say) -> Callable[[int], Image]:
 
 
 def _map_of(folder: Path, temporary: Path, config: Config, map_path: str | None) -> str | None:
-    """Return the path of the map to fly with: for a flight that learnt, that of a copy of its map, as it was."""
+    """Return the path of the map to fly with (None: no map). For a flight that learnt places, it is that of a copy, in
+    `temporary`, of the map as it was at the start."""
     if config.mapping.learn:
         copy = temporary / MAP
         if (folder / MAP).is_file():

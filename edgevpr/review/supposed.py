@@ -1,4 +1,7 @@
-"""Supposing: the frames and messages of a recorded flight with another configuration, beside what was flown."""
+"""Plays a recorded flight back to code with another configuration: `edgevpr replay --config`, a "what if".
+
+Frames and messages are those of the recording, but the flight may ask for and send other things than it did.
+"""
 
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
@@ -7,6 +10,7 @@ from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.review.tape import Note, Playback, ReplayedLink
 
 T = TypeVar("T")
+# Kinds of questions: those answered by the newest answer on the tape, and those with always the same answer.
 _AS_FOUND = "is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn"
 _ALWAYS: dict[str, Any] = {
     "stop": False,
@@ -23,7 +27,7 @@ _ALWAYS: dict[str, Any] = {
 
 
 class SupposedLink(ReplayedLink):
-    """A link to an autopilot that says what it said then; what is said to it leaves at once."""
+    """A link on which the autopilot sends what it sent in the flight. A packet to it counts as sent at once."""
 
     def _said(self, then: str | None) -> None:
         while chosen := self._conversation.next_packet():
@@ -40,12 +44,12 @@ class SupposedLink(ReplayedLink):
 
 
 class SupposedGround(GroundLink, SupposedLink):
-    """The link to the ground, likewise."""
+    """The link to the ground station, replayed as `SupposedLink` is."""
 
 
 class Supposed(Playback):
-    """A tape for a flight that may go another way: its time is that of the tape, which goes on from frame to frame, and
-    work takes none. What the machine was asked is answered as it was last."""
+    """Playback for a flight that may take another course. Its time is that of the tape and goes on from frame to frame;
+    computing takes no time. Questions about the machine get the newest answer on the tape."""
 
     link, ground = SupposedLink, SupposedGround
 
@@ -55,11 +59,11 @@ class Supposed(Playback):
         self._utc_ahead_s = 0.0
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Answer as the flight could have been answered."""
+        """Return an answer that the flight could have got to a question of `kind`; `look` asks the real machine."""
         return cast(T, look() if kind == "outlook" else self._answer(kind, look))
 
     def sleep(self, seconds: float) -> None:
-        """Let time go on, up to the next frame."""
+        """Advance the time by `seconds`. The notes of that time are taken off the tape, up to the next frame."""
         until_s = self.t_s + seconds
         while (note := self._peek()) and note[0] != "frame" and self._time_of(note) <= until_s:
             self._step()
@@ -79,7 +83,8 @@ class Supposed(Playback):
         return self.t_s + (self._utc_ahead_s if kind == "utc_s" else 0.0)
 
     def _frame(self) -> dict[str, Any] | None:
-        """Return the next frame; of several that time has passed over, the newest, as a camera gives it."""
+        """Return the next frame (None: the tape has no more). If the time is past several frames, return the newest of
+        them, as a camera would."""
         frame: dict[str, Any] | None = None
         while note := self._peek():
             if frame and self._time_of(note) > self.t_s:
@@ -94,7 +99,7 @@ class Supposed(Playback):
         return next(self._upcoming(), None)
 
     def _step(self) -> bool:
-        """Go on by one note; return False at the end of the tape."""
+        """Take the next note off the tape and act on it. Return False if the tape has no more."""
         if (note := self._peek()) is None:
             return False
         self._ahead.popleft()

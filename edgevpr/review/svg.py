@@ -1,7 +1,7 @@
-"""Charts as SVG and HTML that follow the width and the colours of the page, without a script.
+"""Charts as SVG and HTML that follow the width and the colours of the page, without a script, for reports.
 
-The drawing stretches to the width that there is, and its lines and dots keep theirs; whatever is written stands beside
-it, so that it stays readable on a phone.
+A drawing stretches to the width of the page, while its lines and dots keep their thickness. All text is HTML beside the
+drawing, so that it is readable on a phone. A `colour` is a CSS class that sets the colour.
 """
 
 import math
@@ -10,23 +10,23 @@ from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
-Points = Sequence[tuple[float, float]]
+Points = Sequence[tuple[float, float]]  # (x, value), or (x, y) of a drawing
 
 UNKNOWN = "–"
 
 _WIDE, _HIGH = 1000.0, 100.0
 _MOST_POINTS = 1200  # of a line: more than there are pixels
-_LAST = 0.97  # a text in the middle of a point further right would stand out of the page
+_LAST = 0.97  # share of an axis: a text centred on a point further right would leave the page
 _TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
-_GAP, _LEAST_GAP_S = 5.0, 3.0  # a line is broken where a point is missing for so many usual steps, and so long
+_GAP, _LEAST_GAP_S = 5.0, 3.0  # a line is broken where points are missing for so many usual steps and so many seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One line or, with `are_dots`, the dots of a chart: its name, the class that colours it, points (x, value) in the
-    order of x."""
+    """One line of a chart (with `are_dots`: its dots): the name in the legend, the colour, and the points (x, value) in
+    the order of x."""
 
     name: str
     colour: str
@@ -36,23 +36,23 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """The axis to the right, from `first` to `last`, with the texts that stand below it, each at its value."""
+    """The horizontal axis, from `first` to `last`. Each of `ticks` is (value on the axis; text below it)."""
 
     first: float
     last: float
     ticks: Sequence[tuple[float, str]]
 
     def across(self, x: float) -> float:
-        """Return where a value lies, from 0 (left) to 1."""
+        """Return where `x` lies along the axis, from 0 (left end, or left of it) to 1 (right end, or right of it)."""
         return min(max((x - self.first) / ((self.last - self.first) or 1.0), 0.0), 1.0)
 
     def grid(self, high: float) -> str:
-        """Return the path of the lines above the texts."""
+        """Return an SVG path of vertical lines at the ticks, `high` units high, and the line below them."""
         lines = "".join(f"M{_WIDE * self.across(x):.1f} 0v{high:g}" for x, _ in self.ticks)
         return f'<path class="grid" d="{lines}M0 {high:g}h{_WIDE:g}"/>'
 
     def below(self) -> str:
-        """Return the texts."""
+        """Return the texts below the axis, as HTML."""
         texts = ""
         for x, text in self.ticks:
             left = self.across(x)
@@ -69,8 +69,8 @@ def chart(
     top: float = 0.0,
     parts: Callable[[Points], Iterable[Points]] = lambda points: [points],
 ) -> str:
-    """Draw series over an axis. The axis of the values reaches from 0 to the highest, and to `top` at least; a series
-    without points is left out, and a chart without any is empty (""). `parts` breaks lines."""
+    """Return a chart of `series` as HTML. Its values reach from 0 to the highest one, and to `top` at least. A series
+    without points is left out; if none has points, the result is "". `parts` splits a line where it is to be broken."""
     series = [each for each in series if each.points]
     if not series:
         return ""
@@ -87,13 +87,13 @@ def chart(
 
 
 def time_chart(title: str, unit: str, series: Sequence[Series], span_s: float, top: float = 0.0) -> str:
-    """Draw series over time, from 0 to `span_s`; a line is broken where nothing is known for longer than usual."""
+    """Return a `chart` over time, from 0 to `span_s`. A line is broken where points are missing for an unusual time."""
     return chart(title, unit, series, _times(span_s), top, _known_parts)
 
 
 def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
-    """Draw points (x, value, its short text, the class that colours it), values from 0 to `top`. Texts that would lie
-    over each other are moved to the right."""
+    """Return a chart of points as HTML, "" without points. Each is (x, value, short text, colour), with values from 0
+    to `top`. Texts that would lie over each other are moved to the right."""
     taken: list[tuple[float, float]] = []
     marks = tags = ""
     for x, value, text, colour in points:
@@ -109,7 +109,7 @@ def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str
 
 
 def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
-    """Draw one lane for each (name, colour, times): a mark at every time, and how many there are."""
+    """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number."""
     axis, lines = _times(span_s), ""
     for name, colour, times in rows:
         marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times}))
@@ -119,12 +119,12 @@ def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> st
 
 
 def dots(points: Points) -> str:
-    """Return the path of dots: lines without length, which a round end makes into dots of any size."""
+    """Return SVG path data of dots: lines of length 0, whose round ends make dots as wide as the line."""
     return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
 
 
 def way(points: Points) -> str:
-    """Return the path of a line through points; a single one is a dot."""
+    """Return SVG path data of a line through `points`; a single point becomes a dot."""
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + ("h0" if len(points) == 1 else "")
 
 
@@ -137,7 +137,7 @@ def nice(value: float) -> float:
 
 
 def figure(value: float | None, unit: str = "") -> str:
-    """Return a number with three digits that say something, and its unit; a dash where it is unknown."""
+    """Return a number, with three significant digits, and its unit as text; a dash for None."""
     if value is None:
         return UNKNOWN
     digits = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
@@ -145,7 +145,7 @@ def figure(value: float | None, unit: str = "") -> str:
 
 
 def clock(t_s: float) -> str:
-    """Return a time of the flight as minutes and seconds, from an hour on with the hours: 1:02:03."""
+    """Return a time in seconds as text: minutes and seconds (2:03), from an hour on with the hours (1:02:03)."""
     minutes, seconds = divmod(round(t_s), 60)
     if minutes < 60:
         return f"{minutes}:{seconds:02d}"
@@ -172,7 +172,7 @@ def _label(title: str, unit: str) -> str:
 
 
 def _thinned(points: Points) -> Points:
-    """Return all points or, of more than can be seen, the lowest and the highest of each short part."""
+    """Return all points; if there are more than can be seen, the lowest and the highest of each short stretch."""
     if len(points) <= _MOST_POINTS:
         return points
     step = -(-2 * len(points) // _MOST_POINTS)
@@ -191,7 +191,7 @@ def _times(span_s: float) -> Axis:
 
 
 def _known_parts(points: Points) -> Iterator[Points]:
-    """Yield the parts of a line between the times at which nothing is known for longer than usual."""
+    """Split a line wherever points are missing for an unusual time, and yield its parts."""
     steps_s = sorted(after[0] - before[0] for before, after in pairwise(points))
     most_s = max(_LEAST_GAP_S, _GAP * steps_s[len(steps_s) // 2]) if steps_s else 0.0
     first = 0

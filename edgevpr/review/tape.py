@@ -1,5 +1,9 @@
-"""The tape of a recorded flight, played back: every question gets the answer that it got then, and the links hear what
-they heard then."""
+"""Plays back the tape of a recorded flight: the code's questions to the outside world (clock, frame, temperature) get
+the answers that they got in the flight, and its links receive what they received then. `replay` uses it.
+
+A line of the tape is a note: the answer to a question of some kind, or a turn of a link. In a turn (`mavlink.turns`) a
+link works alone and its time stands still; the note has this time and the steps, such as bytes received or a packet
+sent."""
 
 import json
 import logging
@@ -23,26 +27,27 @@ T = TypeVar("T")
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"
 
-_RETIRED = ("forms",)  # asked by flights before, and by none now
+_RETIRED = ("forms",)  # kinds of notes that only earlier versions wrote
 
 _log = logging.getLogger(__name__)
 
 
 class TapeEnded(BaseException):
-    """Raised where the tape has no more: the flight was killed, or the recording had ended before it."""
+    """Raised where the tape has no more notes: the flight was killed, or its recording ended before it did."""
 
 
 class ReplayedLink(Link):
-    """A link without a port and a thread: its turns are those on the tape, which is a `Playback`."""
+    """A link without a port and a thread, whose turns come from the tape, a `Playback`. The method `_NAME` repeats the
+    step NAME of a turn."""
 
     def start(self) -> None:
-        """Take the turns of the tape from now on."""
+        """Let the playback perform the link's turns from now on."""
         self._leaving: deque[Sending] = deque()
-        self._playback = cast(Playback, self._tape)  # a link knows only that it has a tape
+        self._playback = cast(Playback, self._tape)  # the type of `_tape` is more general
         self._playback.links[self.name] = self._perform
 
     def close(self) -> None:
-        """Let no text wait any more; the rest is on the tape."""
+        """Send waiting texts without delay; all else that closing does is on the tape."""
         with self.turn("close"):
             self._conversation.texts.hurry()
 
@@ -93,12 +98,12 @@ class ReplayedLink(Link):
 
 
 class ReplayedGround(GroundLink, ReplayedLink):
-    """The link to the ground, likewise."""
+    """The link to the ground station, replayed as `ReplayedLink` is."""
 
 
 class ReplayedSigning(NotSigning):
-    """Signs with no key that anybody has, and admits what was admitted: `verdicts` are those on the next messages, why
-    each was refused (None: it was not)."""
+    """Signing without the real key: signs with a key of zeros, and admits the messages that the flight admitted.
+    `verdicts` has, for each of the next messages, why the flight refused it (None: it did not)."""
 
     def __init__(self) -> None:
         self._refused: Counter[str] = Counter()
@@ -106,16 +111,16 @@ class ReplayedSigning(NotSigning):
         self.verdicts: deque[str | None] = deque()
 
     def of_ground(self) -> "ReplayedSigning":
-        """Return that of the link to the ground."""
+        """Return the signing of the link to the ground station."""
         return ReplayedSigning()
 
     def stamp(self, packer: mavlink.MAVLink) -> None:
-        """Let a packer sign its next message."""
+        """Make `packer` sign its next message, with a key of zeros."""
         signing = packer.signing
         signing.sign_outgoing, signing.secret_key, signing.link_id, signing.timestamp = True, bytes(KEY_BYTES), 1, 1
 
     def admits(self, message: Message) -> bool:
-        """Tell whether a message was believed."""
+        """Return True if the flight accepted this message's signature."""
         reason = self.verdicts.popleft() if self.verdicts else None
         if reason:
             self._refused[reason] += 1
@@ -123,12 +128,13 @@ class ReplayedSigning(NotSigning):
 
 
 class Playback:
-    """A tape that is played back. The turns of the links (`links`, by name) are taken where they were taken, and
-    `packets` compares what they say. `link` and `ground` are the kinds of links that go with it.
+    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns; they are
+    performed in the order of the tape. `packets` compares the packets sent. `link` and `ground` are the classes of the
+    links that a replay uses.
 
-    Code that has changed since the flight may ask more, less, or in another order. The frames then keep both in step:
-    a question that has no answer before the next frame gets the newest one of its kind. `guessed` counts the questions
-    out of turn; where it is 0, the replay has asked what the flight asked.
+    Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
+    the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
+    questions out of order; if it is 0, the replay has asked exactly what the flight asked.
     """
 
     link: type[ReplayedLink] = ReplayedLink
@@ -145,11 +151,12 @@ class Playback:
         self._is_stopping = False
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return the answer of the flight. Raises StopNow where the flight was ended meanwhile, and TapeEnded."""
+        """Return the flight's answer to a question of `kind`. `look` asks the real machine: it is called only if the
+        tape has no answer. Raises StopNow where the flight was stopped, and TapeEnded."""
         if self._head()[0] == "stopped":
             self._ahead.popleft()
             self._is_stopping = True
-        # What was broken off may have asked, on its way out, what its undisturbed end asks.
+        # A flight that was stopped may have asked more while it cleaned up: such a question is answered first.
         if self._is_stopping and self._head()[0] != kind:
             self._is_stopping = False
             raise StopNow
@@ -166,13 +173,14 @@ class Playback:
         return cast(T, found)
 
     def note(self, kind: str, *values: Any) -> None:
-        """Do nothing: what happens is on the tape."""
+        """Do nothing: a replay is not recorded."""
 
     def sleep(self, seconds: float) -> None:
-        """Return at once: time goes on by the tape."""
+        """Return at once: the time comes from the tape."""
 
     def _head(self) -> Note:
-        """Return the next answer, after the turns of the links before it. Raises TapeEnded."""
+        """Perform the turns that come next on the tape, and return the answer after them, still on the tape. Raises
+        TapeEnded."""
         for note in self._upcoming():
             perform = self.links.get(note[0])
             if perform is None:
@@ -184,7 +192,7 @@ class Playback:
         raise TapeEnded
 
     def _take(self) -> Note:
-        """Take the next answer off the tape. Raises StopNow where it is the end that was asked for, and TapeEnded."""
+        """Take the next answer off the tape. Raises StopNow if it says that the flight was stopped, and TapeEnded."""
         note = self._head()
         self._ahead.popleft()
         if note[0] == "stopped":
@@ -192,8 +200,8 @@ class Playback:
         return note
 
     def _steps_to(self, kind: str) -> int | None:
-        """Count the answers before the next one of a kind; None where there is none before the next frame. A look at a
-        clock is not worth going on."""
+        """Count the answers before the next one of `kind`; None if it does not come before the next frame. None for
+        clocks as well: no answers are skipped to read a clock."""
         steps = 0
         for note in self._upcoming() if kind not in _CLOCKS else ():
             if note[0] in (kind, "stopped"):
@@ -204,7 +212,7 @@ class Playback:
         return None
 
     def _upcoming(self) -> Iterator[Note]:
-        """Yield the notes ahead, the first of which may be taken away meanwhile."""
+        """Yield the notes ahead. The caller may take the first one off the tape meanwhile."""
         at = 0
         while True:
             if at == len(self._ahead):
@@ -226,12 +234,12 @@ class Playback:
 
 
 def _is_moment(kind: str) -> bool:
-    """Tell whether an answer is a time on the clock of the flight."""
+    """Tell whether answers of `kind` are times on the flight's monotonic clock."""
     return kind == "mono_s" or kind.startswith("turn: ")
 
 
 def read_tape(path: Path) -> Iterator[Note]:
-    """Yield the notes of a tape; a last line that was cut is left out. Raises EdgevprError where there is none."""
+    """Yield the notes of a tape file, up to a line that was cut off. Raises EdgevprError if it cannot be read."""
     try:
         with open(path, "rb") as file:
             for line in file:
