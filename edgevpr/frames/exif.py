@@ -1,4 +1,5 @@
-"""Data that the camera wrote into an image file: position, heading and time from EXIF, attitude and height from XMP."""
+"""Data that the camera wrote into an image file: position, heading and time from EXIF, attitude and height from XMP.
+Used for the images of a folder without a positions.csv. An attitude is roll and pitch."""
 
 import logging
 import math
@@ -12,7 +13,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
 
 T = TypeVar("T")
-Tags = Mapping[str, Any]  # values of exifread by their names, "GPS GPSLatitude"
+Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSLatitude"
 
 _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
 _MOST_XMP_BYTES = 65_536  # that of a JPEG fits a segment
@@ -24,15 +25,15 @@ _log = logging.getLogger(__name__)
 
 
 class _Senseless(ValueError):
-    """A value is there, and cannot be true."""
+    """A value is present in the file but impossible, such as a latitude of 99 degrees."""
 
 
 def read_exif(path: str | Path) -> GeoTag:
-    """Read the tag of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, broken or senseless is
-    None. What is senseless in EXIF (minutes of 99, a date of 1e308) is said in the log.
+    """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
+    impossible is None. Impossible EXIF values (minutes of 99, a date of 1e308) are reported in the log.
 
-    The time is that of the GPS receiver, else that of the camera clock, taken as UTC where it has no time zone. The
-    heading is that of the gimbal, which goes with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
+    The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. The
+    heading is that of the gimbal, with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
     """
     tags = _exif_of(path)
 
@@ -124,11 +125,11 @@ def _time_s(name: str, text: str) -> float:
 
 
 def read_xmp(path: str | Path) -> GeoTag:
-    """Read what DJI, Parrot and Pix4D's tags say, from the packet in the first 300 KB of a file. Never raises: a value
-    that is absent, broken or senseless is None.
+    """Read the XMP tags of DJI, Parrot and Pix4D from the first 300 KB of a file. Never raises: a value that is absent,
+    damaged or impossible is None.
 
-    The heading is that of the top of the picture. Roll and pitch are the deviation of the camera from straight down.
-    The height is over the take-off point, which is the height above the ground only where the ground is level.
+    The heading is that of the top of the picture, or if unknown that of the aircraft. Roll and pitch are the deviation
+    of the camera from straight down. The height is over the take-off point, and above the ground only if that is level.
     """
     try:
         with open(path, "rb") as handle:
@@ -140,7 +141,7 @@ def read_xmp(path: str | Path) -> GeoTag:
         if angles := _yaw_pitch_roll(values, maker, "Degree"):
             heading_deg, roll_deg, pitch_deg = _from_straight_down(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    for maker in _PIX4D:  # of these tags 0 is straight down; a camera without an IMU writes zeros
+    for maker in _PIX4D:  # in these tags 0 is straight down; a camera without an IMU writes zeros, which are ignored
         if (angles := _yaw_pitch_roll(values, maker, "")) and any(angles):
             yaw_deg, pitch_deg, roll_deg = angles
             return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
@@ -149,10 +150,11 @@ def read_xmp(path: str | Path) -> GeoTag:
 
 
 def _xmp_of(head: bytes) -> dict[str, str]:
-    """Return the texts of the attributes and elements of the first packet, by qualified name.
+    """Return the texts of the attributes and elements of the first XMP packet in `head`, by qualified name; {} if there
+    is none.
 
-    The packet is cut out at its first element. A document type, with which entities would be declared, can only stand
-    before that one, and so is never read.
+    Only the outermost element is parsed. A document type, which could declare harmful entities, can only stand before
+    that element, and so is never parsed.
     """
     start = head.find(_BEGIN)
     end = head.find(_END, start)
@@ -180,14 +182,15 @@ def _number(values: dict[str, str], name: str, low: float = -360.0, high: float 
 
 
 def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Return heading, roll and pitch from straight down of a gimbal whose pitch is -90 there. Its roll then turns the
-    picture and tilts nothing: a gimbal may tell half a turn in yaw as half a turn in roll.
+    """Convert a gimbal's angles, whose pitch is -90 when it looks straight down, to (heading, roll, pitch) in degrees,
+    with roll and pitch 0 when it looks straight down.
 
-    They are those of a level airframe whose camera looks straight down like this one: its nose is where the top of the
-    picture points, its right that of the picture, and its down what the camera looks at.
+    The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
+    is the camera's viewing direction. Looking straight down, the gimbal's roll only turns the picture: a gimbal may
+    report half a turn in yaw as half a turn in roll.
     """
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
-    # The nose, before it is turned by the yaw. A difference from zero is never -0.0, which turns by half a turn.
+    # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, with which atan2 is off by half a turn.
     ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)
     north, east = ahead * math.cos(yaw) - aside * math.sin(yaw), ahead * math.sin(yaw) + aside * math.cos(yaw)
     return (

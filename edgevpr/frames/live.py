@@ -1,4 +1,5 @@
-"""Live pictures: a thread that holds the newest frame of a camera or network stream, and reopens a lost source."""
+"""Live sources: cameras and network streams. A thread reads their pictures, holds the newest one, and reopens a source
+that is lost."""
 
 import atexit
 import contextlib
@@ -15,23 +16,23 @@ from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot, coar
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _EXIT_TIMEOUT_S = 10.0  # longer than any time-out of a stream or camera
-_FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # the second for a camera that takes less than three pictures a second
+_FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take less than three pictures a second
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
 
 def open_camera(device: str, clock: Callable[[], float]) -> "DeviceCapture":
-    """Open a V4L2 device (/dev/video0, /dev/v4l/by-id/...)."""
+    """Open a V4L2 device (/dev/video0, /dev/v4l/by-id/...). If that fails, the first `read` returns None."""
     return DeviceCapture(cv2.VideoCapture(device, cv2.CAP_V4L2), clock)
 
 
 class DeviceCapture:
-    """A camera that OpenCV has opened, which decodes its pictures itself and says of none that it is damaged."""
+    """A camera opened with OpenCV: a `Capture`. OpenCV does not report damaged pictures, so none is rejected here."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
 
     def read(self) -> Shot | None:
-        """Wait for the next picture and return it; None where the camera is lost: `isOpened` stays true."""
+        """Wait for the next picture and return it; None if the camera is lost (OpenCV's `isOpened` does not tell)."""
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
             there, read = self._capture.read()
             if there:
@@ -46,15 +47,15 @@ class DeviceCapture:
 
 
 def wait_before_reopening_s(failures: int) -> float:
-    """Return 0.5 s after the first failure in a row, twice as long after each further one, 10 s at most."""
+    """Return the seconds to wait after `failures` failures in a row: 0.5, doubled by each further one, at most 10."""
     return min(_FIRST_WAIT_S * 2.0 ** min(failures - 1, 10), _LONGEST_WAIT_S)
 
 
 class LiveSource:
-    """The newest frame of the capture that `open_capture` opens (it gives None where nothing is there). Frames not read
-    in time are counted in `dropped`, those that are not new and whole in `refused`, by their reason.
+    """Gives the newest frame of the camera or stream that `open_capture` opens (None: it could not be opened).
 
-    Only the capture thread touches the capture, from opening to release: a call into a stream that hangs cannot be
+    `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
+    Only the capture thread uses the capture, from opening to release: a call into a stream that hangs cannot be
     interrupted. `close` waits half a second, then leaves the thread to its time-out.
     """
 
@@ -82,11 +83,11 @@ class LiveSource:
 
     @property
     def condition(self) -> Condition:
-        """The condition of the source, for programs."""
+        """The state of the source, see `Condition`."""
         return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the newest frame, if it was not read before; None if none comes in `timeout_s`, or after `close`."""
+        """Return the newest frame not read yet; None if none comes within `timeout_s` seconds, or after `close`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
             newest, self._newest = self._newest, None
@@ -97,7 +98,7 @@ class LiveSource:
         return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s)
 
     def close(self) -> None:
-        """End the capture, within about half a second."""
+        """Stop the capture thread; return after about half a second at most."""
         self.ended = True
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
@@ -105,7 +106,7 @@ class LiveSource:
             atexit.unregister(self._end_thread)
 
     def _end_thread(self) -> None:
-        """Wait for the thread before Python ends: one that comes back from FFmpeg while it ends crashes the process."""
+        """Wait for the thread before Python exits: a thread that returns from FFmpeg during the exit would crash it."""
         self._closing.set()
         self._thread.join(_EXIT_TIMEOUT_S)
 

@@ -1,6 +1,6 @@
 """The overlay mask: marks the part of every frame that shows ground, and not an on-screen display or the aircraft.
 
-`edgevpr mask` learns a mask from a recording: edges that stay in place while the rest of the picture moves are masked.
+A mask can also be learnt from a recording: edges that stay in place while the rest of the picture moves are masked.
 """
 
 import hashlib

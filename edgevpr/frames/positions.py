@@ -1,5 +1,5 @@
-"""Tables of positions: where, when and how the images of a folder were taken (positions.csv), or a video at which
-second."""
+"""Tables of positions in CSV: position, attitude and time of each image of a folder (positions.csv), or of a video at
+certain seconds. The sources of frames read them; `where` in this module is "FILE, line N" for error messages."""
 
 import csv
 import io
@@ -18,18 +18,18 @@ from edgevpr.core.types import Position
 _NEEDED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
 _OTHER_COLUMNS = ("alt", "heading_deg", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "rel_alt")
-ALT_M = (-1000.0, 100_000.0)  # of anything that flies
+ALT_M = (-1000.0, 100_000.0)  # plausible altitudes
 _MAX_FILE_BYTES = 100_000_000  # a million images
-# 1900 to 2200. Beyond lie times in milliseconds, which are a thousand times too large.
+# The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
-MOST_GAP_S = 5.0  # a straight line between fixes that lie further apart says where nobody was
+MOST_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
 _ROUNDING_S = 0.001  # Matroska counts in milliseconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
     """Position, heading (0..360 clockwise from true north) and time (seconds since 1970) of an image, and roll, pitch
-    and height above the ground as of `Frame`; None: unknown."""
+    and height above the ground as defined by `Frame`. None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None
@@ -40,25 +40,25 @@ class GeoTag:
 
 
 def find_positions(folder: str | Path) -> Path | None:
-    """Return the positions.csv of a folder of images: the one in it, else the one beside it, else None."""
+    """Return the path of positions.csv in `folder`, else in the folder that contains it, else None."""
     folder = Path(folder).absolute()
     candidates = (folder / "positions.csv", folder.parent / "positions.csv")
     return next((path for path in candidates if path.is_file()), None)
 
 
 def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
-    """Read the columns file, lat, lon (degrees) and, where present, alt (m), heading_deg or yaw_deg, time, roll_deg
-    (right wing down is positive), pitch_deg (nose up), and height_m above the ground or rel_alt.
+    """Read a positions.csv. Returns the data of each image by its file name.
 
-    rel_alt is the height over the take-off point, as DJI writes it: that above the ground only as far as the ground is
-    level. Returns one tag for each file name. A row may leave all but the name empty; other columns are ignored.
-    Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
+    Columns: file, lat, lon (degrees) and, optionally, alt (m), heading_deg or yaw_deg, time, roll_deg (right wing down
+    is positive), pitch_deg (nose up), and height_m above the ground or rel_alt. rel_alt is DJI's height over the
+    take-off point, which is that above the ground only if the ground is level. All cells but the name may be empty;
+    other columns are ignored. Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
     return {row["file"]: tag_of(row, where) for where, row in rows_of(csv_path)}
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
-    """Write a positions.csv that `read_positions` reads as the same tags, to the last bit."""
+    """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
     with open(csv_path, "w", encoding="utf-8", newline="") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "time"))
@@ -69,8 +69,10 @@ def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
 
 
 def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the lines of a table: where each stands, for messages, and its values by the name of the column. Where the
-    column `file` is `needed`, each line names another file. Raises UsageError as `read_positions`."""
+    """Read the rows of a table with the columns `needed`. Returns for each row
+    * its place "FILE, line N", for messages, and
+    * its values as text, by column.
+    If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
         lines = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
@@ -113,7 +115,8 @@ def _checked(
 
 
 def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
-    """Return the tag of a line. Raises UsageError for a wrong value."""
+    """Convert a row of a table (text by column) to a tag. Raises UsageError, which begins with `where`, for a wrong
+    value."""
     lat_deg = number_in(row, "lat", -90, 90, where)
     lon_deg = number_in(row, "lon", -180, 180, where)
     alt_m = number_in(row, "alt", *ALT_M, where)
@@ -131,12 +134,13 @@ def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
 
 
 def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
-    """Make a position, or None of exactly (0, 0), which a receiver without a fix writes."""
+    """Make a position; return None for exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
 def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in a column of a line, None where there is none. Raises UsageError for one out of range."""
+    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError, which begins
+    with `where`, for text that is no number within `low`..`high`."""
     text = row.get(column)
     if not text:
         return None
@@ -163,8 +167,8 @@ def _time_in(row: Mapping[str, str], where: str) -> float | None:
 def parse_time(text: str) -> float:
     """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds.
 
-    A time without a zone is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, as one in
-    milliseconds is.
+    A time without a zone is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, such as one
+    in milliseconds.
     """
     try:
         seconds = float(text)
@@ -180,16 +184,16 @@ def parse_time(text: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VideoTrack:
-    """The path of a video: the seconds from its first frame, ascending, and the tag at each. `path` is the file of
-    it."""
+    """Positions and attitudes along a video. `t_s` are seconds from its first frame, ascending, and `tags` the data at
+    each. `path` is the table's file, for messages."""
 
     path: Path
     t_s: tuple[float, ...]
     tags: tuple[GeoTag, ...]
 
     def tag_at(self, t_s: float) -> GeoTag:
-        """Return position, attitude and height at a second of the video, on the straight line between the two lines
-        around it. The tag is empty outside the table, and where these are more than `MOST_GAP_S` apart."""
+        """Return position, attitude and height at the video time `t_s`, interpolated linearly between the two table
+        rows around it. The tag is empty outside the table, and if these rows are more than `MOST_GAP_S` apart."""
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())
         if abs(self.t_s[nearest] - t_s) <= _ROUNDING_S:
             return self.tags[nearest]
@@ -208,7 +212,8 @@ class VideoTrack:
         )
 
     def require_within(self, video: Path, lasts_s: float) -> None:
-        """Raise UsageError where no line of the table is of a second of the video, nor two around it."""
+        """Raise UsageError if the times of the table and of the video, which lasts `lasts_s` seconds, do not overlap.
+        `video` is its path, for the message."""
         if self.t_s[-1] < -_ROUNDING_S or self.t_s[0] > lasts_s:
             raise UsageError(
                 f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, and {video} lasts from 0 "
@@ -217,9 +222,9 @@ class VideoTrack:
 
 
 def read_track(csv_path: str | Path) -> VideoTrack:
-    """Read the positions of a video: the columns time (seconds from its first frame, ascending), lat, lon and, where
-    present, those of a positions.csv. A line without a position says nothing. Raises UsageError for a file that cannot
-    be read, a wrong value, and one without any position."""
+    """Read the table of positions of a video: the columns time (seconds from its first frame, ascending), lat, lon and,
+    optionally, those of a positions.csv. Rows without a position are ignored. Raises UsageError for a file that cannot
+    be read, a wrong value, and a table without any position."""
     tags: dict[float, GeoTag] = {}
     for where, row in rows_of(csv_path, _TRACK_COLUMNS):
         tag = tag_of(row, where)
@@ -252,5 +257,5 @@ def _turned(one_deg: float | None, other_deg: float | None, share: float) -> flo
 
 
 def _turn_deg(one_deg: float, other_deg: float) -> float:
-    """Return the shorter way from one angle to the other."""
+    """Return the difference `other_deg` - `one_deg` of two angles in -180..180 degrees."""
     return (other_deg - one_deg + 180) % 360 - 180

@@ -1,4 +1,5 @@
-"""A folder of images, read in order to its end, and what all recordings have in common."""
+"""`FolderSource`, a folder of images that is read in order to its end, and `RecordingSource`, the base class of all
+sources that end: folders, video files and orthophotos."""
 
 from collections.abc import Callable, Collection
 from dataclasses import fields
@@ -15,7 +16,7 @@ from edgevpr.frames.shot import Condition, Refusal
 
 
 class RecordingSource:
-    """The common part of all recordings. Frames whose names are not in `only` are passed over (None: all are read)."""
+    """Base class of sources that end. Only frames whose names are in `only` are read (None: all)."""
 
     is_live = False
     dropped: int | None = None
@@ -27,22 +28,22 @@ class RecordingSource:
         self._only = None if only is None else frozenset(only)
 
     def is_wanted(self, name: str) -> bool:
-        """Tell whether the frame of this name is to be read."""
+        """Return True if the frame of this name is to be read."""
         return self._only is None or name in self._only
 
     @property
     def ended(self) -> bool:
-        """True where no more frames will come."""
+        """True if no more frames will come."""
         return self._has_ended
 
     @property
     def condition(self) -> Condition:
-        """The condition of the source, for programs."""
+        """The state of the source: ENDED or RUNNING."""
         return Condition.ENDED if self.ended else Condition.RUNNING
 
     @property
     def state(self) -> str:
-        """The condition of the source, for people."""
+        """The state of the source in a word, for people."""
         return "ended" if self.ended else "reading"
 
     def close(self) -> None:
@@ -50,13 +51,14 @@ class RecordingSource:
 
 
 def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
-    """Return a frame with all that its tag knows."""
+    """Make a frame of `image`, uint8 (H, W[, 3]), with the position, attitude, height and time of `tag`."""
     known = {field.name: getattr(tag, field.name) for field in fields(tag)}
     return Frame(image=image, name=name, t_mono_s=t_mono_s, **known)
 
 
 class FolderSource(RecordingSource):
-    """Each image of a folder once, with the position of its line in positions.csv, else that of its EXIF data."""
+    """Gives each image of a folder once, in counting order of the names, with the data of its line in the table
+    `positions` (None: positions.csv in or beside the folder), or if it has no line, with its EXIF data."""
 
     def __init__(
         self,
@@ -66,7 +68,7 @@ class FolderSource(RecordingSource):
         only: Collection[str] | None = None,
     ) -> None:
         super().__init__(only)
-        paths = {decoded_name(path.name): path for path in list_images(folder)}  # a map and a table hold UTF-8 only
+        paths = {decoded_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         csv_path = positions or find_positions(folder)
         self._tags = read_positions(csv_path) if csv_path else {}
         if positions and not self._tags.keys() & paths:
@@ -82,7 +84,7 @@ class FolderSource(RecordingSource):
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next image, None after the last. Raises ImageError for an image that cannot be used; the next call
-        goes on with the image after it."""
+        continues with the image after it."""
         if self.ended:
             return None
         name, path = self._unread.pop()

@@ -1,7 +1,7 @@
-"""Frames that are recorded while they are read, and the source of the same frames later.
+"""A source that records its frames on a tape while they are read, and a source that replays them later.
 
-A picture is kept as a JPEG, and the flight goes on with the picture in the JPEG: what is flown again is what was flown,
-to the last bit.
+Each picture is recorded as a JPEG, and the flight itself works with the picture decoded from that JPEG. So a replay has
+the flight's pictures, to the last bit.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,8 @@ _STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
 
 
 class RecordedSource:
-    """A source whose frames and state are noted on a tape; `keep` takes the JPEG of a frame, and gives its number."""
+    """A source that records the frames and the state of `source` on a tape. `keep` stores the JPEG of a frame and
+    returns the number under which it is stored."""
 
     def __init__(self, source: Source, tape: Tape, keep: Callable[[bytes], int]) -> None:
         self.is_live, self.total = source.is_live, source.total
@@ -35,7 +36,7 @@ class RecordedSource:
         return value
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, as `Source.read` does, with the picture as it is kept."""
+        """Return the next frame, as `Source.read` does, with the picture decoded from the recorded JPEG."""
         try:
             frame = self._source.read(timeout_s)
         except ImageError as error:
@@ -58,8 +59,8 @@ class RecordedSource:
 
 
 class ReplayedSource:
-    """The source of a recorded flight: everything is read from its tape, and `picture` gives the frame of a number,
-    uint8."""
+    """The source of a recorded flight: frames and state come from its tape. `picture` returns the picture stored under
+    a number, uint8 (H, W, 3) BGR or (H, W) grey."""
 
     def __init__(self, tape: Tape, picture: Callable[[int], Image]) -> None:
         self.is_live, self.total = tape.read("is_live", lambda: False), 0
@@ -72,8 +73,8 @@ class ReplayedSource:
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame of the tape; None where none had come. Raises ImageError where one could not be
-        used."""
+        """Return the next frame of the tape; None if none had come in time in the flight. Raises ImageError if the
+        flight's frame could not be used. `timeout_s` is ignored."""
         known: Any = self._tape.read("frame", lambda: None)
         if known is None:
             return None

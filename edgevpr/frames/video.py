@@ -1,4 +1,4 @@
-"""A video file, read in order to its end; what is damaged or missing in it is said."""
+"""A video file as a source of frames: read in order to its end; damaged and missing parts are reported."""
 
 import math
 from collections import deque
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 _USUAL_RATE_HZ = 25.0
-_CUT_S = 1.0  # so much may be missing at the end: other streams in the file last a little longer
+_CUT_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
 
 
 class VideoSource(RecordingSource):
-    """The frames of a video file, at least `step_s` seconds of video time apart: the same frames in every run. `track`
-    says where each was taken (None: unknown).
+    """The frames of the video file `path`, at least `step_s` seconds of video time apart (0: every frame); every run
+    gives the same frames. `track` has the positions of the frames (None: unknown).
 
-    Damaged frames, and those predicted from them, are left out. `read` raises ImageError once for every stretch of
-    them, and once for an end that is missing."""
+    Damaged frames, and those decoded with their help, are left out. `read` raises ImageError once for each run of
+    damaged frames, and once if the end of the file is missing."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class VideoSource(RecordingSource):
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
         self._promised_s, self._is_stamped = _promised_s(whole), whole.is_stamped
         frames = stream.frames or self._promised_s / self._frame_s
-        self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # an AVI file says only this when cut
+        self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # a cut AVI file has only this right
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
         if track and self._promised_s:
             track.require_within(path, self._promised_s)
@@ -57,7 +57,8 @@ class VideoSource(RecordingSource):
         self._t_due_s = self._heard_s = 0.0
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame that is due; None at the end, or where decoding takes longer than `timeout_s`."""
+        """Return the next frame at least `step_s` after the last; None at the end, or if decoding takes longer than
+        `timeout_s`. Raises ImageError for damaged frames; the next call continues after them."""
         deadline_s = self._clock() + timeout_s
         while not self.ended:
             if not self._ready:
@@ -92,10 +93,11 @@ class VideoSource(RecordingSource):
             self._ready.extend(pictures)
 
     def _advance(self, picture: "VideoFrame") -> bool:
-        """Advance to this picture, and tell whether it is due."""
+        """Set the current frame number and video time to those of `picture`. Return True if at least `step_s` of video
+        time have passed since the last frame that was returned."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
-        # A bare H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
+        # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
 
@@ -124,7 +126,7 @@ class VideoSource(RecordingSource):
 
 
 def _promised_s(whole: WholePictures) -> float:
-    """Return the seconds that the file says it lasts; 0 where it does not say."""
+    """Return the duration in seconds that the file's header states; 0 if it states none."""
     if not whole.is_stamped:
         return 0.0
     stream = whole.stream
