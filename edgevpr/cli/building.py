@@ -1,5 +1,5 @@
-"""`edgevpr map build`, `map refine` and `map calibrate`: places of a recording or an orthophoto, where their pictures
-really lie, and how sure the map can be."""
+"""`edgevpr map build`, `map refine` and `map calibrate`: make a map from a recording or an orthophoto, correct the
+positions of its pictures, and calibrate the confidence of matches in it."""
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
@@ -37,7 +37,7 @@ _OF_A_RECORDING = ("positions", "rate_hz")
 
 
 def add(maps: Any) -> None:
-    """Add the commands and their flags to those of maps."""
+    """Add these commands and their flags to `maps`, the commands of `edgevpr map`."""
     build = command(maps, "build", map_build, "make a map of a flight, or of an orthophoto")
     build.add_argument("map", metavar="MAP", help="the map file to make, e.g. valley.gpkg")
     _add_pictures(build)
@@ -74,7 +74,7 @@ def add(maps: Any) -> None:
 
 
 def _add_pictures(parser: ArgumentParser) -> None:
-    """Add the flags of the pictures that a map is made of: of a recording, or of an orthophoto."""
+    """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
     add_recording(parser, required=False)
     flags = parser.add_argument_group("of an orthophoto, in place of --images")
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
@@ -91,7 +91,8 @@ def _add_pictures(parser: ArgumentParser) -> None:
 
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
-    """Return the pictures that the flags name. Raises UsageError for none, both, or flags of the other."""
+    """Return the pictures that the flags name. Raises UsageError if they name neither a recording nor an orthophoto, or
+    both, or have a flag that goes with the one not named."""
     from edgevpr.mapmaking.making import Cuttings, FlownPictures
 
     if (args.source is None) == (args.orthophoto is None):
@@ -117,7 +118,7 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
 
 
 def map_build(args: Namespace) -> int:
-    """Make a map of a recording or an orthophoto, or continue one."""
+    """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
     from edgevpr.core.text import progress
     from edgevpr.mapmaking.making import MapOrder, make_map
 
@@ -166,7 +167,7 @@ def _print_made(path: str, made: "MadeMap") -> None:
 
 
 def map_refine(args: Namespace) -> int:
-    """Find out where the pictures of a map really lie, and say it."""
+    """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
     from edgevpr.core.text import progress
     from edgevpr.mapmaking.making import refine_map
     from edgevpr.places.mapfile import PlaceMap
@@ -183,7 +184,7 @@ def map_refine(args: Namespace) -> int:
 
 
 def map_calibrate(args: Namespace) -> int:
-    """Calibrate a map, and say what to expect of it."""
+    """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
     from edgevpr.core.text import progress
     from edgevpr.mapmaking.making import calibrate_map
     from edgevpr.places.mapfile import PlaceMap

@@ -1,4 +1,7 @@
-"""`edgevpr eval`: measure techniques on a data set with ground truth."""
+"""`edgevpr eval`: measure techniques, or stored similarities, on data sets with ground truth.
+
+A set is a data set; a row is a technique with its settings, which is a row of the tables that are printed.
+"""
 
 import os
 import sys
@@ -84,7 +87,7 @@ def add(commands: Any) -> None:
 
 
 def evaluate(args: Namespace) -> int:
-    """Measure stored similarities, or techniques, one after another."""
+    """Run `eval`: measure stored similarities, many rows on many sets (with --out), or rows on one set."""
     if args.similarity:
         return _measure_similarities(args)
     return _measure_many(args) if args.out else _measure_techniques(args)
@@ -97,7 +100,7 @@ def _count(text: str) -> int:
 
 
 def _measure_many(args: Namespace) -> int:
-    """Measure many rows on many sets, with all that an earlier run has left."""
+    """Measure many rows on many sets, and write the results to --out. Rows that an earlier run measured are reused."""
     from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.many import measure
     from edgevpr.lab.evaluate.page import as_json, write_results
@@ -127,7 +130,7 @@ def _measure_many(args: Namespace) -> int:
 
 
 def _measure_techniques(args: Namespace) -> int:
-    """Measure techniques on one set, without a trace but for what is printed."""
+    """Measure techniques on one set, and print the results. Files are written only for --plot."""
     from edgevpr.core.text import progress, require_picture
     from edgevpr.lab.evaluate import evaluate as evaluation
     from edgevpr.lab.evaluate.cache import Cache
@@ -142,12 +145,12 @@ def _measure_techniques(args: Namespace) -> int:
     if args.plot:
         require_picture(Path(args.plot))
     plan = _plan(args)
-    errors: dict[str, ModelError] = {}  # by technique, for all its forms
+    errors: dict[str, ModelError] = {}  # by technique, whatever the form
     for row in plan.rows.values():
         try:
             if row.technique not in errors:
                 create(row.technique, row.settings(None))
-        except ModelError as error:  # a network that cannot be used stops no other
+        except ModelError as error:  # the other techniques are still measured
             errors[row.technique] = error
     rows = [row for row in plan.rows.values() if row.technique not in errors]
     if not rows:
@@ -200,7 +203,7 @@ def _measure_similarities(args: Namespace) -> int:
 
 
 def _plan(args: Namespace) -> "EvaluationPlan":
-    """Return the sets and rows that are named, in a file or by flags."""
+    """Return the plan of sets and rows, from the file --sets or from the other flags."""
     from edgevpr.lab.evaluate.plan import SetPlan, of_flags, read_plan
 
     if args.sets:
@@ -226,7 +229,8 @@ def _plan(args: Namespace) -> "EvaluationPlan":
 
 
 def _rows(args: Namespace) -> "dict[str, RowPlan]":
-    """Return the rows that the flags name. Raises UsageError for a setting of a technique that is not measured."""
+    """Return the rows that the flags ask for, by name: each technique in each form. Raises UsageError for an unknown
+    form, or a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
     from edgevpr.lab.evaluate.plan import RowPlan
     from edgevpr.runtime.preflight.pick import camera_setting
@@ -260,7 +264,7 @@ def _rows(args: Namespace) -> "dict[str, RowPlan]":
 
 
 def _say_cameras(plan: "EvaluationPlan") -> None:
-    """Say which sets are taken for ones that look ahead, where nobody has said which way their cameras look."""
+    """Print a note for each set whose camera is taken to look ahead because no flag or file says where it looks."""
     from edgevpr import techniques
 
     for name, of in plan.sets.items():

@@ -82,7 +82,7 @@ def add(commands: Any) -> None:
 
 
 def run_match(args: Namespace) -> int:
-    """Find the places of a recording in a map, and print a line for each image."""
+    """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
     from edgevpr.core.geodesy import distance_m
     from edgevpr.frames.source import open_source
     from edgevpr.power.boards import load_board
@@ -126,7 +126,7 @@ def run_match(args: Namespace) -> int:
 
 
 def run_flight(args: Namespace) -> int:
-    """Fly with a configuration."""
+    """Run `run`: fly with a configuration, until the flight ends."""
     from edgevpr.runtime.flight.flight import fly
 
     def config() -> Config:
@@ -136,7 +136,7 @@ def run_flight(args: Namespace) -> int:
 
 
 def run_check(args: Namespace) -> int:
-    """Say whether a configuration would fly."""
+    """Run `check`: try whether a flight can start with a configuration, and print what was found; or learn a mask."""
     from edgevpr.core.text import waiting
     from edgevpr.runtime.service.check import check, learn_mask
     from edgevpr.runtime.service.finding import lines
@@ -153,7 +153,7 @@ def run_check(args: Namespace) -> int:
 
 
 def run_service(args: Namespace) -> int:
-    """Print the systemd unit for a board, or make or end the service of this machine."""
+    """Run `service`: print the systemd unit for a board, or install or uninstall the service on this machine."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.service.install import install, uninstall
     from edgevpr.runtime.service.unit import render_unit
@@ -185,7 +185,7 @@ def _say(line: str) -> None:
 
 
 def run_doctor(args: Namespace) -> int:
-    """Say what is fine, what is wrong, and what to change."""
+    """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
     from edgevpr.core.text import waiting
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import doctor

@@ -1,5 +1,5 @@
-"""The command line. Each group of commands is a file, with its flags beside its code; a command imports what it needs
-only when it runs."""
+"""Entry point of the command line `edgevpr`. Each module of `_GROUPS` adds a group of commands with their flags. A
+command imports what it needs only when it runs, so that help and short commands are fast."""
 
 import argparse
 import logging
@@ -19,10 +19,10 @@ _GROUPS = (maps, flying, top, review, replaying, profile, evaluation, simulation
 
 
 def program() -> None:
-    """Run one command as a program of its own, and end with its exit code."""
+    """Run the command in `sys.argv`, and end the process with its exit code."""
     code = main()
     if threading.active_count() > 1:
-        # A capture thread hangs in a stream that does not answer: FFmpeg would abort Python while it ends.
+        # A capture thread hangs in a stream that does not answer. In a normal exit FFmpeg would abort Python.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -30,15 +30,15 @@ def program() -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command and return the exit code: 0 done, 1 something outside the program is wrong, 2 the request is
-    wrong, 130 stopped by Ctrl-C."""
+    """Run the command `argv` (None: that of `sys.argv`) and return its exit code: 0 done, 1 something outside the
+    program is wrong, 2 the request is wrong, 130 stopped by Ctrl-C."""
     with guarded_output():
         return _run(sys.argv[1:] if argv is None else argv)
 
 
 def _run(argv: list[str]) -> int:
     args = command_line().parse_args(argv)
-    # Set before NumPy is imported: its products are small here, and more threads make them slower and cost more.
+    # Set before NumPy is imported: matrix products are small here, and more threads only make them slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter("edgevpr: %(message)s"))
@@ -72,7 +72,7 @@ def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code
     return exit_code
 
 
-@cache  # two thirds of a short command, where one process runs many
+@cache  # making it takes two thirds of the time of a short command, and one process may run many
 def command_line() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = argparse.ArgumentParser(

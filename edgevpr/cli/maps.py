@@ -1,5 +1,5 @@
-"""`edgevpr map`: look into, check, repair, merge and export place maps, which are made in `building`; and `edgevpr
-salience`: what of a picture is worth remembering."""
+"""`edgevpr map`: look into, check, repair, merge, shrink and export place maps (`building` makes them); and `edgevpr
+salience`: print how memorable, static and full of information a picture is."""
 
 import sys
 from argparse import ArgumentTypeError, Namespace
@@ -56,7 +56,7 @@ def _number_of_places(text: str) -> int:
 
 
 def map_info(args: Namespace) -> int:
-    """Say what a map holds."""
+    """Run `map info`: print what a map holds."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
@@ -96,7 +96,7 @@ def map_info(args: Namespace) -> int:
 
 
 def map_check(args: Namespace) -> int:
-    """Read everything in a map and say what is damaged; the exit code is 1 where anything is."""
+    """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check
 
     found = check(args.map, watched("checking"))
@@ -108,7 +108,7 @@ def map_check(args: Namespace) -> int:
 
 
 def map_repair(args: Namespace) -> int:
-    """Drop what is damaged in a map, and keep the original."""
+    """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check, repair
 
     found = check(args.map, watched("checking"))
@@ -134,7 +134,7 @@ def _print_check(found: "MapCheck") -> None:
 
 
 def map_merge(args: Namespace) -> int:
-    """Make one map of several, completely or not at all."""
+    """Run `map merge`: make one map of several. If that fails, no map is written."""
     from edgevpr.places.examine import absorb
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path, whole_or_none
@@ -163,7 +163,7 @@ def map_merge(args: Namespace) -> int:
 
 
 def map_shrink(args: Namespace) -> int:
-    """Make a smaller map of the places that are worth most."""
+    """Run `map shrink`: make a smaller map of the most useful places of a map."""
     from edgevpr.places.examine import places_in, shrink
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path
@@ -180,7 +180,7 @@ def map_shrink(args: Namespace) -> int:
 
 
 def map_export(args: Namespace) -> int:
-    """Write the places as GeoJSON."""
+    """Run `map export`: write the places of a map as GeoJSON, to a file or to stdout."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.places.geojson import write_geojson
     from edgevpr.places.mapfile import PlaceMap
@@ -207,7 +207,7 @@ def map_export(args: Namespace) -> int:
 
 
 def run_salience(args: Namespace) -> int:
-    """Print the scores of a picture, and draw its maps."""
+    """Run `salience`: print the salience scores of a picture (see the glossary), and draw the maps of them (--out)."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import gate_with

@@ -64,7 +64,7 @@ def _add_models(models: Any) -> None:
 
 
 def train_calc(args: Namespace) -> int:
-    """Train the CALC autoencoder, and print the result."""
+    """Run `train calc`: train the CALC autoencoder, and print the result."""
     from edgevpr.lab.training import job
 
     unusable: list[ImageError] = []
@@ -77,7 +77,7 @@ def train_calc(args: Namespace) -> int:
 
 
 def train_words(args: Namespace) -> int:
-    """Learn the words that vlad, regions or bow count, and print the result."""
+    """Run `train words`: learn words (see the glossary) for the technique that --kind names, and print the result."""
     from edgevpr.lab.training import words
 
     unusable: list[ImageError] = []
@@ -91,7 +91,7 @@ def train_words(args: Namespace) -> int:
 
 
 def train_ground(args: Namespace) -> int:
-    """Learn the words of the ground, and print how well they fit."""
+    """Run `train ground`: learn the words of regions of the ground, and print how well they fit."""
     from edgevpr.lab.training.words import train_ground
 
     unusable: list[ImageError] = []
@@ -104,7 +104,7 @@ def train_ground(args: Namespace) -> int:
 
 
 def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError]) -> int:
-    """Print the result of a training, as JSON or as this sentence."""
+    """Print the `result` of a training, as JSON or as the sentence `said`, and return the exit code."""
     if args.json:
         print_json(asdict(result))
     else:
@@ -113,7 +113,7 @@ def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError])
 
 
 def models_list(args: Namespace) -> int:
-    """List every card, whether or not it can be used."""
+    """Run `models list`: print every network's card, also of those that cannot be used."""
     from edgevpr.core.files import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
@@ -135,7 +135,7 @@ def models_list(args: Namespace) -> int:
 
 
 def models_verify(args: Namespace) -> int:
-    """Run networks, and say what they take."""
+    """Run `models verify`: run one network or all, and print what each takes in time and memory."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.networks import verify
     from edgevpr.techniques.card import card_names, load_card
@@ -160,7 +160,7 @@ def models_verify(args: Namespace) -> int:
 
 
 def models_add(args: Namespace) -> int:
-    """Try a network, and add it with its card to the user's models folder."""
+    """Run `models add`: try a network, and copy it with its card to the user's models folder."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.preflight.networks import add
 
@@ -173,7 +173,7 @@ def models_add(args: Namespace) -> int:
 
 
 def models_quantise(args: Namespace) -> int:
-    """Make a network of 8-bit integers, and print its costs before and after."""
+    """Run `models quantise`: make an 8-bit integer version of a network, and print the costs of both."""
     from edgevpr.lab.training.quantise import quantise
     from edgevpr.power.boards import load_board
 

@@ -47,7 +47,7 @@ def _add_plan(parser: ArgumentParser) -> None:
 
 
 def profile(args: Namespace) -> int:
-    """Estimate all techniques for a flight, or list, detect or measure boards."""
+    """Run `profile`: estimate what each technique costs in a flight, or list, detect or measure boards."""
     from edgevpr.core.text import progress, require_picture
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import require_technique
@@ -96,7 +96,9 @@ def profile(args: Namespace) -> int:
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
-    """Return the plan that is asked for, the technique of the map (None: no map), and the techniques to try."""
+    """Return three parts: the plan of the flight, from the flags;
+    the name of the technique of --map (None: no map is given);
+    the techniques to try, in all their forms."""
     from edgevpr import techniques
     from edgevpr.core.config import load_config
     from edgevpr.places.mapfile import PlaceMap
@@ -149,8 +151,8 @@ def _detect(args: Namespace) -> int:
 
 
 def _measure(args: Namespace, quiet: bool) -> int:
-    """Measure this machine and keep the figures; with `quiet` an estimate follows, and the figures are not printed as
-    JSON."""
+    """Measure this machine, store the figures, and return the exit code. `quiet`: an estimate follows, which prints the
+    only JSON of --json."""
     from edgevpr import techniques
     from edgevpr.core.text import progress
     from edgevpr.power.boards import load_board

@@ -1,4 +1,4 @@
-"""The command `edgevpr replay`: a recorded flight is flown again, on the ground."""
+"""`edgevpr replay`: fly a recorded flight again on the ground, and print how the replay differs from the flight."""
 
 import logging
 from argparse import Namespace
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from edgevpr.review.compare import Difference, QueryResult
     from edgevpr.review.replay import Recorded, Replayed
 
-_SHOWN = 40  # differences
+_SHOWN = 40  # differences at most, without --json
 
 
 def add(commands: Any) -> None:
@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
 
 
 def run_replay(args: Namespace) -> int:
-    """Fly a recorded flight again."""
+    """Run `replay`: fly a recorded flight again, and print the comparison."""
     from edgevpr.core.text import waiting
     from edgevpr.review.replay import recorded, replay
 
@@ -50,7 +50,7 @@ def run_replay(args: Namespace) -> int:
 
 @contextmanager
 def _unheard(debug: bool) -> Iterator[None]:
-    """Keep back what the flight says: it is in its journal."""
+    """Context manager: print only errors of the replayed flight (all with `debug`); its messages are in its journal."""
     log = logging.getLogger("edgevpr")
     before = log.level
     if not debug:

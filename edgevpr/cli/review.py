@@ -1,4 +1,4 @@
-"""Commands for after a flight: `edgevpr report` and `edgevpr export`."""
+"""Commands for after a flight: `edgevpr report` and `edgevpr export`, which both read the flight's log."""
 
 import logging
 import sys
@@ -46,7 +46,7 @@ def _number(text: str) -> int:
 
 
 def run_report(args: Namespace) -> int:
-    """Make the page of a flight."""
+    """Run `report`: write the HTML page of a flight."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.review.page import Album, page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
@@ -63,7 +63,7 @@ def run_report(args: Namespace) -> int:
 
 
 def run_export(args: Namespace) -> int:
-    """Write what a flight found, for other programs."""
+    """Run `export`: write the points of a flight (matches, fixes, places) as GeoJSON, CSV or KML."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.review.export import WRITERS, features_of
 
@@ -102,7 +102,8 @@ def _out(target: str, log: str) -> Path:
 
 
 def _ground(given: str | None, flight: "LoggedFlight") -> "MapGround":
-    """Read the map that was given, or else that of the log, which need not be on this machine."""
+    """Read the places of the map `given` or, if that is None, of the map that the log names. That one may be missing on
+    this machine: the result then says so."""
     from edgevpr.review.overhead import MapGround, read_ground
 
     if given:

@@ -1,4 +1,4 @@
-"""The way of all output to the terminal: nothing passes that a terminal would act on, and no password."""
+"""Guards the output of all commands: removes control characters that a terminal would act on, and passwords."""
 
 import io
 import logging
@@ -9,25 +9,25 @@ from typing import Any, TextIO
 
 from edgevpr.core.text import shown
 
-_LAYOUT = "\n\r\t"  # what tables and progress lines are made with
+_LAYOUT = "\n\r\t"  # control characters that pass: tables and progress lines need them
 
 
 @contextmanager
 def guarded_output() -> Iterator[None]:
-    """Let all that is printed inside this context pass through `shown`, whoever prints it."""
+    """Context manager: all that is written to stdout and stderr inside it passes through `core.text.shown`."""
     with redirect_stdout(_Guarded(sys.stdout)), redirect_stderr(_Guarded(sys.stderr)):
         yield
 
 
 def erase_lines(count: int) -> None:
-    """Go so many lines up on the terminal, and clear all from there."""
+    """Move the cursor `count` lines up, and clear the terminal from there. Only works inside `guarded_output`."""
     if count and isinstance(sys.stdout, _Guarded):
         sys.stdout.erase(count)
 
 
 class LineFormatter(logging.Formatter):
-    """Makes one line of each message, so that a file name with a line break cannot write a message of its own. The
-    traceback that follows an unforeseen error keeps its lines."""
+    """Formats each log message as one line, so that a file name with a line break cannot fake a second message. The
+    traceback that follows an unexpected error keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return shown(super().formatMessage(record))
@@ -37,7 +37,8 @@ class LineFormatter(logging.Formatter):
 
 
 class _Guarded(io.TextIOBase):
-    """A stream of text in front of another. It can be asked all that the programs behind `print` ask of one."""
+    """Text stream that passes what is written through `shown`, then to `stream`. It has the methods that `print`, the
+    progress lines and `erase_lines` use."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

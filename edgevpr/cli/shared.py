@@ -16,19 +16,20 @@ if TYPE_CHECKING:
     from edgevpr.frames.source import Source
 
 T = TypeVar("T")
-_KEY = "key "  # begins the name under which argparse keeps the value of a flag that is a key of the configuration
+_KEY = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
 _RECORDING = "a folder of images or a video file"
 
 
 def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
-    """Add a command that calls `run` with the parsed arguments, and return its parser."""
+    """Add a command that calls `run` with the parsed arguments, and return its parser. `text` is its help; `run`
+    returns the exit code."""
     parser = _parser(commands, name, text)
     parser.set_defaults(run=run)
     return parser
 
 
 def group(commands: Any, name: str, text: str) -> Any:
-    """Add a command that has commands of its own, and return the object that those are added to."""
+    """Add a command that has subcommands, such as `map`, and return the object that those are added to."""
     return _parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
 
 
@@ -45,7 +46,7 @@ def add_json(parser: ArgumentParser) -> None:
 
 
 def add_recording(parser: ArgumentParser, required: bool = True) -> None:
-    """Add the flags for the recording that frames come from."""
+    """Add the flags for the images or the video that frames come from, and for their positions."""
     parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=_RECORDING)
     add_positions(parser)
 
@@ -61,13 +62,13 @@ def add_positions(parser: ArgumentParser) -> None:
 
 
 def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
-    """Add --param, for parameters of a technique or a vehicle; it may be given several times."""
+    """Add --param, for parameters of a technique or a vehicle. It may be repeated. `text` is its help."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
 def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
-    """Add the flags of the named keys of the configuration, or of all keys where none is named. `texts`, by the last
-    part of a key's name, replace the help of some."""
+    """Add the flags of the configuration keys `names` (none: of all keys), such as "source.mask". `texts` replace the
+    help of some; they are by the last part of the key's name, such as "mask"."""
     for key in keys_of():
         flag = key.flag
         if flag is None or (names and key.name not in names):
@@ -82,12 +83,13 @@ def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
 
 
 def value_of(args: Namespace, name: str) -> Any:
-    """Return the value given for a key of the configuration, None where none was given."""
+    """Return the value that the flags give for the configuration key `name`; None if they give none."""
     return getattr(args, _KEY + name)
 
 
 def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config:
-    """Make the configuration from the file `path`, if there is one; the flags and `others` override it."""
+    """Make the configuration from the file `path` (None: the defaults). Flags override it; `others`, by key, override
+    both."""
     said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
     return load_config(path, said | others)
 
@@ -101,13 +103,13 @@ def parameters_of(pairs: list[str], example: str = "gt=0.4") -> dict[str, str]:
 
 
 def path_of(text: str | None) -> Path | None:
-    """Return a path that need not be given; None where it is not."""
+    """Return `text`, the value of an optional flag, as a path; None if it is None or empty."""
     return Path(text) if text else None
 
 
 def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
-    """Read every frame of a source that ends, and show progress. An image that cannot be used is reported, added to
-    `unusable`, and left out."""
+    """Yield every frame of a source that ends (files, no camera), and show progress with `label`. An image that cannot
+    be used is left out: it is reported, and its error added to `unusable`."""
     from edgevpr.core.text import progress
     from edgevpr.frames.source import read_to_end
 
@@ -122,7 +124,7 @@ def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
 
 
 def exit_code(unusable: list[ImageError]) -> int:
-    """Return the exit code: 1, with a printed sentence, where any image could not be used, else 0."""
+    """Return the exit code: 1 if any image could not be used, and then print how many; else 0."""
     if unusable:
         count = sum(error.count for error in unusable)
         print(f"edgevpr: {count} images could not be used (named above).", file=sys.stderr)
@@ -135,7 +137,7 @@ def print_json(value: Any) -> None:
 
 
 def positive(text: str) -> float:
-    """Read a number above zero, for a flag."""
+    """Read a finite number above zero, as the `type` of a flag. Raises ValueError for other texts."""
     value = float(text)
     if not 0 < value < float("inf"):
         raise ValueError
@@ -143,7 +145,7 @@ def positive(text: str) -> float:
 
 
 def watched(label: str) -> "Callable[[Iterable[T], int], Iterator[T]]":
-    """Return the function that passes things through, of which there are so many, and shows progress."""
+    """Return a function that takes an iterable and its length, and yields its items while it shows progress."""
     from edgevpr.core.text import progress
 
     return lambda things, total: progress(things, total, label)

@@ -1,5 +1,5 @@
-"""`edgevpr simulate` and `demo`: a generated flight, a simulated flight controller, and a demonstration of the whole
-job."""
+"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller, and
+demonstrate all steps from map to match."""
 
 from argparse import Namespace
 from dataclasses import asdict
@@ -9,10 +9,10 @@ from typing import Any
 from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, print_json
 from edgevpr.core.errors import UsageError
 
-# Those of edgevpr.lab.simulate.controller, which is not loaded for a page of help.
+# The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
-# The numbers of a flight over an orthophoto: the usual one, the least, the most, and what to say of it.
+# Number flags of a flight over an orthophoto: (default, least, greatest, help text).
 _NUMBERS = {
     "height_m": (None, 1.0, 10_000.0, "over the ground (default: that of the track)"),
     "every_m": (20.0, 0.1, 1e6, "from picture to picture of a mission (20)"),
@@ -57,7 +57,7 @@ def add(commands: Any) -> None:
 
 
 def simulate_autopilot(args: Namespace) -> int:
-    """Run a simulated flight controller, and print what it has received."""
+    """Run `simulate autopilot`: run a simulated flight controller, and then print what it received."""
     from edgevpr.lab.simulate.autopilot import run_autopilot
     from edgevpr.lab.simulate.motion import read_track
 
@@ -79,7 +79,7 @@ def simulate_autopilot(args: Namespace) -> int:
 
 
 def simulate_flight(args: Namespace) -> int:
-    """Write a flight, generated or over an orthophoto: images and positions.csv."""
+    """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
     if args.seed < 0:
         raise UsageError(f"--seed is {args.seed}: give 0 or more.")
     if args.orthophoto is None:
@@ -127,7 +127,7 @@ def _fly_over(args: Namespace) -> str:
 
 
 def run_demo(args: Namespace) -> int:
-    """Run the demonstration, and print its summary."""
+    """Run `demo`: run the demonstration, and print its summary."""
     from edgevpr.lab.simulate import demo
 
     print(demo.run_demo(Path(args.out)))

@@ -1,4 +1,4 @@
-"""`edgevpr top`: how the flight on this computer goes, once a second."""
+"""`edgevpr top`: show the status of the flight on this computer, once a second, from the file that it writes."""
 
 import json
 import shutil
@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from edgevpr.runtime.flight.status import LinkState, SeenQuery, Status
 
 _FILE = "/run/edgevpr/status.json"
-_LOOK_S = 1.0  # a status comes once a second
-_SILENT_S, _GONE_S = 2.5, 10.0  # a slow frame delays it; a flight that was killed leaves its last one
-_CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # the others are called as their messages
+_LOOK_S = 1.0  # the flight writes its status once a second
+# Age of a status after which the flight is called silent (a slow frame may delay it), and after which --once takes it
+# for the last status of a flight that was killed.
+_SILENT_S, _GONE_S = 2.5, 10.0
+_CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
 
 Row = tuple[str, str]
 
@@ -34,7 +36,7 @@ def add(commands: Any) -> None:
 
 
 def run_top(args: Namespace) -> int:
-    """Show the status of a flight, until Ctrl-C."""
+    """Run `top`: show the status of a flight, once or until Ctrl-C."""
     from edgevpr.runtime.flight.status import read_status
 
     nobody = f"no flight tells its status at {args.file}"
@@ -67,7 +69,7 @@ def run_top(args: Namespace) -> int:
 
 
 def _redraw(lines: list[str], drawn: int) -> int:
-    """Draw lines over those that were drawn before; return how many there are."""
+    """Print `lines` over the `drawn` lines printed before, cut to the size of the terminal. Return their number."""
     columns, height = shutil.get_terminal_size()
     erase_lines(drawn)
     lines = lines[: height - 1]
@@ -76,7 +78,7 @@ def _redraw(lines: list[str], drawn: int) -> int:
 
 
 def rows(status: "Status") -> list[Row]:
-    """Return the status as a person reads it: labels and texts."""
+    """Return the status for people, as rows of (label, text)."""
     rate = "-" if status.rate_hz is None else f"{status.rate_hz:.2f}"
     old = "" if status.latency_s is None else f", {status.latency_s:.2f} s old"
     cores = "-" if status.cpu_cores is None else f"{100 * status.cpu_cores:.0f}"
