@@ -109,8 +109,8 @@ def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
 
 
 def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures. Only ways to lay the query on the place that are near to the `expected`
-    one are tried (None: all)."""
+    """Compare the landmarks of two pictures. Only ways to lay the query on the place near to the `expected` one are
+    tried (None: all)."""
     possible = min(len(query), len(place))
     if possible < _FEWEST:
         return Agreement(inliers=0, matched=0, possible=possible)
@@ -196,8 +196,8 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
     """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one.
-    `asked` and `known` are the points of the matches, complex (n,). A match counts the more, the more closely it
-    follows a way."""
+    `asked` and `known` are the points of the matches, complex (n,). Matches that follow a way more closely count
+    more."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]

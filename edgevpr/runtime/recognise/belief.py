@@ -192,8 +192,7 @@ class Belief:
         * one hypothesis for each candidate,
         * the likelihood of the query if lost, relative to that on ground that never resembles the map,
         * the share (0..1) of the weight that comes from pictures of the same ground as the query before,
-        * the factor, 1 at most, by which the odds of not being lost shrink if this query is weaker evidence for that
-          ground.
+        * the factor, 1 at most, by which the odds of not being lost shrink if this query is weaker evidence there.
         """
         scale, at, of_step = self._scale, proposed.at, proposed.covariance
         rest = max(_LEAST_REST, 1 - float(proposed.p.sum()))

@@ -105,8 +105,7 @@ class Model:
     made_of: str
 
     def chance(self, evidence: Evidence) -> float:
-        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if some evidence is not
-        finite."""
+        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite."""
         logits = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not all(map(math.isfinite, logits)):
             return 1.0
@@ -161,8 +160,8 @@ def model_of(stored: Mapping[str, Any]) -> Model:
 
 @lru_cache
 def prior(kind: str) -> Model:
-    """Return the shipped model for a kind of evidence, such as "down" (see `evidence`). Raises ModelError if its file
-    is missing or damaged."""
+    """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is missing or
+    damaged."""
     path = shipped("models") / f"confidence_{kind}.json"
     try:
         return from_json(read_file(path, _MAX_FILE_BYTES).decode())

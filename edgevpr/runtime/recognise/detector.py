@@ -64,8 +64,7 @@ class Detector:
         return static
 
     def tiles(self, footprint_m: float | None) -> int:
-        """Return the number of tiles along each side of a picture whose ground is `footprint_m` wide (None:
-        unknown)."""
+        """Return the number of tiles along each side of a picture whose ground is `footprint_m` metres wide."""
         if footprint_m is None:
             return 1
         car_px = _CAR_M / footprint_m * self.card.input.width
@@ -129,8 +128,7 @@ def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
 
 def nanodet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode scores (1, N, C) for each of the strides 8, 16 and 32, then distances (1, N, 4 x bins) for each (Li et al.
-    2020, arXiv 2006.04388). A distance, from the cell's middle to a side, is a distribution over whole numbers of
-    strides."""
+    2020, arXiv 2006.04388). A distance from the cell's middle to a side is a distribution over whole strides."""
     levels = len(_NANODET_STRIDES_PX)
     scores = np.concatenate([part[0] for part in outputs[:levels]])
     said = np.concatenate([part[0] for part in outputs[levels:]])

@@ -141,8 +141,7 @@ def described(evidence: Evidence) -> str:
 def evidence_of(
     ranking: Ranking, index: PlaceIndex, neighbour_m: float, proof: Agreement | None, same: Collection[int], down: bool
 ) -> dict[str, float] | None:
-    """Return the evidence for the best place of a ranking; None if no place was compared or, ahead, a match has no
-    `support`.
+    """Return the evidence for the best place; None if no place was compared or, ahead, a match has no `support`.
 
     `down` tells whether the camera looks straight down. If so, `proof` is the agreement of the landmarks (None: not
     compared), and the places with the numbers `same` show the same ground as the best one, so they are not elsewhere.

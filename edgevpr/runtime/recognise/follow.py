@@ -53,8 +53,7 @@ class FollowedPosition:
 class Followed:
     """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
     (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
-    at no position of the belief, and `mass` the probability of `estimate` (None: unknown, or the map has no
-    positions)."""
+    at no position of the belief, `mass` that of the `estimate` (None: unknown, or the map has no positions)."""
 
     slot: int | None
     confidence: float

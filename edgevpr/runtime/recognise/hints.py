@@ -80,8 +80,7 @@ class Prior:
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if they are not trusted now.
 
-        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that the aircraft can have
-        flown.
+        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
@@ -94,8 +93,8 @@ class Prior:
         return self._known if self._are_believed else None
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Decide from the result of a query whether the next one uses hints. If the match was accepted, keep its
-        position and height ratio.
+        """Decide from the result of a query whether the next one uses hints. Keep position and height of an accepted
+        match.
 
         Until a match is accepted, queries alternate between using hints and not. That match then decides whether the
         hints are trusted: whether it agrees with them.

@@ -57,8 +57,7 @@ class Sureness:
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match with this evidence is right: at most 0.5 if a place elsewhere agrees as
-        well."""
+        """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees as well."""
         confidence = self.models[kind_of(evidence)].confidence(evidence)
         return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, _EVEN)
 

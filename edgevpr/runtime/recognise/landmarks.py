@@ -50,7 +50,7 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first.
 
     No patch covers a pixel where `mask`, bool (H, W), is False. A picture without corners, or smaller than a patch, has
-    no landmarks.
+    none.
     """
     height, width = image.shape[:2]
     scale = _LONGEST_SIDE_PX / max(height, width)

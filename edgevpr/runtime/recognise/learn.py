@@ -1,8 +1,7 @@
-"""Learning in flight: a frame of ground that the map does not have becomes a place, at the autopilot's position.
+"""Learning in flight: a frame of ground that the map lacks becomes a place at the position that the autopilot reports.
 
-Every later flight would believe a wrong place, so a doubtful frame is left out: its position is not fresh, or may be an
-echo of our own fixes, its picture is of low quality, the map file has a place near it already, or the flight so far
-does not know where it is.
+A wrong place would mislead every later flight, so a doubtful frame is left out: its position is not fresh or may only
+repeat our own fixes, its quality is low, the map has a place near it, or the flight so far does not tell where it is.
 """
 
 import math
@@ -31,20 +30,20 @@ from edgevpr.runtime.recognise.locate import HEARD, as_learnt, located
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# After a fix that the autopilot took, or perhaps took: so long its position may be only that fix. One that it refused
-# has no echo. That of the frame itself has none either: the position was heard before it.
+# Seconds after a fix that the autopilot took, or perhaps took, in which its position may only repeat that fix. A fix
+# that it refused does not count, nor does the fix of the frame itself: the position was reported before it.
 _ECHO_S = 10.0
 _QUALITY_MIN = 0.2
-_SURE = 0.9  # of the probability to be lost, or to be where the flight so far says
-_CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the place of a match may be farther off than its covariance tells
+_SURE = 0.9  # least probability of being lost, or of being where the flight so far says
+_CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the position of a place may err by more than its covariance says
 
 
 class Learner:
     """Adds places to an open map, then to the index in RAM: every place in the index is already safe on disk.
 
-    `learnt` counts the places, and `passed_over` the frames that were left out, by reason. A frame is passed over while
-    another program is writing to the file, and while learning `is_off`. At any other error of the file learning stops
-    for good, and `trouble` says why: the flight goes on with the places that are there.
+    `learnt` is the number of places added. `passed_over` counts the frames left out, by reason. A frame is left out
+    while another program writes to the file, and while learning is turned off (`is_off`). At any other error of the
+    file learning stops for good and `trouble` says why; the flight goes on with the places it has.
     """
 
     def __init__(
@@ -73,11 +72,12 @@ class Learner:
 
     @property
     def totals(self) -> dict[str, Any]:
-        """The same figures for the flight log."""
+        """Numbers of places learnt and frames left out, and the error that stopped learning (None: no error), as a
+        dict."""
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:
-        """Make a place of an event's frame and return it; None: the frame is left out. Never raises MapError."""
+        """Make a place of an event's frame and return it; None if the frame is left out. Never raises MapError."""
         frame, seen = event.frame, event.descriptor
         if self.trouble is not None or self.is_off or event.failed or frame is None or seen is None:
             return None
@@ -89,7 +89,7 @@ class Learner:
                 self.passed_over[objection or "without a position"] += 1
                 return None
             here = self._tied(here, event)
-            self._map.require_unchanged()  # a place in a file that was deleted would be lost
+            self._map.require_unchanged()  # a place written to a deleted file would be lost
             worth = event.worth
             salience = replace(worth.salience, is_low=worth.reason is not None) if worth else None
             place_id = self._map.add(here, seen, salience, self._recogniser.landmarks(event))
@@ -115,29 +115,32 @@ class Learner:
         return place
 
     def _tied(self, frame: Frame, event: Recognition) -> Frame:
-        """Return the frame where the places around it say that its picture lies, as far as they agree with its recorded
-        position. What they say is only a part of it, so that no error of theirs grows from place to place."""
+        """Correct the position of a frame by the places around it, if they agree with its recorded position. They only
+        count in part, so that errors do not grow from place to place. Returns the frame, with a pose if corrected."""
         recogniser = self._recogniser
         if frame.pose or frame.position is None or event.ranking is None or recogniser.technique.spec.cells is None:
             return frame
         try:
             found = named(event.ranking, recogniser.index, self._map, first=HEARD)
-        except PlaceError:  # it is left out from now on; the frame can be learnt without it
+        except PlaceError:  # the unreadable place is left out from now on; the frame can be learnt without it
             return frame
         if found[0].match.score < recogniser.rule.min_score:
             return frame
-        where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the middle of the picture
+        where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the picture's middle
         learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
         return replace(frame, position=learnt[0], pose=learnt[1]) if learnt else frame
 
     def _placed(self, frame: Frame, vehicle: Vehicle | None) -> tuple[Frame, str | None]:
-        """Return the frame with the position to learn it at, and the objection to learning it there (None: no
-        objection)."""
-        if frame.position:  # it comes from the recording: no echo of our fixes
+        """Return
+
+        * the frame, with the position at which to learn it,
+        * the reason against learning it there (None: no reason).
+        """
+        if frame.position:  # it comes from the recording, so it does not repeat our fixes
             return frame, None
         if vehicle is None or not vehicle.is_fresh_at(frame.t_mono_s):
             return frame, "without a fresh position"
-        if not vehicle.has_gps:  # without GPS the position it goes on reporting is only estimated
+        if not vehicle.has_gps:  # without GPS the reported position is only an estimate
             return frame, "without GPS"
         if frame.t_mono_s - vehicle.t_fix_s < _ECHO_S:
             return frame, "just after a fix"
@@ -145,6 +148,7 @@ class Learner:
         return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
 
     def _objection(self, position: Position, seen: Descriptor, event: Recognition) -> str | None:
+        """Return the reason against learning a place at a position, None if there is none."""
         if event.says_nothing or not seen.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             return "of low quality"
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
@@ -158,8 +162,8 @@ class Learner:
 
 
 def _unsure(followed: Followed | None, position: Position) -> str | None:
-    """Return the objection to learning a place at a position while the flight so far says otherwise, or does not know:
-    it must be sure to be off the map, or to be there."""
+    """Return the reason against learning a place if the flight so far contradicts its position or is unsure, else None.
+    It must say with high probability that the aircraft is off the map, or that it is there."""
     if followed is None or followed.estimate is None or followed.lost >= _SURE:
         return None
     if followed.mass < _SURE:
@@ -171,8 +175,7 @@ def _unsure(followed: Followed | None, position: Position) -> str | None:
 
 
 def check_positions(config: Config, positions: Path | None) -> None:
-    """Raise UsageError where no frame can ever have a position: there is neither a link nor a recording with
-    positions."""
+    """Raise UsageError if no frame can ever have a position: there is neither a link nor a recording with positions."""
     folder = Path(config.source.uri or "")
     if config.mavlink.link is None and not (folder.is_dir() and (positions or _has_positions(folder))):
         raise UsageError(

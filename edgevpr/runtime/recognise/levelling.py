@@ -1,6 +1,7 @@
-"""The first step of the walk: levels every picture, and says how a picture lies on the ground when it becomes a place.
+"""The first step of recognising a frame: levels the picture of a camera that looks straight down, as if the aircraft
+flew level. Also computes the position of a place from the picture's position on the ground (`laid`).
 
-A wrong height scales wrongly. A technique with `height_ratios` finds the picture all the same.
+A wrong height scales a picture wrongly; a technique with `height_ratios` recognises it nevertheless.
 """
 
 import logging
@@ -14,33 +15,32 @@ from edgevpr.core.types import Frame, Pose, Position, Vehicle
 from edgevpr.frames.level import Lens, Levelled, View, leaning, levelled
 from edgevpr.frames.source import is_live
 
-GPS_SD_M = 5.0  # of one axis of a recorded position, as long as nothing better is known
-# Of the footprint: so far from the middle of the picture is the point under an aircraft that tilts by 3 degrees. Chosen
-# with generated flights and aerial_swindale in view.
+GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
+# Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
+# Chosen on generated flights and aerial_swindale.
 UNTOLD_TILT = 0.04
 
 _log = logging.getLogger(__name__)
 
 
 class Leaning:
-    """Takes the pictures of a camera that looks straight down as they are, for want of a lens, and says how far they
-    look aside. `is_live` is as that of `Levelling`."""
+    """Leaves pictures of a camera that looks straight down as they are, because its lens is unknown, and computes by
+    how much they look aside. `is_live` is as in `Levelling`."""
 
     def __init__(self, is_live: bool) -> None:
         self._is_live = is_live
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
-        """Return the picture as it is."""
+        """Return the picture unchanged, with its `overlay` mask, and its view."""
         return Levelled(frame.image, overlay, leaning(frame, _now(vehicle, frame) if self._is_live else None))
 
 
 class Levelling:
     """Levels the pictures of a camera that looks straight down, see `frames.level`.
 
-    `footprint_m` is the length on the ground to which the longest side is scaled, that of the map's places (None: no
-    picture is scaled). With `below`, for places, the point under the camera is in the middle. `on_gimbal`: the camera
-    is kept level, whatever the airframe does. `is_live` is False for frames of a recording, of which the autopilot
-    knows nothing.
+    `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
+    (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
+    keeps the camera level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
     """
 
     def __init__(
@@ -57,7 +57,8 @@ class Levelling:
         self._has_warned = False
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
-        """Level the picture of a frame; `overlay`, bool (H, W), is False where it shows no ground (None: nowhere)."""
+        """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
+        False where the picture shows no ground (None: nowhere)."""
         vehicle = _now(vehicle, frame) if self._is_live else None
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
@@ -74,8 +75,8 @@ AnyLevelling = Leaning | Levelling
 def levelling_of(
     config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
 ) -> AnyLevelling | None:
-    """Make the levelling that the configuration asks for; None where pictures are taken as they are: for a camera that
-    looks ahead, or one of unknown lens on a gimbal."""
+    """Make the levelling for a configuration; None if pictures are left as they are: the camera looks ahead, or its
+    lens is unknown and it is on a gimbal."""
     if technique.spec.parameters.get("camera") != "nadir":
         return None
     live = config.uri is not None and is_live(config.uri)
@@ -92,13 +93,13 @@ def levelling_of(
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading that hints are to know: that of the top of its levelled picture."""
+    """Return the frame with the heading of the top of its levelled picture, if known, for the hints."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
 def laid(frame: Frame, view: View) -> Frame:
-    """Return a frame with a position as a place is to have it: with the heading of its levelled picture, and, where
-    height and heading are known, its pose, and the position of the middle of the picture instead of the aircraft's."""
+    """Return a frame with a position changed to what a place stores: the heading of its levelled picture and, if height
+    and heading are known, its pose and the position of the picture's middle instead of the aircraft's."""
     frame = seen_as(frame, view)
     if frame.position and view.lean_m:
         east_m, north_m = view.lean_m
@@ -111,7 +112,7 @@ def laid(frame: Frame, view: View) -> Frame:
     if view.aside is None:
         variance_m2 += (UNTOLD_TILT * view.footprint_m) ** 2
     else:
-        # What is `aside` is under the aircraft: the middle of the picture is as far off on the other side.
+        # The point `aside` is below the aircraft: the picture's middle is as far from it, in the opposite direction.
         off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
         lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, *off_m.tolist())
         position = Position(lat_deg, lon_deg, position.alt_m)
@@ -120,4 +121,5 @@ def laid(frame: Frame, view: View) -> Frame:
 
 
 def _now(vehicle: Vehicle | None, frame: Frame) -> Vehicle | None:
+    """Return the autopilot's report if it is fresh at the time of the frame, else None."""
     return vehicle if vehicle and vehicle.is_fresh_at(frame.t_mono_s) else None

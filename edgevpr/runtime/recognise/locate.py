@@ -1,9 +1,9 @@
-"""Positions in metres: from places that were recognised to the position of the aircraft, in metres and with a
-covariance.
+"""Computes the position of the aircraft, with a covariance, from the places that were recognised. The recogniser uses
+it.
 
-A match says by what step the middle of the query's picture lies off the middle of the place's. Where it is known how
-that picture lies on the ground (its `Pose`), this is a position. Several places that show the same ground must then say
-the same, and together say it more exactly. Without a pose, such as ahead, the position is the place's own.
+A match gives the shift between the middles of the pictures of query and place. If the `Pose` of the place is known (how
+its picture lies on the ground), the shift gives a position. Several places that show the same ground must give about
+the same position, and their mean is more exact. Without a pose, as ahead, the position is that of the place.
 """
 
 import math
@@ -20,24 +20,24 @@ from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
 
-# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations of one axis of a step, as shares of the longest
-# side, that come on top of what a match knows of its own: tilt and relief move parts of a picture by different steps.
+# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, in the longest
+# side, added to the covariance that a match gives: tilt and relief shift the parts of a picture differently.
 _OF_VOTE, _OF_LANDMARKS = 0.016, 0.008
-_SCALE_SD, _TURN_SD = 0.03, 0.03  # of the pose of a place, which stretch and turn a step
+_SCALE_SD, _TURN_SD = 0.03, 0.03  # of a place's pose, as shares of the length of a shift
 _OF_SCATTER = 0.25
-_LIKE_THE_BEST = 0.5  # of its score: such a match is heard too
-_DISAGREES = 4.0  # standard deviations: such a place is not heard
-_CONTRADICTS = 0.2  # of the footprint: farther apart than that, one of the two is not the right place
-HEARD = 12  # places at most: over a dense map so many show the same ground, and none of them is a rival
-_SAYING = 5  # of these make the position
+_LIKE_THE_BEST = 0.5  # of the best score: matches with at least that score are used too
+_DISAGREES = 4.0  # standard deviations: places that differ by more are not used
+_CONTRADICTS = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
+HEARD = 12  # places looked at; in a dense map so many show the same ground
+_SAYING = 5  # of these determine the position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Located:
-    """Position of the aircraft: `position`, with `covariance_m2` (variance east, covariance, variance north).
-    `heading_deg` is the compass direction of the top of the picture, and `height_ratio` the height of the camera over
-    that of the map and `footprint_m` the length on the ground of its longest side (None: unknown). `places` are the
-    numbers of those that say so. `objection` says why it is not to be believed (None: nothing is against it)."""
+    """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
+    compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
+    pictures, and `footprint_m` the length on the ground of the longest side (None: unknown). `places` are the numbers
+    of the places used. `objection` is the reason not to trust the position (None: no reason)."""
 
     position: Position
     covariance_m2: Covariance
@@ -49,7 +49,7 @@ class Located:
 
     @property
     def accuracy_m(self) -> float:
-        """Standard deviation along the worst direction."""
+        """Standard deviation in the direction where it is largest, metres."""
         var_east, cov, var_north = self.covariance_m2
         middle, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
         return math.sqrt(middle + half)
@@ -57,9 +57,9 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lies:
-    """The way in which the query lies on a place at `position` with a `pose`: the `step` (2,) of its middle, to the
-    right and down, as a share of the place's longest side, with its `covariance` (2, 2); its rotation in degrees, and
-    its height over that of then."""
+    """Estimate of how the query lies on a place at `position` with a `pose`. `step` (2,) is the shift of the query's
+    middle, to the right and down, as a share of the place's longest side, with its `covariance` (2, 2). `rotation_deg`
+    and `height_ratio` are as in `FineMatch`."""
 
     place_id: int
     position: Position
@@ -72,34 +72,34 @@ class _Lies:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """Position by one place: east and north (2,) in metres from the best place, the covariance (2, 2) of the step that
-    led there, and that of its pose."""
+    """Position of the aircraft by one place: `at_m` (2,) east and north of the best place, metres. Its covariances (2,
+    2) are `of_step`, from the shift, and `of_pose`, from the pose."""
 
     at_m: Doubles
     of_step: Doubles
     of_pose: Doubles
 
     def apart(self, other: "_Said") -> float:
-        """Return how far apart two places say that the aircraft is, in standard deviations. Their poses are known
-        against each other far better than on the Earth: half of a variance of each is what they may differ by."""
+        """Return how far apart the positions by two places are, in standard deviations. Relative to each other, poses
+        are known far better than on the Earth, so only half of the variance of each counts."""
         return in_sd(self.at_m - other.at_m, self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2)
 
 
 def at_place(position: Position, accuracy_m: float) -> Located:
-    """Return the position of a place as that of the aircraft, with a standard deviation of one axis."""
+    """Return the position of a place as that of the aircraft; `accuracy_m` is the standard deviation along one axis."""
     return Located(position=position, covariance_m2=(accuracy_m**2, 0.0, accuracy_m**2))
 
 
 def located(
     found: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, proof: Agreement | None = None
 ) -> Located | None:
-    """Return where the aircraft is by the places `found`, best first; None where the best has no pose.
+    """Return the position of the aircraft by the places `found`, best first; None if the best has no pose or its match
+    no shift. `cells` is the number of cells along the longest side of a picture (None: shifts cannot be converted to
+    metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is unknown, it is
+    about the middle. `proof` is the agreement of the landmarks of the best place, which gives another shift.
 
-    `cells` is the number of cells along the longest side of a picture (None: shifts say nothing about metres). `view`
-    is the way in which the query's picture lies on the ground; where it is unknown what is straight under the aircraft,
-    that is about the middle. `proof` is how the landmarks of the best place agree: they say the step as well as the
-    vote does. Places whose score is less than half of the best's, and those that do not show the same ground, are not
-    heard; of those that are, the first five make the position.
+    Not used are places with a score below half of the best one's, and places that do not show the same ground. Of the
+    others, those whose position contradicts the first are excluded, and the first five determine the position.
     """
     best = _by_vote(found[0], cells)
     if best is None:
@@ -141,13 +141,14 @@ def matrix_of(covariance: Covariance) -> Doubles:
 
 
 def in_sd(step: Doubles, covariance: Doubles) -> float:
-    """Return the length of a step (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
+    """Return the length of a shift (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
     return math.sqrt(step @ np.linalg.solve(covariance, step))
 
 
 def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
-    """Return position and pose of a new place that is `recorded` with a standard deviation of one axis, and lies where
-    places around it say; None where the two contradict each other."""
+    """Return position and pose of a new place, combined from its position `recorded`, with the standard deviation of
+    one axis, and its position by the places around it, `where`. None if both contradict each other or `where` has no
+    heading."""
     off_m = _off_m(recorded, where.position)
     by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
@@ -166,26 +167,27 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Return the position that places say together, east and north (2,) in metres, and its covariance (2, 2)."""
+    """Combine positions by several places. Returns east and north of the best place (2,), metres, and the
+    covariance."""
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:
-        # Places that differ by more than they should say how inexact all of them are (Birge 1932).
+        # If places differ by more than their covariances allow, these are scaled up (Birge 1932).
         off = sum((each.at_m - at_m) @ np.linalg.solve(each.of_step, each.at_m - at_m) for each in said)
         of_step = of_step * max(1.0, float(off) / (2 * (len(said) - 1)))
-    # What is wrong with the poses is common to neighbours: hearing several makes it no smaller.
+    # Errors of the poses are common to neighbours: using several makes them no smaller.
     return at_m, of_step + np.mean([each.of_pose for each in said], axis=0)
 
 
 def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
-    """Return how the query lies on a place by its match; None where it cannot be laid over the ground of the place."""
+    """Return how the query lies on a place by its match; None if the match has no shift, or the place no pose."""
     match, place = candidate.match, candidate.place
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
     if place.position is None or place.pose is None:
         return None
     covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
-    # Votes scatter around their peak; of their mean, what is left of that.
+    # The match's covariance is that of single votes; their mean has a fraction of it.
     covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
     return _Lies(
         place_id=place.place_id,
@@ -199,21 +201,23 @@ def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
 
 
 def _by_landmarks(best: _Lies, proof: Agreement) -> _Lies:
-    """Return how the query lies on the best place by its landmarks, which agree."""
+    """Return how the query lies on the best place by its agreeing landmarks."""
     covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
     step, rotation_deg = np.array(proof.shift_share), proof.rotation_deg or 0.0
     return replace(best, step=step, covariance=covariance, rotation_deg=rotation_deg, height_ratio=proof.scale)
 
 
 def _shows_the_same(lies: _Lies, best: _Lies) -> bool:
-    # Both show the middle of the query: their middles are not farther from each other than that.
+    """Return True if both places can show the middle of the query, by the distance of their own middles."""
     room_m = (lies.pose.footprint_m + best.pose.footprint_m) / 2
     return float(np.hypot(*_off_m(best.position, lies.position))) <= room_m
 
 
 def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
+    """Compute the position of the aircraft by one place, relative to `origin`. `aside` (right, up) is the point below
+    it in the query's picture, as shares of the longest side from the middle."""
     pose = lies.pose
-    # The point under the aircraft, in the place's picture: first as the query has it, then turned and scaled as it is.
+    # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
     right, up = aside
     dx = lies.step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
@@ -225,7 +229,7 @@ def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
     aslant = np.array([-towards[1], towards[0]])
     of_pose = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
     of_pose += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
-    upwards = lies.covariance * [[1, -1], [-1, 1]]  # of a step up, and not down
+    upwards = lies.covariance * [[1, -1], [-1, 1]]  # y up instead of down
     return _Said(
         at_m=_off_m(origin, lies.position) + off_m,
         of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose,
@@ -234,7 +238,7 @@ def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
 
 
 def _off_m(origin: Position, position: Position) -> Doubles:
-    """Return how far a position is from another, east and north (2,)."""
+    """Return how far east and north of `origin` a position is (2,), metres."""
     return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 
