@@ -1,15 +1,16 @@
-"""Retrieval of the places that a query may show: one scan of the index, then a full comparison of the best ones.
+"""Retrieval of the places that a query may show: a scan of the whole index, then full comparisons of the best places.
 
-A place that cannot be read is left out from then on, and the others are used. This must never turn a refused match into
-an accepted wrong one, by taking the right place, or the rival that kept the margin small, out of the way. So:
+A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number.
+A place that cannot be read is left out from then on, and the others are used. The loss of the right place, or of the
+rival that kept the margin small, must never make a wrong match be accepted that would have been refused. So:
 
 * The query in which a place turns out to be unreadable is refused.
-* A place that was left out keeps its row in the index, and so its score in the scan. A later query that may show it
-  (see `Ranking.unread`) is refused, whichever place it matches.
-* A technique without a fine part needs nothing but the row. A place that was left out then keeps its rank and its
-  score, and is refused when it is the best.
-* Where most of the places compared with one query cannot be read, the file is at fault, not the places: the query is
-  refused, and none is left out. So all are used again as soon as the file can be read again.
+* A place that was left out keeps its row in the index, and so its scan score. A later query that may show it (see
+  `Ranking.unread`) is refused, whichever place it matches.
+* A technique without a fine part needs only the row. A place that was left out then keeps its rank and score, and the
+  query is refused if that place is the best.
+* If most of the places compared with one query cannot be read, the file is at fault, not the places. The query is
+  refused, and no place is left out: all are used again as soon as the file can be read again.
 """
 
 import math
@@ -29,23 +30,23 @@ from edgevpr.places.mapfile import PlaceMap
 
 T = TypeVar("T")
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
-Glance = tuple[float, Choice]  # about the score of a place, and the best of the hypotheses to try
+Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
-_TRIED_EACH = 6  # hypotheses of a place
-_MANY = 3  # unreadable places of one query, that may be the file's fault
-# On corridor (tune), wherever the right places were left out and a wrong one had the margin to be accepted, one of the
-# right ones was as good in the scan as the wrong one, or among the best two.
+_TRIED_EACH = 6  # hypotheses per place
+_MANY = 3  # unreadable places in one query, from which on the file may be at fault
+# In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
+# one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
 _LIKELY = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Knowledge about the place of a query before the search (None: nothing known). `in_reach` bool (N,), at least one
-    True, tells which places the aircraft can be at. `turned_deg` float (N,) is the expected rotation of the camera
-    since each place was mapped, and `height_ratio` the camera's height above the ground over that of then (see
-    `Technique.coarse_scores`)."""
+    """Knowledge about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one True,
+    is True for the places where the aircraft can be. `turned_deg` float (N,) is the expected rotation of the camera, in
+    degrees, since each place was mapped (see `FineMatch`). `height_ratio` is the camera's expected height above the
+    ground, divided by the height when mapping."""
 
     in_reach: Bools | None = None
     turned_deg: Doubles | None = None
@@ -57,7 +58,7 @@ NOTHING = Expectation()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Query:
-    """One query, and what it is searched in: a map, its index, and what is expected of the place."""
+    """One query's descriptor, the map and the index to search, and the expectation about its place."""
 
     technique: Technique
     descriptor: Descriptor
@@ -68,8 +69,8 @@ class Query:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The result of scanning all rows of the index: `scores` float32 (N,). Where a comparison has several hypotheses
-    to try, `by_hypothesis` float32 (N, H) has the score of each, -inf for one that is ruled out; else None."""
+    """The result of scanning all rows of the index. `scores` float32 (N,) has one score per place. `by_hypothesis`
+    float32 (N, H) has the score of each hypothesis, -inf if it is ruled out (None: there are no hypotheses)."""
 
     scores: Singles
     by_hypothesis: Singles | None
@@ -77,10 +78,10 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Places best first: `slots` int (K,) of the index and `scores` float32 (K,). `compared` maps the slot of each
-    place that was compared in full to its match, which has the same score. Places that were looked at for a moment only
-    come after them. `unread` int (U,) are slots of places that cannot be read but may be in the picture: their scan is
-    at least as good as that of the best place, or as the third best of all."""
+    """Places, best first, as `slots` int (K,) of the index with `scores` float32 (K,). `compared` maps the slot of each
+    place that was compared in full to its match, which has the same score. Places that were compared in part only (see
+    `Technique.glance`) come after them. `unread` int (U,) are slots of unreadable places that the query may show: their
+    scan score is at least that of the best place, or at least the third best of all."""
 
     slots: Ints
     scores: Singles
@@ -93,13 +94,13 @@ class Ranking:
         return [slot for slot in self.slots.tolist() if slot in self.compared]
 
     def led_by(self, slot: int) -> "Ranking":
-        """Return the ranking with another place first, with its own score."""
+        """Return the ranking with the place `slot` moved to the front; it keeps its own score."""
         order = np.argsort(self.slots != slot, kind="stable")
         return replace(self, slots=self.slots[order], scores=self.scores[order])
 
 
 def scan(query: Query) -> Scan:
-    """Score all places of the index by their rows, in one product."""
+    """Score all places of the index by their rows, all at once."""
     technique, index, expected = query.technique, query.index, query.expected
     hint: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
@@ -108,22 +109,21 @@ def scan(query: Query) -> Scan:
 
 
 def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbour_m: float = 0.0) -> Ranking:
-    """Compare the `candidates` places with the best scan scores, and rank them.
+    """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
-    Of more than the technique's `in_full` of them, those that look best at a glance are compared in full.
-    Where `candidates` is None, or is at least the number of places and more than the technique's own number, all
-    places are compared under every hypothesis of the expected height, unless `expected` says more: exact, but slow.
-    Neighbours of the best place are the places within `neighbour_m` metres of it. Where all candidates are its
-    neighbours, the best-scanned places elsewhere are compared as well, because the margin needs one of them. A
-    technique without a fine part is ranked by the scan.
-    Where the scan counts (see `TechniqueSpec.scan_counts`), the score is that of the comparison times the mean of the
-    scan score and 1: for a wrong place the two scores have little to do with each other.
-    Where `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared
-    as well: a false expectation would otherwise hide the right place behind the best of the wrong ones. At least five
-    places elsewhere are then compared, because a margin over fewer says little.
+    If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
+    If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
+    compared: exact, but slow. All hypotheses of the expected height are then tried, if nothing else is expected.
+    Neighbours of the best place are the places within `neighbour_m` metres of it. If all candidates are its neighbours,
+    the best-scanned places elsewhere are compared as well, for the margin. Without a fine part, the scan scores rank.
+    With `TechniqueSpec.scan_counts`, the score is that of the comparison times the mean of the scan score and 1,
+    because for a wrong place the two scores are nearly independent.
+    If `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared as
+    well: with a false expectation, the right place would otherwise be missing, and a wrong one could win. At least five
+    places elsewhere are then compared, because a margin over fewer means little.
 
-    Raises PlaceError where a place cannot be read, after all candidates have been tried. It is then left out (see the
-    top of this file). Raises MapError where the file cannot be read.
+    Raises PlaceError if a place cannot be read, after all candidates have been tried; the place is then left out (see
+    the module's docstring). Raises MapError if the file cannot be read.
     """
     spec, index, in_reach = query.technique.spec, query.index, query.expected.in_reach
     looks = _Comparison(query, scanned, candidates)
@@ -158,11 +158,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
 
 
 class _Comparison:
-    """The comparisons of one query with places of its map: `matches` by slot, and in `passed_over` those that were only
-    glanced at. `readable` bool (N,) tells which places could be read so far; of a technique without a fine part, all.
+    """The comparisons of one query with places of its map. `matches` has the full ones by slot, `passed_over` the
+    places compared in part only. `readable` bool (N,) is False for places left out (all True without a fine part).
 
-    All looks raise PlaceError where a place cannot be read, after all have been tried; it is then left out. They raise
-    MapError where the file cannot be read.
+    Comparing raises PlaceError if a place cannot be read, after all places have been tried; it is then left out. It
+    raises MapError if the file cannot be read.
     """
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
@@ -180,8 +180,8 @@ class _Comparison:
         self.passed_over: list[Glance] = []
 
     def best(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
-        """Choose up to `count` places where `among` bool (N,) is True: the best scanned or, of more than `in_full`
-        looks, those that look best at a glance."""
+        """Choose up to `count` places, with hypotheses to try, of those where `among` bool (N,) is True, by scan score.
+        If these have more than `in_full` hypotheses, keep the `in_full` places with the best glance (None: all)."""
         if self._tries_all and self._by_hypothesis is not None:
             of_slot = self._by_hypothesis
             return [(at, np.flatnonzero(np.isfinite(of_slot[at])).tolist()) for at in np.flatnonzero(among).tolist()]
@@ -193,12 +193,12 @@ class _Comparison:
         return [choice for _, choice in glances[:in_full]]
 
     def next_best(self, among: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more places where `among` is True, first of those that were passed over."""
+        """Choose up to `count` more places where `among` is True: from `passed_over`, or if none is in it, by scan."""
         more = [choice for _, choice in self.passed_over if among[choice[0]]][:count]
         return more or best_scanned(self._scores, self._by_hypothesis, among, count)
 
     def scores_in_full(self, chosen: list[Choice]) -> list[float]:
-        """Compare places in full, under the hypotheses to try, and return their scores."""
+        """Compare the chosen places in full, and return their scores in the same order; fill `matches`."""
         slots = [slot for slot, _ in chosen]
         if self._has_one_stage:
             return [float(score) for score in self._scores[slots]]
@@ -233,8 +233,8 @@ class _Comparison:
 
 
 def together(one: Ranking, other: Ranking) -> Ranking:
-    """Join two rankings of the same query, that looked at the same places under different expectations: of a place that
-    both compared the better match counts."""
+    """Merge two rankings of the same query, made with different expectations. If both compared a place in full, the
+    better match counts."""
     compared = dict(one.compared)
     for slot, match in other.compared.items():
         if slot not in compared or match.score > compared[slot].score:
@@ -252,27 +252,27 @@ def together(one: Ranking, other: Ranking) -> Ranking:
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = ()) -> Bools:
-    """Tell which of `slots` (K,) are outside the neighbourhood of the slot `best`, bool (K,): more than `neighbour_m`
-    metres away or, where either has no position, more than two places before or after it in the index. The places
-    numbered `same` are inside, however far away: they show the same ground."""
+    """Return True for each of `slots` (K,) that is no neighbour of the slot `best`, bool (K,): it is more than
+    `neighbour_m` metres away or, if either has no position, more than two slots away. Places with an id in `same` count
+    as neighbours at any distance, since they show the same ground."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
     away = np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
     return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
-    """Return the margin: the best score less the best score elsewhere. None where no place elsewhere is ranked. The
-    places numbered `same` are not elsewhere."""
+    """Return the margin: the best score minus the best score of a place elsewhere (see `elsewhere`, with `neighbour_m`
+    and `same`). None if no place elsewhere is ranked."""
     others = ranking.slots[1:]
     runners_up = ranking.scores[1:][elsewhere(index, int(ranking.slots[0]), others, neighbour_m, same)]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
 def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
-    """Return the `first` places of a ranking (None: all) as candidates, with their data in the map file, best first.
+    """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
 
-    Raises PlaceError for a place that cannot be read, that was left out, or whose position has changed since the index
-    was loaded: it is then unknown which position is right. It is left out from then on.
+    Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
+    was loaded: it is then unknown which position is right. The place is left out from then on.
     """
     candidates = []
     for slot, score in zip(ranking.slots[:first].tolist(), ranking.scores[:first].tolist(), strict=True):
@@ -291,13 +291,13 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int |
 
 
 def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
-    """Choose the `count` best-scanned slots where `among` bool (N,) is True, and the hypotheses to try of each (None:
-    all). They come in the order of the map file, in which a card reads them fastest.
+    """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
+    (None: all). They come in the order of the map file, in which a memory card reads them fastest.
 
-    With `by_hypothesis` float32 (N, H) (see `Technique.coarse_scores`), the best hypotheses of all places together are
-    chosen instead: `count` times six, or `count` times a third of the mean number possible for a place where that is
-    less. So a place with only two likely hypotheses leaves room for other places. One place gets six hypotheses at
-    most, or more where there are too few places.
+    With `by_hypothesis` float32 (N, H) (see `Scan`), the best pairs of a place and a hypothesis are chosen instead:
+    `count` times six pairs or, if that is less, `count` times a third of the mean number of possible hypotheses per
+    place. So a place with only two likely hypotheses leaves pairs to other places. One place gets six hypotheses at
+    most, or more if there are too few places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
@@ -315,12 +315,12 @@ def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, c
 
 
 def _largest(scores: Singles, count: int) -> Ints:
-    """Return the indices of the `count` largest of scores (N,), in no order."""
+    """Return the indices of the `count` largest of `scores` (N,), in any order."""
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
 def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
-    """Return the slots of the places left out that a query may show (see `Ranking`)."""
+    """Return the slots of the left-out places that the query may show (see `Ranking`). `best` is the best slot."""
     slots: Ints = np.flatnonzero(~readable)
     if not len(slots):
         return slots
@@ -330,15 +330,15 @@ def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
 
 
 def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
-    """Raise PlaceError unless a place is exactly where it was when the index was loaded."""
+    """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
         raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")
 
 
 def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Leave places out that could not be read, and return the error of this query. Where they are most of the `tried`,
-    return one of the file, and leave none out."""
+    """Note the unreadable places as left out, and return the first error. But if they are most of the `tried` places,
+    note none, and return a MapError about the file."""
     first = unreadable[0]
     if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
         return MapError(

@@ -1,8 +1,8 @@
-"""The rows of the table of places: what may stand in one, and the reading of all that can be read.
+"""The rows of the table of places: their columns, the check of their values, and a scan that survives damaged pages.
 
-A row is believed only where each value has its type and range, and each BLOB its size and its checksum. A checksum is
-missing (NULL) where another program has moved a place on purpose. The exception is the time, of which other programs
-write many forms: what is no time is an unknown time.
+A row is used only if each value has the right type and range, and each BLOB the right size and checksum. A missing
+checksum (NULL) is accepted, since a program that moves a place on purpose removes it. An exception is the time, which
+other programs write in many forms: a value that is not a time counts as unknown.
 """
 
 import math
@@ -20,7 +20,7 @@ from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage
 from edgevpr.places.sqlite import is_of_one_row
 
-# Columns, as a query of SQL names them.
+# Lists of columns, as SQL queries name them.
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
 SALIENCE = "memorability, staticity, entropy, is_low_quality"
 POSE = (
@@ -30,37 +30,37 @@ BLOBS = "coarse, fine, landmarks"
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32, pose_crc32, landmarks_crc32"
 OF_PLACE = f"{VALUES}, {SALIENCE}, {POSE}, geom_crc32, pose_crc32"
 ALL = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
-MOST_LANDMARK_BYTES = 10_000  # of a place
+MOST_LANDMARK_BYTES = 10_000  # per place
 
 _POSE = tuple(POSE.split(", "))
 _LEAST_ROW_BYTES = 16  # no row of a map is smaller, so a file has no more rows than its size allows
-_LOWEST_M, _HIGHEST_M = -1000, 100_000  # above sea level, as in positions.csv
-_MOST_METRES = 1e5  # of a footprint, or the standard deviation of a position
-_MOST_MISSING = 100_000  # ids one after another of which there is no place
+_LOWEST_M, _HIGHEST_M = -1000, 100_000  # allowed altitudes above sea level, as in positions.csv
+_MOST_METRES = 1e5  # largest footprint, and largest standard deviation of a position
+_MOST_MISSING = 100_000  # successive ids without a place, after which a scan by ids ends
 
-# Values of some columns of a row as SQLite gives them: nothing is known of their types.
+# Values of some columns of a row as SQLite returns them; their types are not checked yet.
 Values = tuple[Any, ...]
-Content = Mapping[str, Any]  # the same, by their columns
+Content = Mapping[str, Any]  # such values by column name
 
 
 class Unreadable(ValueError):
-    """A value of a row that is not to be believed, in a few words."""
+    """A value of a row is missing or invalid; the message says which, in a few words."""
 
 
 def present(row: Values | None) -> Values:
-    """Return a row. Raises Unreadable for None."""
+    """Return `row` itself. Raises Unreadable if it is None, that is missing or unreadable."""
     if row is None:
         raise Unreadable("its row is gone")
     return row
 
 
 def content_of(columns: str, row: Values | None) -> Content:
-    """Return the values of a row by their columns. Raises Unreadable for None."""
+    """Return the values of a row by the names in `columns`. Raises Unreadable if `row` is None."""
     return dict(zip(columns.split(", "), present(row), strict=True))
 
 
 def point_of(geom: object, checksum: object) -> LatLon | None:
-    """Return (lat_deg, lon_deg), None for a place without a position. Raises Unreadable."""
+    """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises Unreadable."""
     if geom is None:
         if checksum is not None:
             raise Unreadable("its position is gone")
@@ -74,7 +74,7 @@ def point_of(geom: object, checksum: object) -> LatLon | None:
 
 
 def part_of(blob: object, spec: PartSpec, checksum: object, name: str) -> Array:
-    """Return a part of a descriptor (read-only array of `spec`); `name` it is called by. Raises Unreadable."""
+    """Decode a part of a descriptor as a read-only array of `spec`. Raises Unreadable; its message has `name`."""
     if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
         raise Unreadable(f"its {name} has a wrong size")
     _hold(blob, checksum, name)
@@ -85,7 +85,7 @@ def part_of(blob: object, spec: PartSpec, checksum: object, name: str) -> Array:
 
 
 def landmarks_of(blob: object, checksum: object) -> bytes | None:
-    """Return the landmarks of a place, None for one that has none. Raises Unreadable."""
+    """Check the encoded landmarks of a place and return them; None if there are none. Raises Unreadable."""
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) > MOST_LANDMARK_BYTES:
@@ -95,7 +95,7 @@ def landmarks_of(blob: object, checksum: object) -> bytes | None:
 
 
 def quality_of(value: object) -> float:
-    """Return a quality, 0 to 1. Raises Unreadable."""
+    """Check a quality and return it, 0 to 1. Raises Unreadable."""
     quality = _number(value, "quality")
     if quality is None or not 0 <= quality <= 1:
         raise Unreadable("its quality is not from 0 to 1")
@@ -103,7 +103,8 @@ def quality_of(value: object) -> float:
 
 
 def where_of(values: Sequence[Any], geom_checksum: object) -> tuple[LatLon | None, float | None]:
-    """Check all of a row's `VALUES`; return the position, and the heading as 0 up to 360 degrees. Raises Unreadable."""
+    """Check the `VALUES` of a row; return its (lat_deg, lon_deg), and its heading in degrees, 0 up to 360. Each is
+    None if unknown. Raises Unreadable."""
     geom, _, alt_m, heading_deg, source_image, quality = values
     point = point_of(geom, geom_checksum)
     if _number(alt_m, "alt_m") != _altitude(alt_m):
@@ -116,7 +117,7 @@ def where_of(values: Sequence[Any], geom_checksum: object) -> tuple[LatLon | Non
 
 
 def place_of(place_id: int, content: Content) -> Place:
-    """Make a place of the `OF_PLACE` of its row. Raises Unreadable."""
+    """Make a Place from the columns `OF_PLACE` of its row. Raises Unreadable."""
     point, _ = where_of([content[name] for name in VALUES.split(", ")], content["geom_crc32"])
     return Place(
         place_id=place_id,
@@ -133,9 +134,9 @@ def place_of(place_id: int, content: Content) -> Place:
 def frame_content(
     frame: Frame, descriptor: Descriptor, spec: TechniqueSpec, salience: Salience | None, landmarks: bytes | None
 ) -> Content:
-    """Return the row of a new place, without its checksums.
+    """Return the row of a new place, by columns, without its checksums.
 
-    A time that is no date is unknown, and so is an altitude at which nothing flies.
+    A time that is not a date and an altitude outside the allowed range are stored as unknown (NULL).
     """
     position, scores = frame.position, salience.scores if salience else {}
     return {
@@ -155,7 +156,7 @@ def frame_content(
 
 
 def pose_content(pose: Pose | None) -> Content:
-    """Return the `POSE` of a row, by its columns."""
+    """Return the columns `POSE` of a row, all None for an unknown pose."""
     if pose is None:
         return dict.fromkeys(_POSE)
     recorded = (pose.recorded.lat_deg, pose.recorded.lon_deg) if pose.recorded else (None, None)
@@ -164,33 +165,33 @@ def pose_content(pose: Pose | None) -> Content:
 
 
 def checksums_of(content: Content) -> dict[str, int | None]:
-    """Return the `CHECKSUMS` of a row, by their columns: that of what is NULL is NULL."""
+    """Return the columns `CHECKSUMS` of a row. The checksum of a value that is None is None."""
     sums = {f"{name}_crc32": crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
     return sums | {"pose_crc32": pose_crc32([content[name] for name in _POSE])}
 
 
 def pose_crc32(values: Sequence[Any]) -> int | None:
-    """Return the checksum of a row's `POSE`, None where it says nothing."""
+    """Return the checksum of the values of `POSE`, in this order; None if all are None."""
     if all(value is None for value in values):
         return None
     return zlib.crc32(struct.pack("<8d", *(math.nan if value is None else float(value) for value in values)))
 
 
 def readable(name: str) -> str:
-    """Return a name as UTF-8 can have it: bytes that are not UTF-8 are written as escapes."""
+    """Return a name in which characters that UTF-8 cannot encode are replaced by escapes."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
 def most_rows(file_bytes: int) -> int:
-    """Return how many rows a file of this size can hold at most."""
+    """Return the largest number of rows that a file of this size can hold."""
     return file_bytes // _LEAST_ROW_BYTES
 
 
 def scan(db: sqlite3.Connection, columns: str, file_bytes: int) -> Iterator[tuple[int, Values | None]]:
-    """Yield (place id, row) of every place in the order they were added; the row is None where SQLite cannot read it.
+    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
 
-    A damaged page hides the rows on it, and those after it from a walk through the table. They are then asked for one
-    by one. Raises sqlite3.Error where the file cannot be read at all, or has more rows than its size allows.
+    A query of the whole table ends at the first damaged page. The rows after it are then read one by one, by id. Raises
+    sqlite3.Error if the file cannot be read at all, or yields more rows than fit into `file_bytes`.
     """
     left, last = most_rows(file_bytes), -(2**63)
     try:
@@ -224,8 +225,8 @@ def scan(db: sqlite3.Connection, columns: str, file_bytes: int) -> Iterator[tupl
 
 
 def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
-    """Return the highest id that a place may have. Raises `error`, because of which it is asked, where none can be
-    read."""
+    """Return the highest id that a place of a damaged file may have. Raises `error`, the one that showed the damage, if
+    that cannot be read."""
     for query in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
         try:
             (highest,) = db.execute(query).fetchone() or (None,)
@@ -237,13 +238,13 @@ def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
 
 
 def _altitude(alt_m: float | None) -> float | None:
-    """Return an altitude above sea level, None for one at which nothing flies."""
+    """Return an altitude above sea level, or None if it is outside the allowed range."""
     return alt_m if alt_m is not None and _LOWEST_M <= alt_m <= _HIGHEST_M else None
 
 
 def _salience_of(values: Sequence[Any]) -> Salience | None:
-    """Return what a row's `SALIENCE` says; None where it says nothing. A score that is none is unknown: nothing depends
-    on it in flight."""
+    """Make a Salience from the values of `SALIENCE`; None if they are unknown. An invalid score becomes None, since no
+    decision in flight depends on it."""
     *scores, is_low = values
     if is_low is None:
         return None
@@ -253,8 +254,8 @@ def _salience_of(values: Sequence[Any]) -> Salience | None:
 
 
 def _pose_of(values: Sequence[Any], checksum: object) -> Pose | None:
-    """Return what a row's `POSE` says; None where it says nothing. Raises Unreadable: a wrong pose would make a wrong
-    position."""
+    """Make a Pose from the values of `POSE`; None if they are unknown. Raises Unreadable for invalid values: a wrong
+    pose would give wrong positions in flight."""
     if checksum is None and all(value is None for value in values):
         return None
     if checksum is not None and checksum != pose_crc32(values):
@@ -283,14 +284,14 @@ def _pose_of(values: Sequence[Any], checksum: object) -> Pose | None:
 
 
 def _blob_of(part: Array | None, spec: PartSpec | None) -> bytes | None:
-    """Return the bytes of a part of a descriptor as the file has them, None for a part that the technique lacks."""
+    """Encode a part of a descriptor as the bytes to store; None for a part that the technique does not have."""
     if spec is None or part is None:
         return None
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
 
 
 def crc32(blob: Any) -> int | None:
-    """Return the checksum of a BLOB, None for one that is NULL."""
+    """Return the CRC-32 of a BLOB; None for None."""
     return None if blob is None else zlib.crc32(blob)
 
 

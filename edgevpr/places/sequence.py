@@ -1,10 +1,10 @@
-"""Matching in sequences: a place is recognised when the queries before the newest one fit the places before it.
+"""Matching of sequences: a place is recognised if the last queries match the places that were mapped before it.
 
-The trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6) over the scores of any technique. It
-assumes that the places of the map are in the order of the flight, and that the queries pass them in the same direction,
-at 0.8 to 1.2 places a query. An aircraft that flies the other way, or at a very different number of places a query, is
-not followed: the places found would lag behind. To keep such places from being accepted, other speeds are tried too,
-as rivals.
+This is the trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6), applied to the scores of any
+technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed in places per
+query. It is assumed that places were mapped in the order of the flight, and that the aircraft passes them in the same
+direction, at 0.8 to 1.2 places per query. At other speeds, or backwards, the search would find places that lag behind.
+To keep these from being accepted, other speeds are tried too, and a match must beat their scores (the rivals).
 """
 
 import zlib
@@ -19,36 +19,36 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 
-FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places a query, as in the paper
-_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places a query; a step that a sequence of ten queries can tell apart
+FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
+_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can tell steps of 0.25 apart
 _OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
-# After this time at 10 m/s the vehicle has left the neighbourhood of 50 m, and no velocity covers the places between.
+# After 5 s at 10 m/s the vehicle has left the neighbourhood of 50 m, and no trajectory spans the places between.
 _GAP_S = 5.0
 _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
-_USUAL_INTERVALS = 3  # a technique that takes 6 s a query always pauses for 6 s: that is no gap
+_USUAL_INTERVALS = 3  # a pause is no gap if each query takes so long, e.g. 6 s
 
 
 def length_of(spec: TechniqueSpec, asked: int | None) -> int:
-    """Return how many queries are matched together: the number asked for, else the technique's own."""
+    """Return how many queries are matched together: `asked`, or the technique's own number if that is None or 0."""
     return asked or spec.sequence
 
 
 def search_of(length: int) -> "SequenceSearch | None":
-    """Make the search over sequences of `length` queries; None for a length of one: each query is matched alone."""
+    """Make the search over sequences of `length` queries; None for a length of 1: each query is matched alone."""
     return SequenceSearch(length) if length > 1 else None
 
 
 def bytes_beside_place(length: int) -> int:
-    """Return the resident bytes that a sequence adds to each place: a score for each query, and one for the rivals."""
+    """Return the bytes of RAM that a sequence needs per place: a float32 score per query, and one for the rivals."""
     return 4 * (length + 1) if length > 1 else 0
 
 
 class SequenceSearch:
-    """The scores of all places for the last `length` queries, followed from query to query.
+    """The scores of all places for the last `length` queries, and the search for trajectories in them.
 
-    `frames` is the number of queries so far: until it is `length`, no place may be accepted. `rivals`, float32 (N,),
-    are the best mean scores at speeds that are not followed: an accepted place must be ahead of the rivals elsewhere. A
-    pause longer than five seconds, and than three times the interval before it, begins a new sequence.
+    Call `follow` for each query. No place may be accepted before `frames` is `length`. `rivals` float32 (N,) has the
+    best mean score of each place at the other speeds: an accepted place must beat the rivals at places elsewhere. A
+    pause of more than five seconds and more than three times the interval before it begins a new sequence.
     """
 
     def __init__(self, length: int) -> None:
@@ -64,7 +64,7 @@ class SequenceSearch:
 
     @property
     def frames(self) -> int:
-        """Number of queries in the sequence so far, at most `length`."""
+        """The number of queries in the sequence so far, at most `length`."""
         return len(self._rows)
 
     @property
@@ -72,12 +72,13 @@ class SequenceSearch:
         return sum(row.nbytes for row in self._rows) + self.rivals.nbytes
 
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
-        """Take the ranking of the newest query, made at `t_mono_s`, and rank the places by their best trajectory.
+        """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
+        by the mean score of their best trajectory.
 
-        A place that a query was not compared with gets the usual score, the median score of the compared places. With
-        0 instead, rivals would sink, and any place that is always compared would seem ahead. A trajectory has score 0
-        before the first place of the map. Matches exist for the places compared with the newest query: they keep its
-        step and rotation, and have the score of the sequence.
+        A place that was not compared gets the query's usual score, the median score of the compared places. With 0
+        instead, rivals would score too low, and a place that is always compared would seem better. Slots before the
+        first place of the map score 0. The returned ranking has the matches of the newest query, with the scores of the
+        sequence.
         """
         if self._broken(index, t_mono_s):
             self._rows.clear()
@@ -100,12 +101,12 @@ class SequenceSearch:
         return replace(ranking, slots=slots, scores=means[slots], compared=matches)
 
     def goes_on(self, near: Bools, min_score: float) -> bool:
-        """Tell whether the newest queries alone still agree with the sequence.
+        """Return True if the newest queries alone still agree with the sequence.
 
-        `near` bool (N,) is the neighbourhood of the sequence's best place. After a vehicle has left the mapped track,
-        or the map, the mean of the sequence stays high until enough old queries are gone. So the best place of the
-        last three queries together must be in `near`. And each of the last two must score in `near` at least
-        `min_score`, and so high that at most one neighbourhood in ten would reach it by chance.
+        `near` bool (N,) is True in the neighbourhood of the sequence's best place. After a vehicle has left the mapped
+        track, or the map, the mean score of the sequence stays high until enough old queries are dropped. So the best
+        place of the last three queries together must be in `near`. And for each of the last two, the best score in
+        `near` must be at least `min_score`, and so high that at most a tenth of all neighbourhoods would reach it.
         """
         newest = list(self._rows)[:_NEWEST]
         together = best_means(newest, [trajectory[:_NEWEST] for trajectory in self._trajectories])
@@ -113,13 +114,13 @@ class SequenceSearch:
             return False
         for row, usual in zip(newest[:_NEWEST_ALONE], self._usual, strict=False):
             seen = float(row[near[: len(row)]].max(initial=0))
-            # Places that were not compared have the usual score, which would pass a `min_score` of 0.
+            # The usual score, which places have that were not compared, would reach a `min_score` of 0.
             if seen <= usual or seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
                 return False
         return True
 
     def _broken(self, index: PlaceIndex, t_mono_s: float) -> bool:
-        """Tell whether this query cannot continue the sequence: too long since the last query, or another index."""
+        """Return True if this query cannot continue the sequence, because of a long pause or another index."""
         before_s, usual_s = self._t_last_s, self._interval_s
         self._t_last_s = t_mono_s
         if before_s is None:
@@ -134,11 +135,11 @@ class SequenceSearch:
 
 
 def trajectories(length: int, velocities: Floats) -> list[list[int]]:
-    """Return how many slots before the newest query each query of a trajectory was, newest first.
+    """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates.
 
-    Gives one list for each velocity (places a query); velocities with equal lists share one.
+    Each is a list that says how many slots before the newest query's slot each query was, newest first: [0, 1, 2, ...].
     """
-    # Halves go up, also where the product has a rounding error in its last bit.
+    # Round halves up, even if the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     unique: list[list[int]] = np.unique(back, axis=0).tolist()
     return unique
@@ -149,8 +150,8 @@ def _checksum(place_ids: Ints) -> int:
 
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
-    """Return the best mean score of the trajectories that end at each slot: rows float32 (up to N,), newest first ->
-    (N,). Older rows may be shorter, where the index has grown since.
+    """Return, for each slot, the best mean score of the trajectories that end there, float32 (N,). `rows` has the
+    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since.
     """
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:

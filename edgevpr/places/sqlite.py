@@ -1,4 +1,4 @@
-"""Opening and closing of a map file, and SQLite's errors turned into sentences for the user."""
+"""Opening and closing of a map file with SQLite, and the translation of its errors into sentences for the user."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -9,12 +9,12 @@ from edgevpr.core.errors import MapBusyError, MapError
 from edgevpr.places.geopackage import point_or_none
 from edgevpr.places.mapfiles import beside
 
-WAIT_S = 5.0  # for another program that is writing
-# A statement on a table of a million places takes a tenth of this. A view, or a table that refers to itself, may never
-# end.
+WAIT_S = 5.0  # longest wait for another program that is writing
+# Instructions of SQLite after which a statement is interrupted. A table of a million places takes a tenth of this; a
+# view, or a damaged table that refers to itself, may never end.
 _MOST_STEPS = 500_000_000
 
-# Words of SQLite, and what the user can do.
+# Words of SQLite's messages, and advice to the user.
 _ADVICE = (
     (("full",), "the disk is full: make room; every place confirmed so far is kept"),
     (("not a database",), "this is not a place map: give a .gpkg file made by `edgevpr map build`"),
@@ -31,8 +31,9 @@ _ANY_ADVICE = "SQLite says: {said}: check the disk and its free space"
 
 
 def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) -> sqlite3.Connection:
-    """Open a map file; `mode` is SQLite's: ro or rw, and `options` begin with "&". Raises sqlite3.Error."""
-    # Autocommit: transactions are begun by hand, so that nothing is ever half committed.
+    """Open a map file in SQLite's `mode`, ro or rw. `options` are appended to the URI, each with "&". `wait_s` seconds
+    is the longest wait for another program that is writing. Raises sqlite3.Error."""
+    # Autocommit: transactions are begun explicitly, so that nothing is ever half committed.
     db = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}{options}",
         uri=True,
@@ -43,7 +44,7 @@ def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) ->
     db.text_factory = _text
     db.set_progress_handler(lambda: 1, _MOST_STEPS)
     # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
-    # or GDAL may have added such an index. A damaged geometry is like an empty one: it is nowhere.
+    # or GDAL may have added such an index. A damaged geometry is treated as an empty one.
     db.create_function("ST_IsEmpty", 1, lambda geom: point_or_none(geom) is None)
     for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
         db.create_function(name, 1, lambda geom, axis=axis: (point_or_none(geom) or (None, None))[axis])
@@ -57,27 +58,28 @@ def start_log(db: sqlite3.Connection) -> None:
 
 
 def settle(db: sqlite3.Connection) -> None:
-    """Fold the write-ahead log into the file. The log stays where another program has the map open: no harm."""
+    """Merge the write-ahead log into the file and remove it. If another program has the map open, the log stays, which
+    does no harm."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
 
 
 def settle_left_log(path: Path) -> None:
-    """Recover a map that was not closed (its log is beside it), where the file and its folder may be written."""
+    """Merge the log of a map that was not closed into its file, if file and folder may be written."""
     if beside(path)[0].exists():
-        with suppress(sqlite3.Error):  # a read-only medium: `connect_to_read` reads both as they are, or says why not
+        with suppress(sqlite3.Error):  # read-only medium: `connect_to_read` reads file and log, or raises
             db = connect(path, "rw")
             settle(db)
             db.close()
 
 
 def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
-    """Open a map file for reading, also with a left-over log in a folder that may not be written.
+    """Open a map file for reading, even if a log was left beside it in a folder that may not be written.
 
-    SQLite keeps the index of a log in a file beside it. Where it cannot make that file, the index is kept in memory
-    instead. This needs the file for itself alone, and so locks that are not there: nobody writes to a read-only medium.
-    Raises sqlite3.Error.
+    SQLite keeps the index of a log in a file beside it. If it cannot create that file, the index is kept in memory. For
+    this SQLite wants exclusive access, so file locks are switched off: nobody writes to a read-only medium. Raises
+    sqlite3.Error.
     """
     db = connect(path, "ro", wait_s=wait_s)
     try:
@@ -93,17 +95,18 @@ def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
 
 
 def is_of_one_row(error: sqlite3.Error) -> bool:
-    """Tell whether an error may be that of one row, so that other rows can still be read: a damaged page, an unreadable
-    sector, or a value that is too large."""
+    """Return True if an error may concern one row only, so that other rows can still be read: a damaged page, an
+    unreadable sector, or a value that is too large."""
     return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
 
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn an error of SQLite into a MapError that says what the user can do, a MapBusyError where waiting helps."""
+    """Turn errors of SQLite in the body of `with` into a MapError that tells the user what to do; into a MapBusyError
+    if another program is writing."""
     try:
         yield
-    except UnicodeDecodeError as error:  # Python's, of a message of SQLite that quotes a damaged schema
+    except UnicodeDecodeError as error:  # raised by Python if SQLite's message quotes a damaged schema
         raise MapError(
             f"{path}: the file is damaged or no place map (its schema is no text): restore a copy or build it again."
         ) from error
@@ -118,7 +121,7 @@ def sentences(path: Path) -> Iterator[None]:
 
 
 def _text(raw: bytes) -> str | bytes:
-    """Return a text of the file. One that is not UTF-8 stays bytes, which no column of a place may hold."""
+    """Decode a text of the file. One that is not UTF-8 is returned as bytes, which the checks of `rows` refuse."""
     try:
         return raw.decode()
     except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""The choice of the places that are worth most, spread so that no wide gap is left."""
+"""The choice of the best places of a map when not all fit: of high quality, and without wide gaps between them."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 from edgevpr.core.arrays import Floats, Ints
 from edgevpr.core.geodesy import metres
 
-_BLOCK = 256  # places in a block; the least worth of each block is kept, so that the least of all is found quickly
+_BLOCK = 256  # places in a block; the least worth in each block is stored, to find the least of all quickly
 
 
 def best_places(
@@ -17,10 +17,11 @@ def best_places(
     capacity: int,
     numbers: Ints | None = None,
 ) -> Ints:
-    """Choose `capacity` of the places (N,), given in the order they were mapped; return their slots, in that order.
+    """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
 
-    `numbers` (N,) int, ascending, number all places that were ever mapped, also those dropped before (None: none were
-    dropped). For two places without a position, the numbers alone tell how far apart they are.
+    `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,). `numbers` int (N,), ascending, are the
+    numbers of the places, which count also places dropped before (None: none were dropped). The distance between two
+    places without a position is estimated from their numbers.
 
     Places are dropped one at a time, always the one of least worth. The worth of a place is its quality times the
     distance to the nearer of its two remaining neighbours along the track. So gaps stay small, and places of high
@@ -30,7 +31,7 @@ def best_places(
     if count <= capacity:
         return np.arange(count)
     east_m, north_m = metres(lat_deg, lon_deg)
-    # Where a position is unknown, the median distance of successive places is taken.
+    # If a position is unknown, the median distance of successive places is used instead.
     number = np.arange(count) if numbers is None else numbers
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m)) / np.diff(number)
     usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
@@ -46,9 +47,9 @@ def best_places(
         nearer_m = min(apart_m(before, at), apart_m(at, after))
         return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
 
-    # No lists, and few arrays: in flight this runs beside an index that has already taken its memory budget.
+    # No lists, and few arrays: in flight, the index has already taken the whole memory budget.
     before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
-    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # infinite also for dropped places
+    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # places that were dropped have infinite worth too
     for at in range(count):
         worths[at] = worth(at - 1, at, at + 1)
     blocks = worths.reshape(-1, _BLOCK)
