@@ -96,7 +96,7 @@ def profile(args: Namespace) -> int:
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
-    """Return three parts: the plan of the flight, from the flags;
+    """Return, from the flags: the plan of the flight;
     the name of the technique of --map (None: no map is given);
     the techniques to try, in all their forms."""
     from edgevpr import techniques

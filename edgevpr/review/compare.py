@@ -78,8 +78,9 @@ def _difference(key: tuple[Any, ...], fields: dict[str, tuple[Any, Any]], **wher
 
 
 def _keyed(lines: Iterable[Line]) -> Iterator[tuple[tuple[Any, ...], Line]]:
-    """Yield each line as (its key, the line). The key is its kind, time and query, and its number among the lines in
-    which these three are equal."""
+    """Yield for each line two parts: its key, which is its kind, time and query, and its number among the lines in
+    which these three are equal;
+    the line itself."""
     seen: Counter[tuple[Any, ...]] = Counter()
     for line in lines:
         name = line.get("kind"), line.get("t_mono_s") or 0.0, line.get("query")
@@ -196,7 +197,7 @@ def beside(then: Sequence[Line], now: Sequence[Line]) -> list[QueryPair]:
 
 
 def table(pairs: Sequence[QueryPair]) -> list[tuple[str, Any, Any]]:
-    """Return the rows of a summary, each as (label; value of the flight; value of the replay)."""
+    """Return the rows of a summary, each with three parts: a label; the value of the flight; that of the replay."""
     both = [[getattr(pair, side) for pair in pairs if getattr(pair, side)] for side in ("then", "now")]
     off_m = [[each.off_gps_m for each in seen if each.off_gps_m is not None] for seen in both]
     return [

@@ -254,7 +254,7 @@ def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
 
 def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
-    if that is unknown or not fresh."""
+    if it is unknown or its time is further than `_FRESH_S` from the frame's."""
     at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
     if at is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None

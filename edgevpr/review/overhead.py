@@ -158,7 +158,8 @@ class _View:
         return "M" + "L".join(f"{a:.0f} {b:.0f}" for a, b in zip(x, y, strict=True)) + "z"
 
     def ruler(self) -> tuple[float, float]:
-        """Return (a round length in metres, at most a quarter of the drawing's width; its share of that width)."""
+        """Return two parts: a round length in metres, at most a quarter of the drawing's width;
+        its share of that width, 0..1."""
         wide_m = _WIDE / self._scale
         power = 10.0 ** math.floor(math.log10(wide_m / 4))
         length_m = max(each * power for each in _ROUND if each * power <= wide_m / 4)

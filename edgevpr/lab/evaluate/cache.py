@@ -63,7 +63,7 @@ class Cache:
 
 
 def key_of(*parts: Any) -> str:
-    """Return the key of an entry that `parts`, any values that JSON can hold, decide: their SHA-256 in hex."""
+    """Return the key of an entry whose content depends on `parts`, any values for JSON: their SHA-256 in hex."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 

@@ -109,7 +109,8 @@ def read_truth(path: str | Path) -> GroundTruth:
 
 
 def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield each row of the CSV as (its file and line for messages, its values by column without outer spaces)."""
+    """Yield for each row of the CSV two parts: its file and line, for messages;
+    its values by column, without outer spaces."""
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
         columns = list(reader.fieldnames or ())

@@ -151,7 +151,9 @@ def make_map(
 
 @contextmanager
 def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Context manager: open the map file `path`. Gives (the map, open to read; an index with all its places)."""
+    """Context manager: open the map file `path`. Gives two parts:
+    the map, open to read;
+    an index with all its places."""
     with PlaceMap.open(path) as place_map:
         yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 

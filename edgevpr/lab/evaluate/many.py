@@ -166,7 +166,8 @@ def _open_set(name: str, plan: SetPlan, cache: Cache, progress: Progress[Any]) -
 
 
 def _rows_on_sets(plan: EvaluationPlan, sets: Iterable[OpenSet]) -> tuple[list[RowOnSet], Failures]:
-    """Return (the rows on sets that can be measured; why others cannot)."""
+    """Return two parts: the rows, on every set, that can be measured;
+    the reasons why others cannot."""
     rows, failed = [], {}
     techniques: dict[str, Technique] = {}
     for of in sets:

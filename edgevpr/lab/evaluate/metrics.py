@@ -62,8 +62,9 @@ def recall_at(k: int, ranks: np.ndarray) -> float:
 
 
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the curve with the threshold at every score that occurs, from the highest down. Returns (precision (2.1),
-    recall (2.2)), each float (points,).
+    """Compute the curve with the threshold at every score that occurs, from the highest down. Returns two parts:
+    precision (2.1), float (points,);
+    recall (2.2), float (points,).
 
     Queries with the same score are accepted together, so there is one point per distinct score. If no match at all is
     right, recall is taken to be 0.

@@ -125,7 +125,8 @@ def _named(
     references: Sequence[str] | None,
     queries: Sequence[str] | None,
 ) -> tuple[GroundTruth, Sequence[str]]:
-    """Return (`truth` with names in place of numbers; the names of the references in the order of the numbers)."""
+    """Return two parts: `truth` with names in place of numbers;
+    the names of all references, in the order of the numbers."""
     rows, columns = found.scores.shape
     queries = queries or _in_order(label, found.queries, "queries", "--query") or tuple(map(str, range(rows)))
     references = (

@@ -80,7 +80,8 @@ class VideoPictures:
 
 
 def without_position(folder: Path) -> tuple[int, int]:
-    """Return (the number of a video's frames without position; that of all frames). `folder` holds its pictures."""
+    """Return, from the folder of a video's pictures, two counts: frames that have no position, and so no picture;
+    all frames."""
     tags = read_positions(folder / _POSITIONS)
     return sum(tag.position is None for tag in tags.values()), len(tags)
 
