@@ -196,8 +196,8 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
     """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one.
-    `asked` and `known` are the points of the matches, complex (n,). Matches that follow a way more closely count
-    more."""
+    `asked` and `known` are the points of the matches, complex (n,). The closer a match follows a way, the more it
+    counts."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]

@@ -160,8 +160,7 @@ def model_of(stored: Mapping[str, Any]) -> Model:
 
 @lru_cache
 def prior(kind: str) -> Model:
-    """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is missing or
-    damaged."""
+    """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = shipped("models") / f"confidence_{kind}.json"
     try:
         return from_json(read_file(path, _MAX_FILE_BYTES).decode())

@@ -1,7 +1,7 @@
 """Evidence of a match: the figures that its confidence is computed from (see `confidence`), and map calibration.
 
 There are three kinds: for a camera that looks ahead (AHEAD), and for one that looks straight down, with landmarks
-(DOWN) or without (DOWN_BARE). A place *elsewhere* is farther than `neighbour_m` from the best place. Regions *agree* if
+(DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if
 they show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
 
 * agree: log of the share of regions that agree; ahead, of its geometric mean over query and place

@@ -1,6 +1,7 @@
 """Decides when a match is accepted as the place. No other code does, and a match that is not accepted has no position.
 
-A place *elsewhere* is farther than `neighbour_m` from the best place, and the *lead* is measured over the best of them.
+A place *elsewhere* is outside the neighbourhood of the best place (see `places.retrieve.elsewhere`). The *lead* of the
+best place is measured over the best of them.
 """
 
 import math

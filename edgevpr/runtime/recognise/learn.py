@@ -72,8 +72,7 @@ class Learner:
 
     @property
     def totals(self) -> dict[str, Any]:
-        """Numbers of places learnt and frames left out, and the error that stopped learning (None: no error), as a
-        dict."""
+        """Numbers of places learnt and frames left out, and the error that stopped learning (None: none), as a dict."""
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:

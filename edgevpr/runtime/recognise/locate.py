@@ -1,5 +1,4 @@
-"""Computes the position of the aircraft, with a covariance, from the places that were recognised. The recogniser uses
-it.
+"""Computes the position of the aircraft, with a covariance, from the recognised places. The recogniser uses it.
 
 A match gives the shift between the middles of the pictures of query and place. If the `Pose` of the place is known (how
 its picture lies on the ground), the shift gives a position. Several places that show the same ground must give about
@@ -146,9 +145,8 @@ def in_sd(step: Doubles, covariance: Doubles) -> float:
 
 
 def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
-    """Return position and pose of a new place, combined from its position `recorded`, with the standard deviation of
-    one axis, and its position by the places around it, `where`. None if both contradict each other or `where` has no
-    heading."""
+    """Return position and pose of a new place, combined from its position `recorded`, with a standard deviation of one
+    axis, and that by the places around it, `where`. None if both contradict each other or `where` has no heading."""
     off_m = _off_m(recorded, where.position)
     by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
@@ -167,8 +165,7 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Combine positions by several places. Returns east and north of the best place (2,), metres, and the
-    covariance."""
+    """Combine positions by several places. Returns `at_m` (2,) as in `_Said`, and its covariance (2, 2)."""
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:

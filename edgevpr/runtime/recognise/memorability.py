@@ -1,8 +1,8 @@
-"""Memorability: how well the parts of a frame can be remembered, by a network with a card (thesis 3.2.1).
+"""Memorability, for the gate: how well parts of a frame can be remembered, by a network with a card (thesis 3.2.1).
 
-The picture is cut into 5x5 crops that do not overlap. The network says of each how memorable it is, 0..1; between the
-middles of the crops the map is interpolated. `benchmarks/matchability.py` fits a network that says how likely such a
-part is to be found again.
+The picture is cut into 5x5 crops that do not overlap. For each crop the network gives its memorability, 0..1. Between
+the middles of the crops values are interpolated. `benchmarks/matchability.py` fits a network of another meaning: how
+likely a crop is to be found again in another picture.
 """
 
 import cv2
@@ -13,13 +13,13 @@ from edgevpr.core.errors import ModelError
 from edgevpr.techniques.card import Card, InputRule
 from edgevpr.techniques.session import open_session, prepare, run_outputs
 
-CROPS = 5  # a side: C = 5x5 of the thesis
+CROPS = 5  # along each side; the thesis's C is 5x5
 _SEED = 7
 
 
 class Memorability:
-    """The network of memorability of a card, which has run successfully. Raises ModelError, one sentence, for a card
-    without memorability and for whatever keeps it from flying."""
+    """The network of memorability that a card describes; the constructor runs it once as a test. Raises ModelError, in
+    one sentence, for a card without memorability and for anything that makes the network unusable."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.outputs.memorability is None:
@@ -30,7 +30,7 @@ class Memorability:
         self.matrix(np.random.default_rng(_SEED).integers(0, 256, (480, 640, 3), np.uint8))
 
     def matrix(self, image: Image) -> Singles:
-        """Compute M of thesis 3.2.1 for uint8 (H, W[, 3]): the memorability of each crop, float32 (5, 5) in 0..1.
+        """Compute the memorability of each crop of uint8 (H, W[, 3]): float32 (5, 5) in 0..1, the M of thesis 3.2.1.
 
         Raises ModelError for numbers that are not finite, or are outside 0..1.
         """
@@ -47,12 +47,12 @@ class Memorability:
 
 
 def prepared_crops(image: Image, rule: InputRule) -> Singles:
-    """Cut uint8 (H, W[, 3]), 5 pixels a side at least, into its crops, row by row, each prepared for a network: float32
-    (25, C, height, width), or (25, height, width, C) for NHWC."""
+    """Cut uint8 (H, W[, 3]), at least 5 pixels along each side, into crops, row by row, and prepare them for a network:
+    float32 (25, C, height, width), or (25, height, width, C) for an input in the order NHWC."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
     return np.concatenate([prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns])
 
 
 def as_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:
-    """Interpolate the matrix of the crops to (height, width) pixels, bilinearly: float32."""
+    """Interpolate the memorability of the crops, float32 (5, 5), bilinearly to float32 `size_px` (height, width)."""
     return np.asarray(cv2.resize(matrix, size_px[::-1], interpolation=cv2.INTER_LINEAR), np.float32)

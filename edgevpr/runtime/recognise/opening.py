@@ -1,4 +1,5 @@
-"""Opening: makes a recogniser of a map, the technique that it was made with, and its index in RAM."""
+"""Makes a recogniser from a map, the technique it was made with, and its index in RAM, for all programs that
+recognise."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -30,7 +31,7 @@ from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recognise
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
 from edgevpr.techniques.card import load_card
 
-_WAIT_S = 0.05  # in flight, for another program that writes to the map: the next query is better than a late one
+_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
 _log = logging.getLogger(__name__)
 Settings = Mapping[str, int | float | str]  # parameters of a technique, by their names
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
@@ -47,8 +48,8 @@ def open_recogniser(
     """Open the map, make its technique for the board, and load the index.
 
     With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map.
-    With `follows`, queries are those of one flight, in order (see `follow`).
-    Raises an EdgevprError that says what does not go together, such as `settings` of the technique that the map was not
+    With `follows`, the queries are those of one flight, in order (see `follow`). `settings` are parameters of the
+    technique. Raises an EdgevprError that names what does not fit together, such as a setting that the map was not
     built with.
     """
     if config.map is None:
@@ -61,11 +62,12 @@ def open_recogniser(
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
-    """Open a map that places can be added to; return a flight's recogniser, as `open_recogniser`, and the index that
-    takes the new places.
+    """Open a map for adding places. Returns
 
-    Where there is no map, an empty one is made for `new_technique`. The memory that the budget leaves is the room for
-    new places.
+    * a recogniser for a flight, as `open_recogniser` does,
+    * the index that takes new places, up to the memory budget.
+
+    If there is no map, an empty one is made for the technique `new_technique` (None: none is made).
     """
     if config.map is None:
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
@@ -91,25 +93,25 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
 
 
 def has_map(path: Path) -> bool:
-    """Tell whether there is a map file at `path`, or anything else that is not empty."""
+    """Return True if there is a file at `path` that is not empty."""
     return path.exists() and path.stat().st_size > 0
 
 
 def budget_mb(config: Config, board: Board) -> float:
-    """Return how much RAM the index may take, MB: the configuration's figure, else the board's."""
+    """Return the RAM that the index may take, MB: the configuration's value, else the board's."""
     return config.memory.budget_mb or board.budget_mb
 
 
 def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
-    """Make the gate of salience where the configuration asks for one. Raises as `gate_with`."""
+    """Make the salience gate if the configuration asks for one, else return None. Raises as `gate_with`."""
     return gate_with(config, threads) if config.use else None
 
 
 def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
-    """Make a gate of salience, and say which criteria are off for want of a network.
+    """Make a salience gate. A criterion whose network is not named is off, with a warning.
 
-    Raises ConfigError for thresholds that nothing can reach, or of which none is above 0, and ModelError for a network
-    that cannot be used.
+    Raises ConfigError if no picture can reach a threshold or every criterion is off, ModelError for an unusable
+    network.
     """
     if config.entropy > MOST_ENTROPY:
         raise ConfigError(
@@ -138,17 +140,17 @@ def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
 
 
 def meter_of(config: Config, board: Board) -> QueryMeter:
-    """Make the meter of queries on a board that is fed by the configured pack."""
+    """Make the meter that measures time and energy of queries, on a board fed by the configured battery pack."""
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 
 def made_for(board: Board | None, name: str, settings: Settings | None = None) -> Technique:
-    """Make the technique `name`; a network gets as many threads as the board spares for it (None: one)."""
+    """Make the technique `name`; its network gets as many threads as the board allows (no board: one)."""
     return made_with(board.threads if board else None, name, settings)
 
 
 def made_with(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
-    """Make the technique `name`; a network gets `threads` (None: one), unless `settings` say how many."""
+    """Make the technique `name`; its network gets `threads` (None: one) unless `settings` give a number."""
     own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
 
@@ -158,8 +160,8 @@ def technique_of(
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
 
-    Raises MapError where `name` or `settings` ask for another technique, UsageError for a setting that it does not
-    have, and ModelError for a network that cannot be used.
+    Raises MapError if `name` or `settings` belong to another technique, UsageError for a setting that it does not have,
+    and ModelError for an unusable network.
     """
     built_with = place_map.spec
     if not techniques.is_known(built_with.name):
@@ -184,7 +186,7 @@ def technique_of(
 
 
 def _matcher(config: Config, technique: Technique, place_map: PlaceMap | None, index: PlaceIndex) -> Matcher:
-    """Return what frames are recognised with; the calibration of a `place_map` counts (None: no map's does)."""
+    """Return all that frames are recognised with. The calibration of `place_map` is used (None: the shipped one)."""
     length = length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, config.match, length, calibration_of(place_map) if place_map else None)
     return Matcher(technique, index, rule, search_of(length))
@@ -226,8 +228,8 @@ def _recogniser(
 
 
 def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
-    """Warn where the places of a map were made with another mask than `mask`. They can be used all the same: a display
-    in them is ground that nobody sees."""
+    """Warn if the places of a map were made with another mask than `mask`. They remain usable: a display in them is
+    just ground that is never seen."""
     built_with = place_map.mask_sha256
     if len(place_map) and built_with != mask.sha256:
         how = "without a mask" if built_with is None else "with another mask"
@@ -244,8 +246,7 @@ def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
 
 
 def _make_map(path: Path, technique: Technique, mask: AnyMask) -> None:
-    """Make an empty map that is there completely or not at all: a service killed at power-on must be able to start
-    again."""
+    """Make an empty map, completely or not at all, so that a service killed at power-on can start again."""
     unfinished = path.with_name(path.name + ".new")
     remove(unfinished)
     with PlaceMap.create(unfinished, technique.spec) as place_map:
@@ -254,6 +255,7 @@ def _make_map(path: Path, technique: Technique, mask: AnyMask) -> None:
 
 
 def _wanted(config: Config) -> dict[str, str]:
+    """Return the parameters of the technique that the configuration sets."""
     wanted = {"camera": config.source.camera, "matching": config.match.matching, "form": config.match.form}
     return {key: value for key, value in wanted.items() if value}
 

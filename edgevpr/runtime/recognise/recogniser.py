@@ -1,6 +1,7 @@
 """The steps of one frame, written once: for a flight, `match`, `eval`, the probe, and while a map is made.
 
-No link, flight log, thread or clock is inside: what is handed in with a frame decides the result.
+There is no link, flight log, thread or clock in here: the result depends only on what is passed in. A *look* is one
+search of the map for the query of a frame. A query may take several looks, at different heights.
 """
 
 import logging
@@ -38,14 +39,14 @@ from edgevpr.runtime.recognise.salience_gate import Gate, Worth
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 
 _log = logging.getLogger(__name__)
-_OF_CANDIDATES = 0.4  # are compared from each height but the first
+_OF_CANDIDATES = 0.4  # share of the candidates that is compared at each height but the first
 
 
 @dataclass(frozen=True, slots=True)
 class Matcher:
-    """All that a frame is recognised with: a technique, the index that it has packed, the rule by which its matches are
-    accepted, and the search over sequences of queries (None: each query is ranked alone). They go together: another
-    form of the same vectors has other scores, and so other limits."""
+    """All that a frame is recognised with: a technique, the index made with it, the rule for accepting its matches, and
+    the search over sequences of queries (None: each query is ranked alone). They belong together: another form of the
+    vectors in RAM gives other scores, and so needs other limits."""
 
     technique: Technique
     index: PlaceIndex
@@ -55,15 +56,15 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """Preparation of a frame before it is encoded: `levelling` lays it on the ground (None: it is taken as it is),
-    `mask` leaves parts of it out, and `gate` refuses it where it is not memorable (None: all are)."""
+    """Preparation of a frame before it is encoded. `levelling` levels its picture (None: it is used as it is), `mask`
+    excludes parts of it (None: no part), and `gate` rejects frames that are not memorable (None: no frame)."""
 
     levelling: AnyLevelling | None = None
     mask: AnyMask | None = None
     gate: Gate | None = None
 
     def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
-        """Return the picture of a frame as it is encoded."""
+        """Return the levelled picture of a frame, with its mask and view."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         return (
             self.levelling.prepare(frame, vehicle, mask)
@@ -74,9 +75,8 @@ class Preparation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkSettings:
-    """`candidates` places are compared (None: all in full, see `places.retrieve.compare`). With `verify` the best place
-    is held against its landmarks, where the map has some. No position is said to be more exact than
-    `min_accuracy_m`."""
+    """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
+    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
 
     candidates: int | None = None
     verify: bool = True
@@ -85,9 +85,9 @@ class WalkSettings:
 
 @dataclass(slots=True, kw_only=True)
 class _Walk:
-    """State of one frame on its walk; None for what it has not reached. `nothing` is the reason why its picture says
-    too little, and `objection` that or why it is not memorable. `findings`, `best` and `followed` are those of the last
-    look that was judged."""
+    """State of one frame on its way through the steps; None for what is not reached yet. `nothing` is the reason why
+    its picture shows too little, `objection` that one or why it is not memorable. `findings`, `best` and `followed`
+    belong to the last look that was judged."""
 
     frame: Frame
     vehicle: Vehicle | None
@@ -105,8 +105,8 @@ class _Walk:
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `prior` narrows each query; without it each is searched over the whole map. `follower` follows the flight from query
-    to query. The governor changes `candidates`, and the learner the index (`take`, `extend`).
+    `prior` makes hints that narrow each query (None: the whole map is searched). `follower` follows the flight from
+    query to query (None: each is judged alone). The governor changes `candidates`; `take` and `extend` the index.
     """
 
     def __init__(
@@ -123,15 +123,15 @@ class Recogniser:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
         self._settings, self._preparation = settings, preparation or Preparation()
         self._prior, self._follower = prior, follower
-        self._told = 0  # number of places left out that an event has told of
-        self._new: deque[tuple[int, float]] = deque()  # place id, and the time it was learnt at
+        self._told = 0  # number of left out places that events have reported
+        self._new: deque[tuple[int, float]] = deque()  # number of a place, and the time it was learnt
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
-        """Recognise with another matcher from the next frame on."""
+        """Use another matcher from the next frame on."""
         self.technique, self.index = matcher.technique, matcher.index
         self.rule, self.search = matcher.rule, matcher.search
-        # 1-sigma accuracy of a place as a fix: such a match cannot tell where between two places the aircraft is.
+        # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
         self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
 
     @property
@@ -140,19 +140,19 @@ class Recogniser:
         return self.search.length if self.search else 1
 
     def accept_with(self, precision: float) -> None:
-        """Accept matches with this precision from the next frame on. A rule that goes by limits stays as it is."""
+        """Set the precision of accepted matches from the next frame on. A rule without confidence is not changed."""
         if self.rule.sure:
             self.rule = replace(self.rule, sure=replace(self.rule.sure, precision=precision))
 
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
-        """Recognise in an index that has one place more, learnt from the frame taken at `t_mono_s`."""
+        """Use an index that has one more place, `place_id`, learnt from the frame taken at `t_mono_s`."""
         self._new.append((place_id, t_mono_s))
         self.take(Matcher(self.technique, index, self.rule, self.search))
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
-        """Recognise one frame; `vehicle` is the autopilot's report at that moment.
+        """Recognise one frame; `vehicle` is the autopilot's report at that moment (None: no report).
 
-        Never raises an Exception: an error of a frame, a place or the technique becomes a refusal with its reason.
+        Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason.
         """
         self.meter.begin()
         walk, failure = _Walk(frame=frame, vehicle=vehicle), None
@@ -165,7 +165,7 @@ class Recogniser:
         return self._event(walk, verdict, failure)
 
     def _encode(self, walk: _Walk) -> tuple[Levelled, Descriptor]:
-        """Prepare the picture of a frame, look at its worth, and encode it."""
+        """Prepare the picture of a frame, judge its worth by the gate, and encode it."""
         frame, gate = walk.frame, self._preparation.gate
         with self.meter.step("prepare"):
             walk.picture = picture = self._preparation.picture(frame, walk.vehicle)
@@ -176,7 +176,7 @@ class Recogniser:
         return picture, descriptor
 
     def _recognise(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> Verdict:
-        """Search the map for a frame that is encoded, and judge what is found."""
+        """Search the map for an encoded frame, and judge the result."""
         follower = self._follower
         walk.nothing = says_nothing(descriptor, self.rule.min_quality)
         walk.objection = walk.nothing or (walk.worth.reason if walk.worth else None)
@@ -184,7 +184,7 @@ class Recogniser:
             follower.went_on(walk.frame, walk.vehicle)
         if not len(self.index):
             return Verdict(False, "the map has no place yet")
-        if walk.objection and self.search is None:  # in a sequence it is searched for, to keep the others in step
+        if walk.objection and self.search is None:  # a sequence needs every query
             if follower:
                 follower.saw_nothing(self.index)
             return Verdict(False, walk.objection)
@@ -198,7 +198,8 @@ class Recogniser:
         return verdict
 
     def _found(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> tuple[Verdict, Candidate]:
-        """Look for a query as it is expected and, where nothing is accepted, from all other heights as well."""
+        """Search for a query as expected and, if nothing is accepted, at all other heights as well. Returns the verdict
+        and the best place."""
         frame, prior, spec, search = walk.frame, self._prior, self.technique.spec, self.search
         height_ratio = prior.height_ratio if prior else 1.0
         if prior:
@@ -214,14 +215,13 @@ class Recogniser:
         if verdict.accepted or search or not others or (prior and not prior.looks_again):
             return verdict, best
         for ratio in others:
-            # What spoke against the first look counts in the others as well.
+            # Matches of all looks are judged together: whatever resembles the query in one look speaks against the others.
             look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
             ranking = together(ranking, look)
         return self._judged(walk, ranking, looked)
 
     def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
-        """Search the map for a query, with a `part` of the candidates. Raises MapError and PlaceError as `compare`
-        does."""
+        """Search the map once for a query, with the share `part` of the candidates. Raises as `compare` does."""
         technique, place_map, index = self.technique, self.place_map, self.index
         query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
         with self.meter.step("scan"):
@@ -234,8 +234,8 @@ class Recogniser:
     def _judged(
         self, walk: _Walk, ranking: Ranking, looked: Verification, followed: Followed | None = None
     ) -> tuple[Verdict, Candidate]:
-        """Judge the best place of a ranking, with its landmarks, what the places beside it say, and the flight so far:
-        that may know better which place is the best (`followed`: it has been asked)."""
+        """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
+        flight makes another place more likely, judge that one (`followed`: the flight's result is known already)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
@@ -306,8 +306,8 @@ class Recogniser:
         )
 
     def landmarks(self, event: Recognition) -> bytes | None:
-        """Return what a map keeps of the landmarks of a frame that becomes a place, None for a technique that does not
-        look straight down."""
+        """Return the landmarks to store for a frame that becomes a place; None if the technique does not look straight
+        down."""
         return landmarks_of(self.technique, event.picture) if event.picture else None
 
     def unread(self, error: Exception) -> Recognition:
@@ -318,19 +318,21 @@ class Recogniser:
         )
 
     def _newly_left_out(self) -> tuple[tuple[int, str], ...]:
+        """Return number and problem of the places left out since the last event."""
         left_out = self.place_map.left_out
         newly = tuple(islice(left_out.items(), self._told, None))
         self._told = len(left_out)
         return newly
 
     def _is_new(self, place_id: int, t_mono_s: float) -> bool:
+        """Return True if a place was learnt within the last `NEW_FOR_S` seconds before `t_mono_s`."""
         while self._new and t_mono_s - self._new[0][1] > NEW_FOR_S:
             self._new.popleft()
         return any(place_id == new for new, _ in self._new)
 
 
 def _sentence(error: Exception) -> str:
-    """Return the error as a sentence. An error that is not edgevpr's own is a fault of a technique or of a library."""
+    """Return an error as a sentence. An error that is not edgevpr's own is a fault of a technique or of a library."""
     if isinstance(error, EdgevprError):
         return str(error)
     return f"an unforeseen {type(error).__name__} ({error}): report it, with the output of --debug"

@@ -1,4 +1,4 @@
-"""The event of one frame: everything that happened to it, in one value."""
+"""The event of one frame: everything that happened to it, in one value. Made by the recogniser, written to the log."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,25 +19,24 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
-    """Result of one frame.
+    """Result of one frame. A field is None if its step was not reached.
 
-    The inputs are `frame` and `vehicle`, the autopilot's report when the frame was taken (None: no report). `picture`
-    is the picture that was encoded, and how it lies on the ground, `worth` what the gate says of the frame (None: no
-    gate looks), `descriptor` the encoded frame, `hints` what narrowed the search, `ranking` the places found and `best`
-    the first of them; each is None where its step was not reached. `proof` is how the landmarks of frame and place
-    agree (None: they were not held against each other), `evidence` what the match offers (see `evidence`), and
-    `confidence` the probability that it is right by that (None: the technique is judged by limits). `accepted` tells
-    whether `best` is taken for the place, and `reason` why (not), in a few words. `located` is where the aircraft is by
-    that, and `accuracy_m` the 1-sigma to send with it; both are set for an accepted match of a place with a position
-    only: any other carries no position. `says_nothing` tells whether the picture holds too little to be recognised; a
-    place was then searched for only to go on with a sequence.
-
-    `failed` tells whether the frame, a place or the technique could not be used, and `map_lost` whether that is because
-    the map as a whole cannot be read. `left_out` are the places that have been left out since the last event because
-    they cannot be read: the number of each, and what is wrong with it.
-
-    `steps` and `cost` are what the frame took. `fix` tells what became of the position, and `last_fix` the same of the
-    one sent before it. The channel to the autopilot fills them in; they are None where there was nothing to send.
+    * `frame`, and `vehicle`, the autopilot's report when the frame was taken (None: no report)
+    * `picture`: the picture that was encoded, and how it lies on the ground; `descriptor`: the encoded picture
+    * `worth`: the judgement of the salience gate (None: no gate)
+    * `hints`, which narrowed the search; `ranking`, the places found; `best`, the first of them
+    * `proof`: the agreement of the landmarks (None: not compared)
+    * `evidence` of the match (see `evidence`), and `confidence`, the probability by that evidence that the match is
+      right (None: the technique is judged by limits); `followed`: the result with the flight so far
+    * `accepted`: is `best` taken for the place? `reason`: why or why not, in a few words
+    * `says_nothing`: the picture shows too little to be recognised; a search was only made to continue a sequence
+    * `failed`: the frame, a place or the technique was unusable; `map_lost`: the whole map cannot be read
+    * `left_out`: unreadable places that are left out since the last event: number, and what is wrong
+    * `located`: the position of the aircraft; `accuracy_m`: the 1-sigma to send with it. Both are set only if the match
+      is accepted and the place has a position
+    * `steps` and `cost`: the time and energy that the frame took
+    * `fix`: what became of the position; `last_fix`: what became of the one sent before. The channel to the autopilot
+      sets both (None: nothing was sent)
     """
 
     frame: Frame | None
@@ -67,33 +66,32 @@ class Recognition:
 
     @property
     def view(self) -> View:
-        """The way in which the picture lies on the ground."""
+        """The way in which the picture lies on the ground; `UNKNOWN_VIEW` without a picture."""
         return self.picture.view if self.picture else UNKNOWN_VIEW
 
     @property
     def position(self) -> Position | None:
-        """Position of the aircraft, of an accepted match only."""
+        """Position of the aircraft; None unless the match was accepted and the place has a position."""
         return self.located.position if self.located else None
 
     @property
     def name(self) -> str:
-        """Name of the frame, "" where there is none."""
+        """Name of the frame, "" if there is none."""
         return self.frame.name if self.frame else ""
 
     @property
     def is_query(self) -> bool:
-        """True where the frame became a query: it could be read and encoded."""
+        """True if the frame became a query: it could be read and encoded."""
         return self.descriptor is not None
 
 
 def fields_of(event: Recognition) -> dict[str, Any]:
-    """Return the event as the flight log (kind "query") and `edgevpr match --json` have it.
+    """Return the event as a dict for the flight log (kind "query") and for `edgevpr match --json`.
 
-    The fields are: query, place (id), reference_image, score, position (of the place), the match's step, its covariance
-    and the rotation (all null where no place was found), accepted, reason, accuracy_m, located (where the aircraft is;
-    null where nothing was accepted), costs; where a gate looks, salience; where landmarks were held against each other,
-    landmarks; where the technique has one, the confidence and the evidence that it is made from; and, where anything is
-    known of how the picture lies on the ground, view.
+    Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
+    of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
+    if nothing was accepted), costs. Only if known: view (how the picture lies on the ground), salience, landmarks,
+    confidence, evidence, followed.
     """
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,

@@ -1,12 +1,11 @@
-"""The gate: keeps the frames that are memorable, static and full of information (thesis 3.2.4).
+"""The salience gate: lets through the frames that are memorable, static and full of information (thesis 3.2.4).
 
-The threshold of entropy is meant for the light of day. In a night or a fog all frames have less, and the best of them
-are as good a choice as ever. So a frame lacks entropy only if it has less than the threshold *and* less than is usual
-in this light (the thesis's threshold is constant). What is usual is told by the upper half of the frames before: a
-long stretch of sky or water changes the other half, and is no change of light. Before so much is known, half of the
-threshold is enough.
+The threshold of entropy is meant for daylight. At night or in fog all frames have less, yet the best of them are still
+worth keeping. So a frame lacks entropy only if it has less than the threshold *and* less than is usual in the present
+light (the thesis's threshold is constant). The usual entropy is estimated from the upper half of the frames before: a
+long stretch of sky or water changes only the lower half. Until enough frames are known, half of the threshold suffices.
 
-Where none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
+If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
 """
 
 from collections import deque
@@ -22,22 +21,22 @@ from edgevpr.runtime.recognise.detector import Detector
 from edgevpr.runtime.recognise.memorability import Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
 
-MOST_ENTROPY = float(np.log2(81) / 8)  # of a disc of 81 pixels: as many intensities at most
+MOST_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
 GAP_FRAMES = 20
 STEP = 0.03
 _TO_KNOW, _REMEMBERED = 8, 100  # frames
-# As far below the 75th percentile of a normal distribution as so many steps to the 90th, there are a tenth of all.
+# A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
 _STEPS_BELOW = 3.2
 _LEAST_STEP = 0.005
-# Of the longer side on which entropy is computed: a larger copy costs more and says the same.
+# Longer side of the copy on which entropy is computed: a larger one costs more and gives the same.
 _LONGEST_PX = 320
-_WIDTH_PX, _CAPTION_PX, _WEIGHT = 480, 34, 0.55  # of a panel that is drawn, and of the colours over the picture
+_WIDTH_PX, _CAPTION_PX, _WEIGHT = 480, 34, 0.55  # sizes of a drawn panel; weight of its colours
 
 
 @dataclass(frozen=True, slots=True)
 class Maps:
-    """`memorability` float32 in 0..1, `is_static` bool, `entropy` float32 in 0..1 (bits over 8): (H, W) each, of one
-    size; None for what is not looked at."""
+    """Maps of one picture, (H, W) each: `memorability` float32 in 0..1 and `is_static` bool (None: not computed), and
+    `entropy` float32 in 0..1 (bits over 8)."""
 
     memorability: Singles | None
     is_static: Mask | None
@@ -46,7 +45,8 @@ class Maps:
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Least MS, SS and ES of a frame that is kept, each 0..1; 0: the criterion is off."""
+    """Least mean memorability, staticity and entropy (MS, SS, ES of the thesis) of a frame to keep, each 0..1; 0:
+    off."""
 
     memorability: float = 0.0
     staticity: float = 0.0
@@ -55,8 +55,8 @@ class Thresholds:
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """Judgement of a frame: its scores, how far the worst of them is below its threshold (0: it passes), which one that
-    is and a sentence about it (None: the frame passes)."""
+    """Judgement of a frame. `salience` has its scores. `short_by` is how far the worst score is below its threshold (0:
+    the frame passes), `lacks` its name, and `reason` a sentence about it (both None: the frame passes)."""
 
     salience: Salience
     short_by: float = 0.0
@@ -65,11 +65,10 @@ class Worth:
 
 
 class Gate:
-    """Looks at one frame of a flight after the other.
+    """Judges the frames of a flight, one after the other.
 
-    `memorability` and `detector` are None where their criterion is off. The detector looks at every k-th frame only
-    (`detect_every`), and what it has found holds until the next; `footprint_m` is the width of the ground in a frame
-    (see `Detector`).
+    `memorability` and `detector` are None if their criterion is off. The detector runs on every k-th frame only (k =
+    `detect_every`), and its result is used until the next. `footprint_m` is as in `Detector.is_static`.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class Gate:
         self._static: Mask | None = None
 
     def look(self, image: Image) -> Worth:
-        """Tell what a frame, uint8 (H, W[, 3]), is worth. Raises ModelError for a network that cannot be used."""
+        """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
         return self.worth(self.maps(image))
 
     def maps(self, image: Image) -> Maps:
@@ -96,15 +95,15 @@ class Gate:
         return maps_of(image, self._memorability, self._is_static(image))
 
     def worth(self, maps: Maps) -> Worth:
-        """Tell what the frame of these maps is worth."""
+        """Judge the frame that has these maps."""
         scores = scores_of(maps)
         self._entropies.append(scores.entropy or 0.0)
         usual = usual_entropy(self._entropies)
-        # The first frames of a flight at night: their light is not known yet, and a picture of nothing has none at all.
+        # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
         return worth_of(scores, self.thresholds, self.thresholds.entropy / 2 if usual is None else usual)
 
     def forget(self) -> None:
-        """Begin another flight: nothing is known of its light, nor of what moves there."""
+        """Prepare for another flight: forget the usual entropy and the last result of the detector."""
         self._entropies.clear()
         self._until_detection, self._static = 0, None
 
@@ -119,8 +118,8 @@ class Gate:
 
 
 def usual_entropy(entropies: Iterable[float]) -> float | None:
-    """Return the least entropy that is usual among these frames: a tenth have less, where they are alike. None: of
-    fewer than 8 nothing is known."""
+    """Return the least usual entropy of these frames: a tenth of similar frames have less. None: fewer than 8 are
+    known."""
     entropies = list(entropies)
     if len(entropies) < _TO_KNOW:
         return None
@@ -129,8 +128,8 @@ def usual_entropy(entropies: Iterable[float]) -> float | None:
 
 
 def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> Worth:
-    """Hold the scores of a frame against the thresholds. Entropy need not be above what is `usual` in this light. A
-    score that was not looked at is not asked for."""
+    """Compare the scores of a frame with the thresholds; entropy only needs to reach `usual` if that is lower. A score
+    that is None is not compared."""
     least = {
         "memorability": thresholds.memorability,
         "staticity": thresholds.staticity,
@@ -146,15 +145,16 @@ def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> 
 
 
 def best_of(shortfalls: list[float]) -> list[bool]:
-    """Lower all thresholds in steps of 0.03 until some of these frames pass; tell which do then."""
+    """Lower all thresholds in steps of 0.03 until some of these frames pass. Returns for each frame whether it passes
+    then; `shortfalls` are their `Worth.short_by`."""
     steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
     return [bool(step == steps.min()) for step in steps]
 
 
 def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | None) -> Maps:
-    """Compute the maps of uint8 (H, W[, 3]), the longer side of each 320 pixels at most.
+    """Compute the maps of uint8 (H, W[, 3]); their longer side has 320 pixels at most.
 
-    `is_static` bool (H, W) is what a detector says of the picture (None: there is none). Raises ModelError.
+    `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
     """
     grey = _small_grey(image)
     if is_static is not None:
@@ -168,8 +168,8 @@ def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | N
 
 
 def scores_of(maps: Maps) -> Salience:
-    """Average the maps over the whole picture. What is not static counts as 0 in the other two, because less is known
-    of such a picture."""
+    """Average each map over the picture. Pixels that are not static count as 0 in the other two maps, because less is
+    known of such a picture."""
     static = 1.0 if maps.is_static is None else maps.is_static
     return Salience(
         memorability=None if maps.memorability is None else float((maps.memorability * static).mean()),
@@ -179,6 +179,7 @@ def scores_of(maps: Maps) -> Salience:
 
 
 def _small_grey(image: Image) -> Image:
+    """Return the picture as uint8 grey, its longer side scaled down to 320 pixels if it is longer."""
     shrink = _LONGEST_PX / max(image.shape[:2])
     if shrink < 1:
         size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
@@ -187,7 +188,7 @@ def _small_grey(image: Image) -> Image:
 
 
 def drawn_as_png(image: Image, maps: Maps, salience: Salience) -> bytes:
-    """Draw a picture and its three maps over it, two by two, as a PNG file. Blue is little, red is much."""
+    """Draw a picture, and its three maps over it, as four panels in a PNG file. Blue is low, red is high."""
     size = _WIDTH_PX, round(_WIDTH_PX * image.shape[0] / image.shape[1])
     colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     ground = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,6 +1,6 @@
-"""Verification: a second look at the best place, by landmarks that have no part in how it was found.
+"""Verification: checks the best place by landmarks, which had no part in finding it. The recogniser uses it.
 
-It is for cameras that look straight down: ahead, near and far landmarks move by different steps.
+It is for cameras that look straight down only: ahead, near and far landmarks shift by different amounts.
 """
 
 from collections.abc import Collection
@@ -17,17 +17,16 @@ from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement, Overlay, agreement, held_against, onto
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
 
-_MAY_BE_THE_SAME = 12  # places; on kite_ochota, which has no positions, as many as overlap
+_MAY_BE_THE_SAME = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 
 
 def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
-    """Return the landmarks that a map keeps of a picture; None for a technique that does not look straight down."""
+    """Return the landmarks of a picture as a map stores them; None for a technique that does not look straight down."""
     return packed(describe(picture.image, picture.mask, OF_PLACE)) if technique.spec.cells else None
 
 
 class Verification:
-    """Landmarks of one query, held against those of places. They are found when a place is first asked for that has
-    some."""
+    """Compares the landmarks of one query with those of places. They are computed when first needed."""
 
     def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._spec, self.picture = spec, picture
@@ -35,18 +34,18 @@ class Verification:
         self._query: Landmarks | None = None
 
     def proof(self, ranking: Ranking) -> Agreement | None:
-        """Hold the landmarks of the query against those of the best place, as its match says that it lies. None where
-        there is nothing to hold: the place has no landmarks, or its match no step or rotation.
+        """Compare the landmarks of the query with those of the best place, expected as its match says. None if they
+        cannot be compared: the place has no landmarks, or its match no shift or rotation.
 
-        Raises PlaceError where the landmarks of the place cannot be read; the place is then left out.
+        Raises PlaceError if the landmarks of the place cannot be read; the place is then left out.
         """
         expected, known = self._place(ranking, int(ranking.slots[0]))
         return held_against(self._of_query(), known, expected) if expected and known is not None else None
 
     def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
-        """Return how many landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) agree, as its own
-        match says that it lies: 0 where there is no such place, and of one without landmarks all that there could be.
-        The places numbered `same` are not elsewhere. Raises PlaceError as `proof`."""
+        """Return the number of landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) that agree as
+        its own match expects: 0 if there is no such place, and the largest possible number if its landmarks are
+        unknown. The places with the numbers `same` are not elsewhere. Raises PlaceError as `proof`."""
         away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
         if not len(away):
             return 0
@@ -54,9 +53,9 @@ class Verification:
         return OF_PLACE if known is None else agreement(self._of_query(), known, expected).inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
-        """Return the numbers of those of the first places without a position that show ground of the best one: the
-        landmarks of both lie over each other as the two matches say that they must. Where places have positions,
-        these tell. Raises PlaceError as `proof`."""
+        """Return the numbers of the first places that show the same ground as the best one: their landmarks agree with
+        those of the best place as both matches expect. Empty if places have positions, which then tell. Raises as
+        `proof`."""
         slots = ranking.compared_slots[:_MAY_BE_THE_SAME]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
@@ -73,8 +72,11 @@ class Verification:
         return tuple(same)
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
-        """Return how the query is expected to lie on a place by its match, and the landmarks of the place. None where
-        the match does not say it, and where the place has no landmarks, or none that this edgevpr understands."""
+        """Return
+
+        * the overlay of the query on a place that its match gives (None: the match has none),
+        * the landmarks of the place (None: it has none, or none that this version can read).
+        """
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
             return None, None
@@ -90,6 +92,7 @@ class Verification:
         return expected, None
 
     def _of_query(self) -> Landmarks:
+        """Return the landmarks of the query, computed at the first call."""
         if self._query is None:
             self._query = describe(self.picture.image, self.picture.mask, OF_QUERY)
         return self._query
