@@ -18,9 +18,9 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
 # Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
-# expected as their match says, 31 had four inliers, 7 five, 3 six
-# and none more (benchmarks/verification.py); of 50,940 expected at random, 111, 22 and 2. So fewer than one in 10,000
-# has eight by chance. Where nothing is expected, 3 of 2500 had seven.
+# expected as their match says, 31 had four inliers, 7 five, 3 six and none more (benchmarks/verification.py). Of
+# 50,940 expected at random, 111 had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Where
+# nothing is expected, 3 of 2500 had seven.
 CONFIRMED, PROVEN = 8, 10
 # Largest deviations from the expected shift (share of the longest side), rotation (degrees) and scale (a factor).
 _STEP, _TURN_DEG, _SCALE = 3.5 / 32, 25.0, 1.35
@@ -31,7 +31,7 @@ _SIZE_BEYOND = 1.2  # one level of the image pyramid: sizes are not known more e
 
 _MOST_BITS = 64  # of 256 may differ; one in some thousand pairs of unrelated landmarks differs in so few
 _TOLERANCE = 10 / 640  # of the longest side: relief and tilt move landmarks of the same spot by about so much
-_BEST_MATCHES = 60  # so many: every two of them define a way that is tried
+_BEST_MATCHES = 60  # every two of so many best matches define a way that is tried
 _APART = 0.06  # share of the longest side; two landmarks nearer to each other say little about the rotation
 _FEWEST = 3
 # Relief and tilt move neighbouring landmarks alike: so many of them count as one independent landmark. With this, half
@@ -179,13 +179,13 @@ def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, e
 
 
 def _factor(expected: Overlay) -> float:
-    """Return the largest factor between the scale and the expected one."""
+    """Return the largest factor by which the scale may differ from the expected one."""
     return _ANY_SCALE if expected.scale is None else _SCALE
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Return which of N ways, complex (N,) each or one number each, are near to the expected one: bool like `shift`.
-    Without an expectation (None), only the scale is limited."""
+    """Return True for each of N ways, complex (N,) each or one number each, that is near to the expected one: bool like
+    `shift`. Without an expectation (None), only the scale is limited."""
     if expected is None:
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)

@@ -215,7 +215,7 @@ class Recogniser:
         if verdict.accepted or search or not others or (prior and not prior.looks_again):
             return verdict, best
         for ratio in others:
-            # Matches of all looks are judged together: whatever resembles the query in one look speaks against the others.
+            # Matches of all looks are judged together: each can speak against the best one.
             look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
             ranking = together(ranking, look)
         return self._judged(walk, ranking, looked)
