@@ -179,7 +179,7 @@ class QueryPair:
 
     @property
     def is_alike(self) -> bool:
-        """True where both accept the same place, or neither accepts any."""
+        """True if both accept the same place, or neither accepts a place."""
         if self.then is None or self.now is None:
             return False
         return (self.then.accepted, self.then.accepted and self.then.place) == (

@@ -266,7 +266,7 @@ def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
 
 def _words(line: dict[str, Any]) -> str:
     words = next((known for key in _WORDS if (known := text(line, key))), None)
-    before, after = line.get("from"), line.get("to")  # of the governor
+    before, after = line.get("from"), line.get("to")  # only lines of the governor have them
     if words and isinstance(before, dict) and isinstance(after, dict):
         changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
         return ": ".join(filter(None, (", ".join(changed), words)))

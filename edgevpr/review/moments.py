@@ -1,5 +1,5 @@
 """Chooses the moments of a flight that its report shows: matches far from GPS, fixes refused or held back, long times
-without a match, the least exact match, the slowest query. Each kind is a function that yields the worst first."""
+without a match, the least exact match, the slowest query. A function for each kind yields its moments."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -159,7 +159,7 @@ def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIn
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
-    """Return the results with the PCU filled in, which rates each technique against the slowest encoder among them."""
+    """Return the results with the PCU (see `metrics.pcu`) filled in. It depends on the slowest encoder among them."""
     results = list(results)
     slowest_s = max(result.t_encode_s for result in results)
     return [

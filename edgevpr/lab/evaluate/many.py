@@ -326,7 +326,7 @@ def _answer(content: dict[str, Any]) -> QueryAnswer:
 
 
 def _compared(found: Sequence[MeasuredRow]) -> tuple[MeasuredRow, ...]:
-    """Return the rows with the PCU filled in, which rates each row against the slowest encoder on its set."""
+    """Return the rows with the PCU (see `metrics.pcu`) filled in. It depends on the slowest encoder on each set."""
     done: list[MeasuredRow] = []
     for name in dict.fromkeys(row.set_name for row in found):
         of_set = [row for row in found if row.set_name == name]

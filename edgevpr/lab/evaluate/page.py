@@ -220,7 +220,7 @@ def _picture(what: str, path: Path | None, more: str = "") -> str:
         return f"<figure><figcaption>{what}: none</figcaption></figure>"
     try:
         return picture(path.name, f"{what}: {path.name}{more}", small_jpeg(read_image(path), _PICTURE_PX))
-    except ImageError:  # it was there when it was measured
+    except ImageError:  # deleted since the measurement
         return f"<figure><figcaption>{what}: {foreign(path.name)} (gone)</figcaption></figure>"
 
 

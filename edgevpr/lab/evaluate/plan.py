@@ -84,8 +84,8 @@ def read_plan(path: str | Path) -> EvaluationPlan:
 
 
 def checked(plan: EvaluationPlan, where: str) -> EvaluationPlan:
-    """Return `plan` if it can be measured. Raises ConfigError if not, with `where` (its file), and UsageError for an
-    unknown technique or parameter."""
+    """Return `plan` if it can be measured. Raises ConfigError if not, and UsageError for an unknown technique or
+    parameter. `where` names the origin of the plan in messages."""
     for name, each in plan.sets.items():
         if bool(each.folder) == bool(each.query and each.ref) or (each.folder and (each.query or each.ref)):
             raise ConfigError(f"{where}: the set `{name}` needs either `folder`, or `query` and `ref`: name them.")

@@ -43,7 +43,7 @@ def share_text(share: float | Interval | None) -> str:
 
 
 def decided(result: TechniqueResult) -> list[str]:
-    """Return the cells below `_DECIDED`: the PCU, and how many matches a flight would accept, with the wrong ones."""
+    """Return the cells below `_DECIDED`: the PCU; the number of accepted matches, and of the wrong ones among them."""
     return [share_text(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
 
 
@@ -58,7 +58,7 @@ def costs(result: TechniqueResult) -> list[str]:
 
 
 def quality_text(results: Sequence[Quality]) -> str:
-    """Make the text that `edgevpr eval` prints for stored similarities."""
+    """Make the text that `edgevpr eval` prints for stored similarities, and with --out for each set."""
     first = results[0]
     return "\n".join(
         [
