@@ -88,7 +88,7 @@ class Agreement:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the pictures coincide without shift, rotation and scaling, as a display drawn over all does."""
+        """True if the pictures coincide without shift, turn or scaling, as a display drawn over all pictures does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         turned_deg = min(self.rotation_deg, 360 - self.rotation_deg)

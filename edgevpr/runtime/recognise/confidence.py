@@ -1,5 +1,4 @@
-"""The model of confidence: takes the evidence of a match (see `evidence`), gives the probability that the match is
-right.
+"""The model of confidence: turns the evidence of a match (see `evidence`) into the probability that it is right.
 
 A match can be wrong in two ways: the query shows no ground of the map at all, or it does, and the best place is not the
 right one. Pictures agree by chance to much the same degree in every map, but maps differ in how much their places look

@@ -28,6 +28,7 @@ from edgevpr.runtime.recognise.locate import Located, matrix_of
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
 _OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
 _PROPOSED = 20  # most places that one query proposes
+# Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
 _NEAR_PLACES, _NEAR_FOOTPRINT, _HALF = 3.0, 0.25, 0.5
 _PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
 _FASTEST_M_S = 30.0  # unless the configuration says another speed
@@ -198,7 +199,11 @@ def _on_earth(estimate: PlaneEstimate | None, origin: Position | None) -> Follow
 def _proposals(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Turn a ranking into proposals. Returns the slots of the places proposed, int (K,), and the proposals."""
+    """Turn a ranking into proposals. Returns
+
+    * the slots of the places proposed, int (K,),
+    * the proposals, in the same order.
+    """
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
     covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))

@@ -96,8 +96,8 @@ class Prior:
         """Decide from the result of a query whether the next one uses hints. Keep position and height of an accepted
         match.
 
-        Until a match is accepted, queries alternate between using hints and not. That match then decides whether the
-        hints are trusted: whether it agrees with them.
+        An accepted match decides whether hints are trusted: they are if it agrees with them. Until there is one,
+        queries with hints and without alternate.
         """
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again

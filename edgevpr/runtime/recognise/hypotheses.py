@@ -111,7 +111,11 @@ def firm(covariance: Doubles, least: float) -> Doubles:
 
 def fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
     """Combine two estimates of K positions, `one` and `other` (K, 2) with covariances (K, 2, 2), by covariance
-    intersection (Julier and Uhlmann 1997): errors of the map are common to both. Returns positions and covariances."""
+    intersection (Julier and Uhlmann 1997), because errors of the map are common to both. Returns
+
+    * the positions (K, 2),
+    * their covariances (K, 2, 2).
+    """
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
     by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)

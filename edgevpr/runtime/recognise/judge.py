@@ -1,7 +1,7 @@
 """Decides when a match is accepted as the place. No other code does, and a match that is not accepted has no position.
 
-A place *elsewhere* is outside the neighbourhood of the best place (see `places.retrieve.elsewhere`). The *lead* of the
-best place is measured over the best of them.
+A place *elsewhere* is outside the neighbourhood of the best place (see `places.retrieve.elsewhere`). The *lead* of
+the best place is how far its score is above that of the best place elsewhere.
 """
 
 import math
@@ -35,8 +35,8 @@ _AT_REST_CELLS = 1.5
 _AT_REST_DEG = 7.5
 _AT_REST_HEIGHT = 0.2
 
-# A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had
-# six or more. Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
+# A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had six or more.
+# Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
 _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 # Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
 _OF_SCORE_WHEN_PROVEN = 0.5
@@ -146,7 +146,7 @@ def says_nothing(query: Descriptor, min_quality: float) -> str | None:
     """Return the reason if a picture shows too little to be recognised, None if its quality is at least `min_quality`.
 
     Examples are screens without a signal, displays on a dark ground, bare sky, or a covered lens. Few regions of such a
-    picture hold information. The share of regions that agree is then one of a few, and exceeds any limit by chance.
+    picture hold information, so that the share of them that agrees on a place can exceed any limit by chance.
     """
     if query.quality >= min_quality:  # False for NaN
         return None

@@ -162,7 +162,7 @@ class Learner:
 
 def _unsure(followed: Followed | None, position: Position) -> str | None:
     """Return the reason against learning a place if the flight so far contradicts its position or is unsure, else None.
-    It must say with high probability that the aircraft is off the map, or that it is there."""
+    By the flight, the aircraft must very probably be off the map, or at this position."""
     if followed is None or followed.estimate is None or followed.lost >= _SURE:
         return None
     if followed.mass < _SURE:

@@ -19,11 +19,11 @@ from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
 
-# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, in the longest
-# side, added to the covariance that a match gives: tilt and relief shift the parts of a picture differently.
+# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
+# longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
 _OF_VOTE, _OF_LANDMARKS = 0.016, 0.008
 _SCALE_SD, _TURN_SD = 0.03, 0.03  # of a place's pose, as shares of the length of a shift
-_OF_SCATTER = 0.25
+_OF_SCATTER = 0.25  # share of the covariance of single votes that their mean has
 _LIKE_THE_BEST = 0.5  # of the best score: matches with at least that score are used too
 _DISAGREES = 4.0  # standard deviations: places that differ by more are not used
 _CONTRADICTS = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
@@ -165,7 +165,11 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Combine positions by several places. Returns `at_m` (2,) as in `_Said`, and its covariance (2, 2)."""
+    """Combine positions by several places. Returns
+
+    * the position, east and north (2,) of the best place, metres,
+    * its covariance (2, 2).
+    """
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:

@@ -1,5 +1,4 @@
-"""Makes a recogniser from a map, the technique it was made with, and its index in RAM, for all programs that
-recognise."""
+"""Makes a recogniser from a map, the technique it was made with, and its index in RAM. All programs start here."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -67,7 +66,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
     * a recogniser for a flight, as `open_recogniser` does,
     * the index that takes new places, up to the memory budget.
 
-    If there is no map, an empty one is made for the technique `new_technique` (None: none is made).
+    If there is no map, an empty one is made for the technique `new_technique` (None: a map must exist).
     """
     if config.map is None:
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
@@ -110,8 +109,7 @@ def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
 def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
     """Make a salience gate. A criterion whose network is not named is off, with a warning.
 
-    Raises ConfigError if no picture can reach a threshold or every criterion is off, ModelError for an unusable
-    network.
+    Raises ConfigError if no picture can reach a threshold or all criteria are off, ModelError for an unusable network.
     """
     if config.entropy > MOST_ENTROPY:
         raise ConfigError(
@@ -140,7 +138,8 @@ def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
 
 
 def meter_of(config: Config, board: Board) -> QueryMeter:
-    """Make the meter that measures time and energy of queries, on a board fed by the configured battery pack."""
+    """Make the meter that measures time and battery charge of queries, on a board fed by the configured battery
+    pack."""
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 

@@ -34,7 +34,7 @@ class Recognition:
     * `left_out`: unreadable places that are left out since the last event: number, and what is wrong
     * `located`: the position of the aircraft; `accuracy_m`: the 1-sigma to send with it. Both are set only if the match
       is accepted and the place has a position
-    * `steps` and `cost`: the time and energy that the frame took
+    * `steps`: the time that each step took; `cost`: time, memory and battery charge of the whole query
     * `fix`: what became of the position; `last_fix`: what became of the one sent before. The channel to the autopilot
       sets both (None: nothing was sent)
     """

@@ -22,9 +22,9 @@ from edgevpr.runtime.recognise.memorability import Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
 
 MOST_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
-GAP_FRAMES = 20
-STEP = 0.03
-_TO_KNOW, _REMEMBERED = 8, 100  # frames
+GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
+STEP = 0.03  # by which they are lowered at a time
+_TO_KNOW, _REMEMBERED = 8, 100  # frames that tell what entropy is usual: at least, at most
 # A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
 _STEPS_BELOW = 3.2
 _LEAST_STEP = 0.005
@@ -118,8 +118,7 @@ class Gate:
 
 
 def usual_entropy(entropies: Iterable[float]) -> float | None:
-    """Return the least usual entropy of these frames: a tenth of similar frames have less. None: fewer than 8 are
-    known."""
+    """Return the least usual entropy of these frames: a tenth of similar frames have less. None for fewer than 8."""
     entropies = list(entropies)
     if len(entropies) < _TO_KNOW:
         return None
@@ -168,8 +167,8 @@ def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | N
 
 
 def scores_of(maps: Maps) -> Salience:
-    """Average each map over the picture. Pixels that are not static count as 0 in the other two maps, because less is
-    known of such a picture."""
+    """Average each map over the picture. Pixels that are not static count as 0 in the other two maps, because a picture
+    with many of them is worth less."""
     static = 1.0 if maps.is_static is None else maps.is_static
     return Salience(
         memorability=None if maps.memorability is None else float((maps.memorability * static).mean()),
