@@ -1,10 +1,11 @@
-"""Calibration of a map: it is asked for changed pictures of its own places, and how sure it can be is fitted to the
-answers.
+"""Calibration of a map: queries with known answers are made from the map's own pictures, and the confidence model (the
+probability that a match is right, from the evidence of the match) is fitted to the results.
 
-Each picture is asked for three times. As it is, it is of a place that the map has. Then that place and all that may
-show the same ground are left out: the best match is one of the look-alikes that every map has. At last the picture is
-mirrored: it shows ground that is nowhere, as the same camera would see it in the same country. What the shipped model
-knows from many sites stays, as far as the answers do not say otherwise.
+Each picture is changed as by another day and season (see `changes`) and then looked for in the map in three ways:
+* THERE: its place is in the map.
+* LEFT_OUT: without its place and all that may show the same ground. The best match is then a similar-looking place.
+* MIRRORED: as its mirror image, which shows ground that exists nowhere but looks like the country of the map.
+The fit starts from the shipped model, which is from many sites, and moves it only as far as the results demand.
 """
 
 from collections import Counter
@@ -34,25 +35,26 @@ from edgevpr.runtime.recognise.evidence import FEWEST_PLACES, MapCalibration, ca
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 
-Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # the frames of these names, as far as they are at hand
+Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
-ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures; looking down, most are looked for from five heights
-_BESIDE_PLACES = 10  # before and after a place without position: they may show the same ground
-_MOST_WITHOUT_POSITION = 0.2  # of the places of a map that looks down, whose pictures overlap in any order
-_OVERLAPS = 2.0  # footprints: so far apart a higher and a lower picture, turned, have no ground in common
-_LEFT_OUT_COUNTS = 0.3  # over ground that is not in the map nobody flies as often
-# How far a map moves the shipped weights; chosen on corridor, with grief_stromovka_seasons and nordland_tiny in view.
+ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures, by the camera's direction; each takes longer when it looks down
+_BESIDE_PLACES = 10  # so many places before and after one without position may show the same ground
+_MOST_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
+_OVERLAPS = 2.0  # footprints between two places from which on their pictures, from any heights, share no ground
+_LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
+# Strength with which the fit holds on to the shipped weights (see `fitted`), for the two parts of a model. Chosen on
+# corridor, with grief_stromovka_seasons and nordland_tiny in view.
 _PULL_OF_MAP, _PULL_OF_PLACE = 20.0, 5.0
 _SEED = 15
-_EVEN = 0.5  # precision at which hardly anything is refused for want of confidence
+_EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapAnswer:
-    """The answer to one question of a map: of which place the picture was, in which `way` it was asked for (THERE,
-    LEFT_OUT, MIRRORED), whether the best place was `right`, and its evidence (None: the picture says too little to look
-    for it). `refused`: something beside the confidence speaks against the best place."""
+    """Result of one query: the place of its picture, the `way` in which it was made (THERE, LEFT_OUT, MIRRORED), if the
+    best match is `right`, and the evidence of that match by name (None: the picture holds too little to be looked
+    for). `refused`: the match was refused for another reason than low confidence."""
 
     place_id: int
     way: str
@@ -70,8 +72,9 @@ def ask(
     pictures: Iterable[tuple[int, Levelled]],
     seed: int = 0,
 ) -> Iterator[MapAnswer]:
-    """Ask a map for changed pictures of its own places, in each way. `pictures` are numbers of places with the pictures
-    that they were made of, as they were encoded then. A place that is not in the index is left out."""
+    """Run queries with changed pictures of the map's own places, in all three ways, and yield the results. `index` has
+    the places of `place_map`, and `rule` is the rule for accepting a match. `pictures` are pairs of a place's number
+    and its picture as it was encoded for the map. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
     assert rule.sure is not None  # of a technique that has a confidence
     sure = replace(rule.sure, precision=_EVEN)
@@ -106,7 +109,7 @@ def ask(
             best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
             right = way == THERE and not elsewhere(index, slot, np.array([best]), near_m)[0]
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
-                continue  # their pictures may overlap: nobody knows whether it is right
+                continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
             yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
@@ -120,9 +123,10 @@ def calibrate(
     watch: Watch[Frame],
     preparation: Preparation | None = None,
 ) -> MapCalibration:
-    """Calibrate a map that is open for adding, and record it there. `preparation` is that which the map was made with.
-    Raises UsageError where the technique is judged by its limits, the map has too few places, or too few of their
-    pictures are at hand: the shipped model is then used. Raises MapError for a file that cannot be read or written.
+    """Calibrate a map that is open for adding, and store the result in the map. `watch` passes the frames through and
+    shows progress. `preparation` is that with which the map was made (None: no mask and no levelling).
+    Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
+    pictures are found. Raises MapError for a file that cannot be read or written.
     """
     kinds = kinds_of(technique.spec)
     if not kinds:
@@ -155,14 +159,15 @@ def calibrate(
 
 
 def asked_of(technique: Technique) -> int:
-    """Return how many pictures a map of this technique is asked for."""
+    """Return the number of pictures that are used to calibrate a map of this technique."""
     return ASKED_AHEAD if technique.spec.cells is None else ASKED_DOWN
 
 
 def _as_mapped(
     technique: Technique, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], preparation: Preparation
 ) -> Iterator[tuple[int, Levelled]]:
-    """Yield places with what is really their picture: another folder may have the same names."""
+    """Yield pairs of a place's number and its prepared picture. A picture that only has the name of a place's picture,
+    and another content, is left out."""
     ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
@@ -177,7 +182,8 @@ def _as_mapped(
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the model of the kind of evidence that most answers have, and count what it accepts."""
+    """Fit the model of that one of `kinds` of evidence that most answers have, and count the matches that it accepts
+    at the required `precision` (share of right matches among the accepted)."""
     counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
     kind = max(kinds, key=lambda kind: counts[kind])
     of_kind = [answer for answer in answers if answer.evidence and kind_of(answer.evidence) == kind]
@@ -201,7 +207,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
 
 
 def _by_place(answers: Sequence[MapAnswer], sure: Sureness) -> dict[int, float]:
-    """Return the mean confidence of each place that was asked for. A match that is wrong or refused counts as 0."""
+    """Return the mean confidence of each place's THERE queries, by its number; a wrong or refused match counts as 0."""
     of_place: dict[int, list[float]] = {}
     for answer in answers:
         if answer.way == THERE:
@@ -211,7 +217,8 @@ def _by_place(answers: Sequence[MapAnswer], sure: Sureness) -> dict[int, float]:
 
 
 def adapted(model: Model, answers: Iterable[MapAnswer], made_of: str) -> Model:
-    """Return a model for the map that gave these answers; those without evidence say nothing."""
+    """Return a copy of `model` fitted to the answers of a map; those without evidence are ignored. `made_of` is the
+    note in the model on what it was fitted to."""
     answers = [answer for answer in answers if answer.evidence]
     right = [answer for answer in answers if answer.right]
     nowhere = [answer for answer in answers if answer.way == MIRRORED]
@@ -230,7 +237,7 @@ def _adapted(
     start: Logistic, found: Sequence[MapAnswer], beside: Sequence[MapAnswer], counts: float, pull: float
 ) -> Logistic:
     answers = [*found, *beside]
-    if all(answer.right for answer in answers):  # they say nothing of how a wrong one could be told
+    if all(answer.right for answer in answers):  # wrong ones are needed to fit anything
         return start
     right = np.array([answer.right for answer in answers], bool)
     weights = np.repeat([1.0, counts], [len(found), len(beside)])
@@ -238,10 +245,11 @@ def _adapted(
 
 
 def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights: np.ndarray, pull: float) -> Logistic:
-    """Fit a logistic regression to rows that are `right` or not, bool (N,), with `weights` float (N,).
+    """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
+    `weights`, float (N,), are their weights.
 
-    The most probable one, where weights times scales are expected around those of `start` with the variance 1 / `pull`
-    (a Gaussian prior; the bias is free). With few rows it stays at `start`.
+    A Gaussian prior holds the regression's scaled weights near those of `start`, with the variance 1 / `pull`; the bias
+    is free. With few rows the result stays close to `start`.
     """
     scales, mine = np.array(start.scales), evidence_matrix(rows, start.names) / np.array(start.scales)
     middle = np.array(start.weights) * scales
@@ -259,7 +267,7 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights
 
 
 def evidence_matrix(rows: Sequence[Evidence], names: Sequence[str]) -> np.ndarray:
-    """Return evidence as a matrix, float64 (N, F)."""
+    """Return the evidence of N matches as a matrix, float64 (N, F), with a column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 
@@ -269,7 +277,8 @@ def _mirrored(picture: Levelled) -> Levelled:
 
 
 def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> np.ndarray:
-    """Tell which places may show ground of this one, bool (N,); `near_m` is the ground that a picture shows."""
+    """Return which of the N places may show ground of the place in row `slot` of the index, bool (N,). `near_m` is the
+    ground length of a picture in metres. Without positions, the places mapped just before and after count."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
     beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
     return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * near_m)

@@ -1,7 +1,8 @@
-"""Changes of a picture, as another day, season, height and course make them: a map is asked for its own places so.
+"""Artificial changes of a picture, as by another day, season, height and course. `calibrate` applies them to the map's
+own pictures to make queries.
 
-No real change is one of these. Together they bring the shares of agreeing regions down to what real ones leave, which
-is what a calibration needs: right and wrong matches that are hard to tell apart.
+No single change is realistic. Together they lower the share of agreeing regions as much as real changes do, so that
+right and wrong matches are as hard to tell apart as in flight. `strength` is about 0 (hardly any change) to 1.3.
 """
 
 import cv2
@@ -10,16 +11,17 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
 
 _STRENGTH = (0.3, 1.3)  # from a cloud to snow
-_TONES = 6  # points of a curve of tones
-_PATCHES = 2  # at most, of the picture hidden by something that was not there
+_TONES = 6  # points of a tone curve
+_PATCHES = 2  # most plain patches that hide a part of the picture
 
 
 def changed(
     image: Image, rng: np.random.Generator, looks_down: bool, shown: Mask | None = None
 ) -> tuple[Image, Mask | None]:
-    """Return a picture as it might look another time: uint8 (H, W[, 3]) to uint8 (H, W) grey. Looking down, the camera
-    may be turned to any heading. `shown`, bool (H, W), is False where the picture shows no ground (None: nowhere); it
-    is returned for the new picture."""
+    """Change a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
+    by any angle. `shown`, bool (H, W), is False where it shows no ground (None: nowhere). Returns
+    * the changed picture, uint8 (H, W) grey, and
+    * `shown` for the changed picture."""
     strength = rng.uniform(*_STRENGTH)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     warp = _from_beside(grey.shape, rng, strength, looks_down)
@@ -33,7 +35,7 @@ def changed(
 
 
 def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
-    """Look from another spot, height and course, and from a tilted camera: return the warp of pixels, (3, 3)."""
+    """Return a random homography of pixels, (3, 3), as by another position, height, course and tilt of the camera."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength
@@ -51,11 +53,8 @@ def _warped(image: Array, warp: Doubles, flags: int) -> Array:
 
 
 def another_season(grey: Singles, rng: np.random.Generator, strength: float) -> Singles:
-    """Give tones other values, differently in different parts, as leaves and snow do; and a texture of its own.
-
-    `grey` is float32 (H, W), 0..1, and so is the result, but for values beyond. `strength` is 0 (hardly anything) to
-    1.3.
-    """
+    """Map grey levels through random tone curves that differ between parts of the picture, as leaves and snow do, and
+    add a random texture. `grey` is float32 (H, W), 0..1, and so is the result, which may slightly exceed 0..1."""
     height, width = grey.shape
     tones = np.clip(255 * grey, 0, 255).astype(np.uint8)
     one, other = (_curve(rng, strength)[tones] for _ in range(2))
@@ -66,7 +65,7 @@ def another_season(grey: Singles, rng: np.random.Generator, strength: float) -> 
 
 
 def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
-    """Cast soft shadows, expose otherwise, blur half of the pictures, and add the noise of a sensor."""
+    """Add soft shadows, another exposure, blur (to half of the pictures) and sensor noise to `grey`, float (H, W)."""
     lit: Floats = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
@@ -76,7 +75,7 @@ def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> 
 
 
 def _hide(grey: Floats, rng: np.random.Generator, strength: float) -> None:
-    """Hide a part or two behind a plain patch, in place."""
+    """Cover `grey`, float (H, W), in place with up to two plain patches."""
     height, width = grey.shape
     for _ in range(rng.integers(0, _PATCHES + 1)):
         x, y, half = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.05, 0.2) * width * strength
@@ -91,7 +90,7 @@ def _curve(rng: np.random.Generator, strength: float) -> Singles:
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Singles:
-    """Return a smooth field of values within -1..1, float32 of this shape."""
+    """Return a random smooth field, float32 of this shape, with values about -1..1; more `cells` vary faster."""
     coarse = rng.normal(size=(cells, cells)).astype(np.float32)
     field = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(field / max(float(np.abs(field).max()), 1e-6), np.float32)

@@ -1,5 +1,5 @@
-"""An orthophoto as a source of frames: a picture of the ground around each place of a grid, as a camera that looks
-straight down, with the nose to the north, would take it."""
+"""An orthophoto as a source of frames, from which a map can be made: for each place of a grid it gives the picture that
+a camera looking straight down would take there, with north at the top."""
 
 from collections.abc import Callable, Collection
 
@@ -12,13 +12,14 @@ from edgevpr.mapmaking.lattice import Lattice
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 SIDE_PX = 512
-MOST_WITHOUT_DATA = 0.1
-_GEO_REFERENCE_M = 1.0  # standard deviation of where the orthophoto says that a thing is, in each direction
+MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
+_GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 
 
 class OrthophotoSource(RecordingSource):
-    """A frame for each place of a grid, but for those of which more than a tenth is without data; `without_data` counts
-    these."""
+    """Gives a frame for each place of `lattice`: a square of ground with sides of `footprint_m`. Places of which more
+    than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the names of the
+    frames to read (None: all)."""
 
     def __init__(
         self,
@@ -41,12 +42,12 @@ class OrthophotoSource(RecordingSource):
 
     @property
     def ended(self) -> bool:
-        """True after the last place."""
+        """True after the last place was read."""
         return self._read == self.total
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the picture of the next place, None where it has too little data. Raises ImageError for a damaged part
-        of the file; the next call goes on with the place after it."""
+        """Return the frame of the next place, None if that place is left out. Raises ImageError for a damaged part of
+        the file; the next call continues with the place after it. `timeout_s` is ignored."""
         if self.ended:
             return None
         lattice, at = self._lattice, self._read
@@ -79,5 +80,5 @@ class OrthophotoSource(RecordingSource):
 
 
 def _numbered(number: int, count: int) -> str:
-    """Write a number of 0..count - 1 so that names sort in its order."""
+    """Write a number in 0..`count` - 1 with leading zeros, so that names sort in its order."""
     return str(number).zfill(max(3, len(str(count - 1))))

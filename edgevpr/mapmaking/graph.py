@@ -1,17 +1,18 @@
-"""The pose graph of a map: where each picture lies, which way it is turned and how much ground it shows, so that ties
-between pictures and recorded positions are met as well as can be.
+"""The pose graph of a map: solves for the position, direction and footprint of each picture that fit best, by least
+squares, to recorded positions and to ties. A tie is the relative pose of two pictures that show the same ground.
 
 A place has two complex unknowns. Its position p is east + i north, in metres. Its log l has the footprint and the
-direction: exp(l) = footprint_m exp(-i up), which turns a step in the picture (dx - i dy, as shares of its longest side)
-into one on the ground. A tie says that the middle of picture `query` lies `step` away from the middle of picture
-`place`, in that picture, and that it is turned and scaled against it by exp(`turn`):
+direction: exp(l) = footprint_m exp(-i up), a factor that turns an offset in the picture (right + i up, in shares of its
+longest side) into one on the ground. In a tie, `step` is the offset of the middle of picture `query` from the middle of
+picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale of `query` against `place`:
 
     (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
 
-Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. The step is compared
-in the picture and not on the ground: ties alone could otherwise be met by a map that shrinks to a point. Recorded
-positions give the whole its place, scale and direction. All three kinds are weighted by how much they scatter, which is
-estimated from the residuals, and those that contradict the others lose their weight (Geman and McClure 1987).
+Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. Steps are compared in
+the picture and not on the ground: otherwise a map shrunk to a point would fulfil all ties. Recorded positions fix
+position, scale and direction of the whole. Steps, turns and recorded positions are weighted by their standard
+deviations ("scatter"), estimated from the residuals; those that contradict the others get little weight (Geman and
+McClure 1987).
 """
 
 from dataclasses import dataclass
@@ -23,24 +24,24 @@ from scipy.sparse.linalg import splu
 
 from edgevpr.core.arrays import Complexes, Floats
 
-_ROUNDS, _SETTLED = 4, 0.05  # of estimating the scatters, and by how much of themselves they still change
-_MOVES, _STAYS = 40, 1e-4  # of solving, and how far a position still moves, as a share of a footprint
-_LONGEST_MOVE = 0.5  # of a log
-_FIRST = 3.0  # times its own standard deviation a tie is off, as long as nothing better is known
-_LEAST = 0.5  # times: ties that happen to agree better must not make the others look wrong
-_SURE = 0.005  # standard deviation of a log that is known
-_LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions
-_GONE = 0.1  # a weight below it: what has it contradicts the others
-_MEDIAN_OF_FOUR = 1.832  # of the length of four numbers, normally distributed
-_NOTHING = 1e-6  # is known of the log of a place without ties
-_AT_ONCE = 256  # columns of the inverse
+_ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
+_MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that ends them, as a share of a footprint
+_LONGEST_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
+_FIRST = 3.0  # first estimate of `Solved.times`
+_LEAST = 0.5  # least value of `Solved.times`: ties that agree well by chance must not make the others look wrong
+_SURE = 0.005  # standard deviation of a known log
+_LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions: the least, and the first estimate
+_GONE = 0.1  # a tie or position with a smaller weight counts as contradicting the others
+_MEDIAN_OF_FOUR = 1.832  # median length of a vector of four standard normal numbers
+_NOTHING = 1e-6  # added to the diagonal, so that places without ties can be solved
+_AT_ONCE = 256  # columns of the inverse that are computed together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
-    """Pairs of pictures of the same ground: `query` and `place` int (T,) are their numbers, `step` and `turn` complex
-    (T,) what one says of the other. `step_sd` and `turn_sd` float (T,) are how exactly, of one axis, in proportion: by
-    how much all of them are to be multiplied shows when they are held against each other."""
+    """T pairs of pictures of the same ground: `query` and `place`, int (T,), are their numbers. `step` and `turn`,
+    complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are their standard
+    deviations along one axis, up to a common factor, which `solve` estimates (`Solved.times`)."""
 
     query: np.ndarray
     place: np.ndarray
@@ -55,10 +56,12 @@ class Ties:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solved:
-    """The graph of N places. `position` complex (N,) metres, `log` complex (N,); `position_var` (m^2) and `log_var`
-    float (N,) are their variances, both axes together. `component` int (N,) numbers the groups of places that are tied.
-    Ties scatter by `times` their own standard deviation, and recorded positions by `recorded_sd_m` in one axis.
-    `recorded_counts` and `ties_count` bool tell which recorded positions and ties agree with the rest."""
+    """The solved graph of N places with T ties. `position`, complex (N,), is in metres; for `log`, complex (N,), see
+    the module.
+    `position_var` (m^2) and `log_var`, float (N,), are their variances, summed over both axes.
+    `component`, int (N,): number of the group of places, connected by ties, that each place belongs to.
+    `times`: factor from the given to the real standard deviations of ties. `recorded_sd_m`: that of recorded positions.
+    `recorded_counts` (N,), `ties_count` (T,): bool, False for positions and ties that contradict the others."""
 
     position: np.ndarray
     log: np.ndarray
@@ -72,8 +75,9 @@ class Solved:
 
 
 def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.ndarray | None = None) -> Solved:
-    """Solve the graph of places recorded at complex (N,) metres. `recorded_sd_m` float (N,) is the scatter of positions
-    that are known apart (NaN: they scatter as the others do). `log` complex (N,) are logs that are known (NaN: not)."""
+    """Solve the pose graph of N places, `recorded` at complex (N,) metres. `recorded_sd_m`, float (N,), are standard
+    deviations of these positions, where known in advance (NaN: one common value is estimated). `log`, complex (N,), are
+    the known logs (NaN: unknown; None: all are unknown)."""
     count = len(recorded)
     known = np.full(count, np.nan + 0j) if log is None else log
     _, component = connected_components(_graph(ties, count), directed=False)
@@ -84,16 +88,16 @@ def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.n
     for _ in range(_ROUNDS):
         sd_m = np.where(own, scatter_m, recorded_sd_m)
         position, log, normal, agree = _settled(position, log, recorded, sd_m, known, ties, times)
-        variance = 2 * _inverse_diagonal(normal)  # of one axis is each weight
+        variance = 2 * _inverse_diagonal(normal)  # the weights are of one axis, the variance of both
         steps, turns, off = _residuals(position, log, recorded, ties)
         before = times, scatter_m
         if len(ties):
-            # Ties that hang on nothing else are met exactly: what they say of the scatter is spread over the others.
+            # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
             spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
             off_ties = float(np.median(_off_ties(steps, turns, ties)))
             times = max(_LEAST, off_ties / _MEDIAN_OF_FOUR / np.sqrt(spare))
         if own.any():
-            # What a position is off, and what the solution leaves open there: few ties let it follow every error.
+            # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
             scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off[own]) ** 2 + np.median(variance[:count][own]) / 2)))
         if abs(np.log(before[0] / times)) < _SETTLED and abs(np.log(before[1] / scatter_m)) < _SETTLED:
             break
@@ -119,8 +123,8 @@ def _settled(
     ties: Ties,
     times: float,
 ) -> tuple[np.ndarray, np.ndarray, csc_matrix, np.ndarray]:
-    """Move positions and logs until they stay, for given scatters (Gauss and Newton). Returns both, the normal matrix
-    (2 N, 2 N), and how far each tie agrees, 0..1."""
+    """Solve for positions and logs with given scatters, by Gauss-Newton steps. Returns positions and logs, complex (N,)
+    each, the normal matrix (2 N, 2 N), and the robust weight of each tie, float (T,), 0..1."""
     count = len(position)
     for _ in range(_MOVES):
         steps, turns, off = _residuals(position, log, recorded, ties)
@@ -130,7 +134,7 @@ def _settled(
         jacobian, rest = _linear(position, log, recorded, known, ties, weights)
         normal = (jacobian.conj().T @ jacobian).tocsc()
         move = splu(normal + _NOTHING * identity(2 * count)).solve(-(jacobian.conj().T @ rest))
-        # A long step is cut: far from the solution the logs are not as linear as that.
+        # A long move is shortened: far from the solution the logs are not linear.
         share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
         position, log = position + share * move[:count], log + share * move[count:]
         if (abs(move[:count]) < _STAYS * np.exp(log.real)).all():
@@ -148,12 +152,13 @@ def _graph(ties: Ties, count: int) -> csc_matrix:
 
 
 def _first(recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lay the places of each component out along its strongest ties, and the whole over the recorded positions."""
+    """Return first positions and logs, complex (N,) each: chain each component's places along its most exact ties, then
+    fit the component to its recorded positions and known logs."""
     count = len(recorded)
     position, log = np.zeros(count, complex), np.zeros(count, complex)
     tree = minimum_spanning_tree(_graph(ties, count))
     of_pair = {}
-    for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the strongest of a pair comes last
+    for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most exact tie of a pair comes last
         of_pair[int(ties.query[at]), int(ties.place[at])] = at
     for number in range(component.max(initial=-1) + 1):
         members = np.flatnonzero(component == number)
@@ -179,8 +184,8 @@ def _first(recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.nd
 
 
 def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
-    """Return the scale-and-turn and the offset that lay `shape` over the recorded positions; outliers lose their
-    weight. For one point, the scale is 1."""
+    """Return complex `scale` (and rotation) and `offset` so that scale * `shape` + offset fits `recorded`, complex (N,)
+    each. Outliers get little weight. For one point, the scale is 1."""
     weight = np.ones(len(shape))
     scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
     for _ in range(20):
@@ -214,7 +219,7 @@ def _linear(
     ties: Ties,
     weights: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[csc_matrix, np.ndarray]:
-    """Return the weighted Jacobian (R, 2 N) and the residuals (R,): steps, turns, recorded positions, known logs."""
+    """Return the Jacobian (R, 2 N) and the residuals (R,), weighted: steps, turns, recorded positions, known logs."""
     count, many = len(recorded), len(ties)
     steps, turns, off = _residuals(position, log, recorded, ties)
     by_step, by_turn, by_recorded = map(np.sqrt, weights)
@@ -235,12 +240,12 @@ def _linear(
 
 
 def _agree(off: np.ndarray) -> np.ndarray:
-    """Return the weight of residuals that are `off` (in standard deviations), 0..1: a half at three."""
+    """Return the robust weight, 0..1, of residuals `off` in standard deviations: 0.5 for a residual of three."""
     return 1 / (1 + (off / 4.66) ** 2) ** 2
 
 
 def _scatter(residuals: np.ndarray) -> float:
-    """Return the standard deviation of one axis of complex residuals, of those that agree: from their median."""
+    """Estimate the standard deviation along one axis of complex residuals from their median, so ignoring outliers."""
     return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
 
 

@@ -1,4 +1,4 @@
-"""The places at which an orthophoto is cut: a regular grid over all of it, or over an area."""
+"""The places at which pictures are cut from an orthophoto: a regular grid over all of it, or over an area."""
 
 import math
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, local_crs
 from edgevpr.mapmaking.rasters import CRS, geometry_mask, rasterio, transform
 
 MOST_PLACES = 1_000_000
-_MOST_POINTS = 20 * MOST_PLACES  # of the grid around an area of which they are a part
+_MOST_POINTS = 20 * MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lattice:
-    """Places of a grid, each (N,): numbers of row (from the north) and column (from the west), degrees of WGS-84.
-    `shape` is the number of rows and columns of the whole grid."""
+    """N places of a grid, in arrays (N,): `rows`, int, counted from the north, and `columns`, from the west; `lat_deg`
+    and `lon_deg` in degrees of WGS-84. `shape` is the number of (rows, columns) of the whole grid."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -33,11 +33,12 @@ class Lattice:
 def lattice_of(
     orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None, margin_m: float = 0.0
 ) -> Lattice:
-    """Lay a grid over the orthophoto, so that a square of `footprint_m` around each place lies inside of its extent.
-    With an `area`, keep the places of the same grid that lie in its polygons or within `margin_m` of its paths.
+    """Make a grid of places `spacing_m` apart over the orthophoto. A square with sides of `footprint_m` around each
+    place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
+    its polygons or within `margin_m` of its paths.
 
-    Raises UsageError where the footprint or the spacing does not fit the orthophoto, the area lies elsewhere, or there
-    are no places or more than `MOST_PLACES`.
+    Raises UsageError if footprint or spacing do not fit the orthophoto, the area is outside of it, or there are no
+    places or more than `MOST_PLACES`.
     """
     plane = local_crs(orthophoto.middle)
     x_m, y_m = orthophoto.outline(plane)
@@ -113,13 +114,13 @@ def _elsewhere(orthophoto: Orthophoto, area: Area) -> UsageError:
 
 
 def extent_words(extent_deg: tuple[float, float, float, float]) -> str:
-    """Return south, west, north and east as the messages name them."""
+    """Format a bounding box (south, west, north, east) for messages."""
     south, west, north, east = extent_deg
     return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"
 
 
 def _box(area: Area, plane: CRS, margin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest x and y of the area in metres, each (2,)."""
+    """Return the least and the largest (x, y) of the area with its margin, float64 (2,) each, in metres of `plane`."""
     points_m = [np.concatenate([_metres(ring, plane) for ring in rings]) for rings in area.polygons]
     low, high = [each.min(axis=0) for each in points_m], [each.max(axis=0) for each in points_m]
     for path in _paths_m(area, plane):
@@ -138,7 +139,8 @@ def _paths_m(area: Area, plane: CRS) -> list[np.ndarray]:
 
 
 def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
-    """Tell which points of the grid lie in the area: bool (rows, columns)."""
+    """Return which points of the grid are in the area, bool (rows, columns). `x_m` are the x of the columns, ascending,
+    and `y_m` the y of the rows, descending, in metres of `plane`; `step_m` is their distance."""
     shape = len(y_m), len(x_m)
     inside = np.zeros(shape, bool)
     if area.polygons:
@@ -155,7 +157,7 @@ def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.nd
 def _near(
     inside: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, begin: np.ndarray, end: np.ndarray, margin_m: float
 ) -> None:
-    """Set the points of the grid that lie within the margin of a straight way."""
+    """Set the points of the grid `inside` to True that are within `margin_m` of the line `begin`-`end`, (2,) each."""
     low, high = np.minimum(begin, end) - margin_m, np.maximum(begin, end) + margin_m
     columns = slice(*np.searchsorted(x_m, (low[0], high[0])))
     rows = slice(*np.searchsorted(-y_m, (-high[1], -low[1])))

@@ -1,4 +1,5 @@
-"""A map from its pictures to its confidence: what `edgevpr map build`, `map refine` and `map calibrate` do."""
+"""Making of a complete map: places from pictures, then refinement of their positions, then calibration of the map's
+confidence. This is the work of the commands `edgevpr map build`, `map refine` and `map calibrate`."""
 
 import logging
 import time
@@ -30,28 +31,32 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _OF_ORTHOPHOTOS = "cohog"
 
-Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]  # passes things through, and shows progress
+# Called with items, their number and a label; yields the items unchanged and shows the progress.
+Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownPictures:
-    """Pictures of a flight: a folder or a video, its positions (None: those beside it), and how many pictures a second
-    of a video are taken (None: every frame)."""
+    """Pictures of a flight. `source`: a folder of images or a video. `positions`: their table of positions (None: the
+    one that `open_source` finds). `rate_hz`: pictures taken per second of a video (None: every frame)."""
 
     source: str
     positions: Path | None = None
     rate_hz: float | None = None
 
     def open(self, only: Collection[str] | None = None) -> Source:
-        """Open it; only the pictures of the names in `only` are read (None: all)."""
+        """Open the source. Only pictures whose names are in `only` are read (None: all)."""
         step_s = 1 / self.rate_hz if self.rate_hz else None
         return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cuttings:
-    """Pictures that are cut from an orthophoto: the ground along a picture's longest side and from place to place, the
-    file of the area (None: all), and how far beside its path (None: the footprint)."""
+    """Pictures that are cut from an orthophoto, at the places of a grid.
+
+    `footprint_m`: ground length of a picture's side. `spacing_m`: distance between neighbouring places.
+    `area`: file that limits the places, see `missions.read_area` (None: the whole orthophoto).
+    `margin_m`: greatest distance of a place from a path of the area (None: `footprint_m`)."""
 
     orthophoto: str
     footprint_m: float
@@ -60,8 +65,8 @@ class Cuttings:
     margin_m: float | None = None
 
     def open(self, only: Collection[str] | None = None) -> Source:
-        """Open the orthophoto and lay the grid of its places; those of the names in `only` are cut (None: all). Raises
-        SourceError, and UsageError for what does not fit."""
+        """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
+        Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
         from edgevpr.mapmaking.cuttings import OrthophotoSource
         from edgevpr.mapmaking.lattice import lattice_of
         from edgevpr.mapmaking.missions import read_area
@@ -76,8 +81,10 @@ class Cuttings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOrder:
-    """The map to be made: its technique (None: by the board that will fly) with its parameters, whether places are
-    added to a map that is there, and whether it is refined and calibrated in the end."""
+    """The map to be made at `path` from `pictures`.
+
+    `technique`: its name (None: chosen for `board`, the board that will fly). `parameters`: of the technique, by name.
+    `append`: add places to the map if it exists. `refine`, `calibrate`: do so after the places are made."""
 
     path: str
     pictures: FlownPictures | Cuttings
@@ -91,9 +98,12 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """Result of an order: the technique, its cells, the places in all, how many of them have a position, what the
-    frames were, and how the map was refined and calibrated (None: it was not). Of an orthophoto, `without_data` places
-    were left out."""
+    """Result of `make_map`.
+
+    `technique`, `cells`: the technique's name, and its `TechniqueSpec.cells`.
+    `places`, `with_position`: number of places in the map, and of those that have a position.
+    `result`: counts of the frames read. `refined`, `calibration`: results of these two steps (None: not done).
+    `without_data`: places of an orthophoto that were left out for lack of data (None: not of an orthophoto)."""
 
     technique: str
     cells: int | None
@@ -106,7 +116,8 @@ class MadeMap:
 
 
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
-    """Make a map of pictures, or continue one. Pictures that cannot be used are handed to `unusable`."""
+    """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
+    cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, is_cut = map_path(order.path), isinstance(order.pictures, Cuttings)
     camera = _camera(config.source.camera, is_cut)
     source = order.pictures.open()
@@ -137,7 +148,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 unusable,
             )
         except EdgevprError:
-            if is_new and not len(place_map):  # a full disk: an empty map would only stand in the way of the next try
+            if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
                 remove(path)
             raise
         refined, calibration = None, None
@@ -163,7 +174,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
 
 
 def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
-    """Refine an open map. Raises UsageError for one that nothing can be refined of, and where SciPy is missing."""
+    """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not at hand).
+    Raises UsageError if the map's technique does not allow it, or SciPy is missing."""
     if technique.spec.cells is None:
         raise UsageError(
             f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
@@ -179,8 +191,8 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 def calibrate_map(
     place_map: PlaceMap, technique: Technique, config: Config, pictures: FlownPictures | Cuttings, shown: Shown
 ) -> MapCalibration:
-    """Calibrate an open map with its pictures; one that cannot be read is left out. Raises UsageError where that cannot
-    be done, and where SciPy is missing."""
+    """Calibrate the confidence of an open map with the pictures that it was made from (see `calibrate`). A picture that
+    cannot be read is left out. Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
     try:
         from edgevpr.mapmaking.calibrate import calibrate
     except ModuleNotFoundError as error:
@@ -201,15 +213,15 @@ def calibrate_map(
 
 
 def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
-    """Return what is done to pictures. What is cut lies on the ground already: no aircraft hides it, no lens has seen
-    it."""
+    """Return the steps before encoding: overlay mask and levelling. Pictures cut from an orthophoto need neither."""
     if isinstance(pictures, Cuttings):
         return Preparation(mask=mask_of(None), levelling=None)
     return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
 
 
 def _unless_impossible(what: str, work: Callable[[], Any]) -> Any:
-    """Do what a map is whole without; return None where it cannot be done."""
+    """Call `work`, an optional step, and return its result. If it raises EdgevprError, log a warning that the map is
+    not `what` ("refined"), and return None."""
     try:
         return work()
     except EdgevprError as error:

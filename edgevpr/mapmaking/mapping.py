@@ -1,8 +1,8 @@
-"""Making places: every frame is encoded, and is on the disk before the next one is taken.
+"""Making places of a map from frames: every frame is encoded, and is on the disk before the next one is read.
 
-Where no frame is memorable for long, the best of them are kept all the same (thesis 3.4.8). A frame that does not pass
-waits. When there would be no place for `most_frames` frames, or for `most_m` metres of the way, all thresholds are
-lowered in steps of 0.03 until some of those that wait pass; these become places of low quality.
+With salience criteria (the "gate"), only frames that reach all thresholds become places. So that no long gaps arise
+(thesis 3.4.8), the other frames are held back ("wait"). After `most_frames` frames or `most_m` metres without a place,
+all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
 
 from collections import Counter
@@ -28,12 +28,13 @@ from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, Gate, best_of
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]  # passes items through, so many of them, and shows the progress
-Kept = tuple[Recognition, Salience | None]
+Watch = Callable[[Iterable[T], int], Iterable[T]]  # gets items and their number, yields them and shows the progress
+Kept = tuple[Recognition, Salience | None]  # event of a frame that becomes a place, and its salience (None: no gate)
 
 
 class Gaps:
-    """Takes one event after the other, and gives back those that become places, in their order."""
+    """Chooses the frames that become places, see the module. An event is the `Recognition` of one frame. `most_m` None:
+    distances are ignored."""
 
     def __init__(self, most_frames: int = GAP_FRAMES, most_m: float | None = None) -> None:
         self._most_frames, self._most_m = most_frames, most_m
@@ -42,7 +43,7 @@ class Gaps:
         self._has_begun = False
 
     def take(self, event: Recognition) -> Iterator[Kept]:
-        """Yield what becomes a place now that the frame of `event` is seen."""
+        """Process the next event, and yield the events that now become places: of waiting frames, or this one."""
         if event.worth is None:
             yield event, None
             return
@@ -57,12 +58,12 @@ class Gaps:
             self._waiting.append(replace(event, frame=replace(frame, image=_NO_PIXELS)))
 
     def end(self) -> Iterator[Kept]:
-        """Yield what becomes a place at the end: of a recording in which nothing has passed, the best of it."""
+        """Yield the events that become places at the end of a recording: the best ones, if there is no place yet."""
         if not self._has_begun and self._waiting:
             yield from self._best_waiting()
 
     def _best_waiting(self) -> Iterator[Kept]:
-        """Yield the best of those that wait; those after the last of them wait on."""
+        """Yield the best of the waiting events; those after the last of these continue to wait."""
         waiting = [(event, event.worth) for event in self._waiting if event.worth]
         best = np.flatnonzero(best_of([worth.short_by for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
@@ -86,8 +87,8 @@ def _frame_of(event: Recognition) -> Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Selection of the frames that become places: those whose quality is at least `min_quality` and that pass the
-    `gate` (None: all do), and of those that do not pass it the ones that `gaps` keeps."""
+    """Rules that select the frames that become places. `min_quality`: least `Descriptor.quality`. `gate`: salience
+    criteria to be met (None: no criteria). `gaps`: chooses among the frames that do not meet them."""
 
     gate: Gate | None = None
     gaps: Gaps = field(default_factory=Gaps)
@@ -96,8 +97,9 @@ class Selection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappingResult:
-    """Counts of frames: places added, how many of those have no position and how many are of low quality, frames that
-    were in the map already, frames that say nothing, and frames that were not memorable, by what they lacked."""
+    """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
+    closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
+    `not_memorable`: frames that failed the salience criteria, by the criterion that failed."""
 
     added: int
     without_position: int
@@ -116,11 +118,11 @@ def build_map(
     selection: Selection | None = None,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
-    """Add a place for every frame that is not in the map yet, so that an interrupted map can be continued.
+    """Add a place for every selected frame that is not in the map yet, so that an interrupted map can be continued.
 
-    A frame goes through the steps of a query, with no place to find. It is in the map already if a place has the same
-    name and nearly the same descriptor; the name alone does not tell, since cameras restart their numbering. A frame
-    that cannot be encoded is handed to `unusable` and left out; with `unusable` None it raises ModelError.
+    Frames are encoded by the same steps as queries. A frame is in the map already if a place has the same name and
+    nearly the same descriptor; the name alone does not suffice, since cameras restart their numbering. For a frame that
+    cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised.
     """
     place_map.require(technique.spec)
     preparation, selection = preparation or Preparation(), selection or Selection()

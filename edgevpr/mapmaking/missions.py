@@ -1,4 +1,5 @@
-"""Areas and paths as ground stations keep them: waypoint files, plans of QGroundControl, GeoJSON."""
+"""Reading of areas and paths to be flown over: waypoint files, plans of QGroundControl, and GeoJSON. They limit the
+part of an orthophoto from which a map is made."""
 
 import json
 import math
@@ -13,17 +14,17 @@ from edgevpr.core.files import read_file
 
 _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
-# The MAV_CMDs that an aircraft flies to: waypoint, loiter (unlimited, turns, time, to altitude), land, take off,
-# spline, and take off and land of a VTOL. Others, such as the region of interest, have a position and are not flown to.
+# The MAV_CMDs whose position an aircraft flies to: waypoint, loiter (unlimited, turns, time, to altitude), land, take
+# off, spline, and take off and land of a VTOL. Others, such as a region of interest, have a position to look at.
 _FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
-_OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is over home or the terrain
+_OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
 
 Ring = list[LatLon]
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A point of a path, degrees, and its height in metres over home or the ground (None: not told)."""
+    """A point of a path in degrees, and its height in metres over home or the ground (None: the file gives none)."""
 
     lat_deg: float
     lon_deg: float
@@ -32,15 +33,15 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The ground that a file names: polygons, each as rings (the outline, then holes) of points (lat, lon) in degrees,
-    and paths of waypoints."""
+    """The areas and paths in a file. Each of `polygons` is a tuple of rings (the outline, then holes) of points (lat,
+    lon) in degrees. Each of `paths` is a tuple of waypoints in the order of flight."""
 
     polygons: tuple[tuple[Ring, ...], ...]
     paths: tuple[tuple[Waypoint, ...], ...]
 
     @property
     def extent_deg(self) -> tuple[float, float, float, float]:
-        """The area's south, west, north and east."""
+        """The bounding box of polygons and paths: (south, west, north, east) in degrees."""
         points = [(way.lat_deg, way.lon_deg) for path in self.paths for way in path]
         points += [point for rings in self.polygons for ring in rings for point in ring]
         lat_deg, lon_deg = zip(*points, strict=True)
@@ -49,7 +50,7 @@ class Area:
 
 def read_area(path: str | Path) -> Area:
     """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or GeoJSON in degrees. Raises UsageError for a
-    file that is none of them, holds no position, or has one beyond the globe."""
+    file that is none of them, holds no position, or has one outside -90..90 or -180..180 degrees."""
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except OSError as error:
@@ -76,7 +77,8 @@ def _foreign(path: str | Path) -> UsageError:
 
 
 def _of_lines(lines: list[str]) -> Area:
-    """Read a waypoint file: index, current, frame, command, four parameters, lat, lon, alt, autocontinue."""
+    """Read the lines of a waypoint file. The first is a heading; the columns of the others are index, current, frame,
+    command, four parameters, lat, lon, alt, autocontinue."""
     path: list[Waypoint] = []
     for line in lines[1:]:
         values = line.split()
@@ -88,10 +90,11 @@ def _of_lines(lines: list[str]) -> Area:
 
 
 def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: float) -> list[Waypoint]:
-    """Return the waypoint of an item of a mission; none for one that is not flown to, or is where the aircraft is."""
+    """Return a list with the waypoint of a mission item. It is empty for an item that is not flown to, or has the
+    position (0, 0), which means the aircraft's present one. `command` is a MAV_CMD, `frame` a MAV_FRAME."""
     if command not in _FLOWN_TO or lat_deg == lon_deg == 0:
         return []
-    # Home and a landing are at no height: a picture is taken from the height of the waypoint before or after.
+    # Height 0, as of home and a landing, is not that from which pictures are taken: it counts as not given.
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
 
 
@@ -111,7 +114,7 @@ def _of_json(content: Any) -> Area:
 
 
 def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield kind and coordinates of the plain geometries of any object of GeoJSON."""
+    """Yield the plain geometries in any GeoJSON object, each as (kind such as "Polygon", coordinates)."""
     kind = content["type"]
     if kind == "Feature":
         if content["geometry"]:
@@ -124,7 +127,7 @@ def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _lat_lon(point: list[float]) -> LatLon:
-    """Return the point of GeoJSON, which writes longitude first."""
+    """Return a point of GeoJSON, which has longitude first, as (lat, lon)."""
     return _finite(point[1]), _finite(point[0])
 
 
@@ -135,8 +138,8 @@ def _ring(points: list[list[float]]) -> Ring:
 
 
 def _of_plan(items: list[dict[str, Any]]) -> Area:
-    """Read the items of a plan: simple ones, and surveys and corridors, whose way is written out beside their shape. A
-    plan writes null for numbers that it leaves to the autopilot."""
+    """Read the items of a plan: simple items, and surveys and corridors, which have both a polygon and the waypoints
+    computed from it. A plan has null for numbers that it leaves to the autopilot."""
     path: list[Waypoint] = []
     polygons: list[tuple[Ring, ...]] = []
     for item in items:

@@ -1,4 +1,5 @@
-"""An orthophoto: squares of ground are cut out of it, in metres on the ground and with true north up."""
+"""An orthophoto, from which pictures of squares of ground are cut: sides in metres on the ground, true north at the
+top. `cuttings` makes the frames of a map from them."""
 
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -15,12 +16,12 @@ from edgevpr.mapmaking.rasters import CRS, CPLE_BaseError, GeoRaster, RasterioEr
 Pixel = tuple[int, int]  # column and row
 Coordinate = TypeVar("Coordinate", float, Doubles)
 WGS84 = CRS.from_epsg(4326)
-_EDGE_POINTS = 25  # a straight edge of the file is a curve elsewhere
-_MOST_HALVINGS = 8  # to a pixel of a tile of 256
+_EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
+_MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 
 
 class Raster(Protocol):
-    """A grid of pixels: see `georaster.GeoRaster`."""
+    """A georeferenced grid of pixels: see `rasters.GeoRaster` for its fields."""
 
     crs: CRS
     transform: rasterio.Affine
@@ -33,17 +34,17 @@ class Raster(Protocol):
 
 
 def local_crs(at: Position) -> CRS:
-    """Return the plane that touches the Earth at a point: metres east and true north of it, the right distance and
-    direction of each point as seen from there."""
+    """Return the coordinate system of the plane that touches the Earth at `at`: metres east and true north of that
+    point. Distances and directions from that point are exact."""
     return CRS.from_proj4(f"+proj=aeqd +lat_0={at.lat_deg:.10f} +lon_0={at.lon_deg:.10f} +datum=WGS84 +units=m")
 
 
 class Orthophoto:
-    """An open orthophoto. `extent_deg` is (south, west, north, east), `middle` the middle of the file,
-    `resolution_m` the ground under a pixel there."""
+    """An open orthophoto. `extent_deg` is its bounding box (south, west, north, east), `middle` its middle, and
+    `resolution_m` the length in metres of a pixel on the ground in the middle."""
 
     def __init__(self, path: str | Path) -> None:
-        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of tiles. Raises SourceError."""
+        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
         self.path = Path(path)
         if not self.path.exists():
             raise SourceError(f"There is no orthophoto {path}: check the name.")
@@ -71,7 +72,7 @@ class Orthophoto:
         return Position(lat_deg, (lon_deg + 180) % 360 - 180)
 
     def outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
-        """Return points along the edge of the file in a coordinate system: x and y, float64 (N,)."""
+        """Return points along the edges of the file, x and y in the coordinate system `crs`, float64 (N,) each."""
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
         rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
@@ -80,8 +81,8 @@ class Orthophoto:
         return np.array(to_x), np.array(to_y)
 
     def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
-        """Return columns and rows (of the corners of pixels), float64 (N, 2), of points (N, 2) in metres east and north
-        of `at`."""
+        """Return (column, row), float64 (N, 2), whole numbers at the corners of pixels, of points (N, 2) in metres east
+        and north of `at`."""
         raster = self._raster
         x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
         if raster.crs.is_geographic:  # a file may count from 0 to 360 degrees, or over the date line
@@ -90,10 +91,10 @@ class Orthophoto:
         return np.column_stack(_through(~raster.transform, x, y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
-        """Cut a square of ground with its middle at `at` and true north up, `footprint_m` wide.
+        """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
 
-        Returns uint8 (side_px, side_px, 3) BGR, and bool of the same shape, True where there is data. Pixels without
-        data have the mean colour of the others. Raises ImageError for a damaged part of the file.
+        Returns the picture, uint8 (side_px, side_px, 3) BGR, and bool (side_px, side_px), True where there is data.
+        Pixels without data have the mean colour of the others. Raises ImageError for a damaged part of the file.
         """
         half_m = footprint_m / 2
         corners = self._pixels(at, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
@@ -107,7 +108,7 @@ class Orthophoto:
         if (high <= low).any():
             return _nothing(side_px)
         ground, valid = self._raster.read(tuple(low.tolist()), tuple(high.tolist()), shrink)
-        # Drawn twice as large and averaged, so that no pixel of the file is passed over.
+        # Warped to twice the size and averaged, so that no pixel of the file is skipped.
         large_px = 2 * side_px
         drawn = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
         view = cv2.getPerspectiveTransform(
@@ -117,7 +118,7 @@ class Orthophoto:
         warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
         picture = resized(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
         warped = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
-        # Wholly known pixels only: one at the edge is mixed with black, and would draw a line around the data.
+        # Only pixels that are wholly data: one at the edge is mixed with black, and would form a line around the data.
         seen = resized(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
         if seen.any():
             picture[~seen] = picture[seen].mean(axis=0)
@@ -129,7 +130,7 @@ class Orthophoto:
 
 
 def _through(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Send points (scalars or arrays) through an affine map; its own operator for that differs between releases."""
+    """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 
 

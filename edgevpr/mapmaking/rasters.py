@@ -1,5 +1,7 @@
-"""rasterio, which brings GDAL and PROJ, with a sentence where it is missing. All modules that read maps made of
-pictures import it from here."""
+"""Georeferenced pictures as grids of pixels: `GeoRaster`, a file that GDAL reads, and `TileFolder`, map tiles.
+
+Other modules import rasterio (GDAL and PROJ) from here, where a clear error is raised if it is not installed.
+"""
 
 import logging
 import math
@@ -14,7 +16,7 @@ from edgevpr.core.arrays import Bools, Bytes, Image
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.frames.images import resized
 
-# Read when GDAL first keeps a block of a file, in MB. Its default is a twentieth of the RAM.
+# Size of GDAL's cache in MB, read when it is first used. The default is a twentieth of the RAM.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 try:
@@ -36,17 +38,17 @@ logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each
 
 _DTYPES = ("uint8", "uint16")
 _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
-# A file of 16 bits is made 8 by one scale, from these percentiles of windows that are spread over it.
+# Values of 16 bits are scaled to 8 bits; these percentiles, of sample windows all over the file, become 0 and 255.
 _PERCENTILES = (2, 98)
 _WINDOWS, _WINDOW_PX = 12, 64
 
 
 class GeoRaster:
-    """An open raster. `crs` is its coordinate system, `transform` leads from column and row (of the corners of pixels)
-    to its coordinates, `width` and `height` are in pixels."""
+    """An open file. `crs` is its coordinate system. `transform` converts column and row (whole numbers at the corners
+    of pixels) to coordinates of `crs`. `width` and `height` are in pixels."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file. Raises SourceError for one that is no picture or has no geo-reference."""
+        """Open a file. Raises SourceError for one that is no picture or has no georeference."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -67,7 +69,8 @@ class GeoRaster:
             raise
 
     def _colour_bands(self) -> list[int]:
-        """Return the numbers of the bands blue, green and red, or that of grey; refuse what is no picture."""
+        """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError for a
+        file that is no picture."""
         kinds, dtypes = self._data.colorinterp, self._data.dtypes
         if not self.crs or self.transform.is_identity:
             raise SourceError(
@@ -89,7 +92,7 @@ class GeoRaster:
         return colours
 
     def _find_tone(self) -> Bytes:
-        """Return the 8-bit value of each 16-bit value, uint8 (65536,)."""
+        """Return the lookup table from 16-bit to 8-bit values, uint8 (65536,)."""
         values = []
         for top in np.linspace(0, max(0, self.height - _WINDOW_PX), _WINDOWS).astype(int):
             for left in np.linspace(0, max(0, self.width - _WINDOW_PX), _WINDOWS).astype(int):
@@ -100,10 +103,11 @@ class GeoRaster:
         return np.clip((np.arange(65536) - low) * (255 / max(high - low, 1)), 0, 255).round().astype(np.uint8)
 
     def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
-        """Read the window from column and row `low` to `high` (not included), whose sides are multiples of `shrink`,
-        each `shrink` x `shrink` pixels as their mean.
+        """Read the window from (column, row) `low` to `high` (not included), reduced by the factor `shrink`: each pixel
+        of the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
 
-        Returns uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError for a damaged window.
+        Returns the picture, uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError for a
+        damaged window.
         """
         width, height = high[0] - low[0], high[1] - low[1]
         shape = height // shrink, width // shrink
@@ -134,7 +138,7 @@ _HALF_WORLD_M = math.pi * 6_378_137.0  # of Web Mercator
 
 
 class TileFolder:
-    """The tiles of the highest zoom of a folder; fields as of `georaster.GeoRaster`."""
+    """Map tiles of a folder (zoom/x/y.png, Web Mercator), of its highest zoom. The fields are those of `GeoRaster`."""
 
     def __init__(self, folder: Path) -> None:
         """List the tiles. Raises SourceError for a folder that holds none."""
@@ -167,7 +171,7 @@ class TileFolder:
         self.transform = rasterio.Affine(pixel_m, 0, west_m, 0, -pixel_m, north_m)
 
     def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
-        """Read a window as `GeoRaster.read` does. A tile that is missing or damaged is a hole without data."""
+        """Read a window as `GeoRaster.read` does. There is no data where a tile is missing or damaged."""
         (left, top), (right, bottom) = low, high
         side = self._side_px
         bgra = np.zeros(((bottom - top) // shrink, (right - left) // shrink, 4), np.uint8)
@@ -182,7 +186,8 @@ class TileFolder:
         return bgra[..., :3], bgra[..., 3] > 127
 
     def _tile(self, column: int, row: int, side_px: int) -> Image | None:
-        """Read a tile, uint8 (side_px, side_px, 4) BGR and alpha; None where there is none."""
+        """Read the tile at `column` and `row`, counted from the north-west tile, and scale it to uint8 (side_px,
+        side_px, 4) BGR and alpha. None: it is missing or damaged."""
         path = self._tiles.get((self._left + column, self._top + row))
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path else None
         if picture is None or picture.dtype != np.uint8:

@@ -1,8 +1,9 @@
-"""Refinement of a map that looks straight down: its pictures, matched with each other, say where they really lie.
+"""Refinement of a map whose camera looks straight down: its pictures are matched with each other to correct the
+recorded positions. `mapmaking.making` calls it.
 
-Each place gets a pose: the direction and the footprint of its picture, and a position with a covariance. A camera
-mounted askew, a missing compass or a lens that nobody has measured are no obstacle: none of them is asked. A place that
-is tied to too few others stays where it was recorded, without a pose.
+Each place gets a pose: the direction and the footprint of its picture, and a position with a covariance. Headings, lens
+and mounting of the camera need not be known. A place with ties (see `graph`) to too few others keeps its recorded
+position and gets no pose.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,20 +24,19 @@ from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, pic
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sqlite import sentences
 
-_LEAST_GROUP = 4  # places tied to each other: three positions fit any error of the scale too well
-_MOST_TURN = 0.15  # standard deviation of a log: 9 degrees, 15 % of the footprint
-_AMISS = 4.0  # standard deviations
+_LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
+_MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
+_AMISS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refined:
-    """Result of refining a map. Of its `places`, `without_position` have none, `surveyed` needed no refining, and
-    `refined` have a pose now; the others could not be tied. `ties` pairs of pictures agree, `ties_refused` do not.
-    `recorded_sd_m` is how much recorded positions scatter in one axis, `moved_m` the median of how far places were
-    moved, `position_sd_m` the median standard deviation of a refined position, and `footprint_m` the median footprint
-    (None: nothing was refined). `contradictory` are places whose recorded position the pictures contradict: number,
-    image and metres.
-    """
+    """Result of refining a map of so many `places`. Of these, `without_position` have no position, `surveyed` needed no
+    refinement, and `refined` have a pose now; for the others there were too few ties.
+    `ties`, `ties_refused`: number of ties that agree with the solution, and of those that do not.
+    `recorded_sd_m`: standard deviation of recorded positions along one axis. `moved_m`, `position_sd_m`, `footprint_m`:
+    medians of the places' moves, of the standard deviations of refined positions, and of footprints (None: no place).
+    `contradictory`: places whose recorded position the pictures contradict: (number, image, metres between the two)."""
 
     places: int
     without_position: int
@@ -52,16 +52,16 @@ class Refined:
 
     @property
     def not_tied(self) -> int:
-        """Number of places with a position that could not be tied to others."""
+        """Number of places that have a position but too few ties to be refined."""
         return self.places - self.without_position - self.surveyed - self.refined
 
 
 def refine(
     place_map: PlaceMap, technique: Technique, watch: Watch[tuple[int, int]], images: str | Path | None = None
 ) -> Refined:
-    """Refine a map that is open for adding: all of it, or nothing is changed. `watch` passes pairs through and shows
-    progress. `images` is the folder of the pictures that the map was made of, where they are at hand. Raises MapError
-    where the file cannot be read or written.
+    """Refine a map that is open for adding, in one transaction. `watch` passes the pairs of places through and shows
+    progress. `images` is the folder of the map's pictures (None: not at hand). Raises MapError if the file cannot be
+    read or written.
     """
     places = list(_readable(place_map))
     placed = [place for place in places if place.position]
@@ -86,7 +86,7 @@ def refine(
         ties |= tied(watch(more, len(more)), look)
         solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
     sure = _is_sure(solved) & ~surveyed
-    # A place that is not tied goes back to where it was recorded, but for one whose pose is not by refining.
+    # A place without enough ties gets its recorded position back, unless its pose did not come from refinement.
     by_refining = np.array([place.pose is None or place.pose.recorded is not None for place in placed], bool)
     _write(place_map, placed, recorded_at, solved, sure, sure | by_refining)
     off_m = abs(solved.position - recorded)
@@ -114,19 +114,19 @@ def complex_metres(positions: Sequence[Position]) -> Complexes:
 
 
 def log_of(pose: Pose) -> complex:
-    """Return the log of a pose (see `graph`)."""
+    """Return the complex log of a pose, ln(footprint_m) - i up (see `graph`)."""
     return complex(np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg))
 
 
 def _recorded(place: Place) -> Position:
-    """Return the position of a place as it was before any refining."""
+    """Return the position of a place as it was before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
     assert position is not None  # of a place that has one
     return position
 
 
 def _is_sure(solved: Solved) -> Bools:
-    """Tell which places are tied to enough others, and lie as exactly as a pose should, bool (N,)."""
+    """Return which places have enough ties and a sufficiently exact solution to get a pose, bool (N,)."""
     members = np.bincount(solved.component)[solved.component]
     is_sure: Bools = (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
     return is_sure
@@ -151,7 +151,8 @@ def _write(
     sure: Bools,
     may_change: Bools,
 ) -> None:
-    """Write the solution: a pose for each place that is `sure`, none for the others that `may_change`."""
+    """Write the solution to the map: refined position and pose for places where `sure`, bool (N,), is True; recorded
+    position and no pose for the others where `may_change`, bool (N,), is True."""
     origin = recorded_at[0]
     with sentences(place_map.path), place_map.transaction():
         for at in np.flatnonzero(may_change).tolist():

@@ -1,11 +1,11 @@
-"""Ties between the places of a map: which pictures show the same ground, and how they lie over each other.
+"""Ties between the places of a map: which pictures show the same ground, and their relative poses. For `refine`.
 
-Only pairs that can overlap are looked at: places recorded near each other, and places mapped one after the other, since
-a recorded position may be far off. Once the graph has been solved, the pairs that should overlap by it are looked at
-too.
+Only pairs that may overlap are compared: places recorded near each other, and places mapped one after the other, since
+a recorded position may be far off. After the pose graph (see `graph`) is solved, pairs that overlap by it follow.
 
-Landmarks tell it most exactly. Where too few of them agree, and the pictures are at hand, all regions of one vote
-against the other, as in flight; landmarks are then asked again about what the vote says.
+Landmarks (ORB points) are compared first, as they are most exact. If too few of them agree, and the pictures are found,
+the technique compares their regions as in flight, which gives a rough relative pose ("vote"). Landmarks are then
+compared again near that pose.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,25 +27,25 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Agreement, Overlay, agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 
-_NEAREST = 8  # places recorded nearest
-_BEFORE = 2  # places mapped just before
+_NEAREST = 8  # each place is compared with so many places recorded nearest
+_BEFORE = 2  # and with so many places mapped just before
 _OVERLAPS = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
-_MOST_OVERLAPPING = 12  # pairs of one place, once the graph is solved
+_MOST_OVERLAPPING = 12  # pairs of one place, after the graph is solved
 # Chosen on aerial_caliterra and aerial_garfield28.
-_VOTE = 0.06  # share of the regions that agree, so that it is believed without any landmark
-_ASKED = 0.05  # share of the regions that agree, so that landmarks are asked about it
-# Standard deviations of one axis: of landmarks, which see tilt and relief as turns and scalings, and of a vote, which
-# is of whole cells, of turns of 15 degrees, and of any scaling within a fifth where few regions agree.
+_VOTE = 0.06  # share of regions that must agree to use a vote without landmarks
+_ASKED = 0.05  # share of regions that must agree to compare landmarks near the vote
+# Standard deviations (step, turn) along one axis: of landmarks, in which tilt and relief look like turns and scalings;
+# and of a vote, which has whole cells, turns of 15 degrees, and an uncertain scale if few regions agree.
 _OF_LANDMARKS, _OF_VOTE = (0.01, 0.05), (0.016, 0.09)
-_TRIED = 8  # rotations of a pair
-_KEPT = 512  # landmarks and descriptors: a place is looked at with its neighbours, which come soon after each other
-_KEPT_PICTURES = 4
+_TRIED = 8  # hypotheses of rotation and height for a pair
+_KEPT = 512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
+_KEPT_PICTURES = 4  # descriptors that are cached
 
 
 @dataclass(frozen=True, slots=True)
 class Tie:
-    """The way in which one picture lies over another: `step` and `turn` complex, and their standard deviations (see
-    `graph.Ties`)."""
+    """Relative pose of picture `query` to picture `place`: complex `step` (right + i up, in shares of the place's
+    longest side) and `turn` (log of the scale + i counter-clockwise rotation), and their standard deviations."""
 
     step: complex
     turn: complex
@@ -54,12 +54,12 @@ class Tie:
 
 
 Pair = tuple[int, int]  # the numbers of query and place, the later one first
-Look = Callable[[int, int], Tie | None]  # at a pair
-Encoded = Callable[[str], Descriptor | None]  # the picture of this name
+Look = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie found
+Encoded = Callable[[str], Descriptor | None]  # encodes the picture of this name; None: it cannot be used
 
 
 def likely_pairs(recorded: Complexes) -> list[Pair]:
-    """Return the pairs of places, recorded at complex (N,) metres in the order of mapping, that may overlap."""
+    """Return the pairs of places that may overlap. `recorded` is their positions, complex (N,) metres, as mapped."""
     count = len(recorded)
     pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
     if count > 1:
@@ -70,7 +70,7 @@ def likely_pairs(recorded: Complexes) -> list[Pair]:
 
 
 def overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
-    """Return the pairs of the places `of` bool (N,) that overlap, by a solved graph."""
+    """Return the pairs that overlap by `position` and `log` of a solved graph, among places where `of` (N,) is True."""
     members = np.flatnonzero(of).tolist()
     if len(members) < 2:
         return []
@@ -91,12 +91,12 @@ def _later_first(one: int, other: int) -> Pair:
 
 
 def tied(pairs: Iterable[Pair], look: Look) -> dict[Pair, Tie]:
-    """Look at each pair; return the ties that were found."""
+    """Compare each pair with `look`; return the ties that were found."""
     return {pair: tie for pair in pairs if (tie := look(*pair))}
 
 
 def ties_of(tie_of: dict[Pair, Tie]) -> Ties:
-    """Return ties as the arrays of a graph."""
+    """Convert ties to the arrays that `graph.solve` takes."""
     pairs = np.array(list(tie_of), np.intp).reshape(-1, 2)
     columns = [(tie.step, tie.turn, tie.step_sd, tie.turn_sd) for tie in tie_of.values()]
     step, turn, step_sd, turn_sd = np.array(columns, complex).reshape(-1, 4).T
@@ -104,8 +104,8 @@ def ties_of(tie_of: dict[Pair, Tie]) -> Ties:
 
 
 def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encoded: Encoded | None) -> Look:
-    """Return the look at a pair of `places`, by their numbers in this list. A place that cannot be read, or has no
-    landmarks, ties nothing by them."""
+    """Return the function that compares two of `places`, given by their indices in this list, and returns their tie.
+    `encoded` encodes the places' pictures (None: they are not at hand, so only landmarks are compared)."""
     coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
 
     @lru_cache(_KEPT)
@@ -149,7 +149,7 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
 
 
 def pictures(folder: str | Path, technique: Technique) -> Encoded:
-    """Return the pictures of a folder by name, as descriptors; None for one that is not there or cannot be used."""
+    """Return the function that encodes the picture of a given name in `folder` (None: missing or cannot be used)."""
     paths = {decoded_name(path.name): path for path in list_images(folder)}
 
     def encoded(name: str) -> Descriptor | None:
@@ -162,7 +162,8 @@ def pictures(folder: str | Path, technique: Technique) -> Encoded:
 
 
 def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
-    """Choose the hypotheses to try; neighbours of a map are from about the same height."""
+    """Return the best hypotheses (rotations of query `asking`) for `Technique.match`, by the scores with the place's
+    coarse part `part`. Only the map's own height is tried: neighbours are from about the same height."""
     _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
     assert by_hypothesis is not None  # of a technique that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
