@@ -47,9 +47,9 @@ def append(file: BinaryIO, data: bytes) -> None:
     end = file.seek(0, os.SEEK_END)
     try:
         rest = memoryview(data)
-        while rest:  # a nearly full disk takes a part, and reports only at the next part that it is full
+        while rest:  # a nearly full disk writes a part, and reports only at the next write that it is full
             taken = file.write(rest)
-            if not taken:  # a terminal that is stopped
+            if not taken:  # such as a terminal that is stopped
                 raise OSError(errno.EAGAIN, "it takes nothing more at the moment")
             rest = rest[taken:]
     except OSError:

@@ -29,14 +29,14 @@ class Ended:
 
 def ask_child(module: str, job: Any, limit_s: float) -> Ended:
     """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return how it ended."""
-    # A session of its own: only the parent process is to act on Ctrl-C.
+    # The child gets its own session, so that only the parent process receives Ctrl-C.
     process = subprocess.Popen(
         [sys.executable, "-m", module],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         encoding="utf-8",
-        errors="replace",  # a library may repeat what stands in a broken file
+        errors="replace",  # a library may print bytes of a damaged file
         start_new_session=True,
     )
     try:
@@ -68,7 +68,7 @@ def end_with_parent(parent_pid: int) -> None:
     import ctypes  # not at the top: the parent may be a flight, which has no use for it
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent_pid:  # it ended before the line above
+    if os.getppid() != parent_pid:  # the parent ended before the line above
         sys.exit(1)
 
 

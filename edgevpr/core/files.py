@@ -21,14 +21,14 @@ _KERNEL_FILE_BYTES = 1_000_000  # read at most of a file of /proc or /sys, which
 
 
 def shipped(kind: str) -> Path:
-    """Return the folder of `kind` ("profiles", "models" or "deploy"): inside the wheel, or at the top of a checkout."""
+    """Return shipped folder `kind` ("profiles", "models" or "deploy"): in the wheel, or at the top of the checkout."""
     package = Path(__file__).parents[1]
     in_wheel = package / "shipped" / kind
     return in_wheel if in_wheel.is_dir() else package.parent / kind
 
 
 def own_folder() -> Path:
-    """Return the user's own folder, which may not exist: edgevpr below XDG_DATA_HOME or ~/.local/share."""
+    """Return the user's own folder, which may not exist: `edgevpr` in XDG_DATA_HOME or ~/.local/share."""
     # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
     return Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")) / "edgevpr"
 
@@ -74,7 +74,7 @@ def read_file(path: str | Path, most_bytes: int) -> bytes:
     with open_file(path, most_bytes) as handle:
         # Never ask for more than the file has: Python allocates the requested size first.
         size = os.fstat(handle.fileno()).st_size or min(most_bytes, _KERNEL_FILE_BYTES)
-        return handle.read(size) or b""  # None: a file of the kernel that would have to be waited for
+        return handle.read(size) or b""  # read gives None for a kernel file that has no data yet
 
 
 def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
@@ -89,7 +89,7 @@ def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
 def arrays_of(content: bytes, most_bytes: int) -> "dict[str, np.ndarray[Any, Any]]":
     """Unpack the `content` of an .npz file of any origin to its arrays by name. Raises ValueError for one that is
     damaged, holds Python objects, or takes more than `most_bytes` unpacked."""
-    import zipfile  # not at the top: only networks and sets of researchers come in archives
+    import zipfile  # not at the top: only networks and data sets are in archives
 
     import numpy as np
 

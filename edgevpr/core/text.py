@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 # user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is replaced.
-# An address that was handled as a path has one `/` only.
+# An address that was handled as a path has only one `/` after the colon.
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
-# Cameras take their secrets in the query of an address, too.
+# Passwords and keys in the query part of an address, such as ?token=abc, which cameras use too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _COLUMNS, _TERMINAL_COLUMNS = 120, 79
 _SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
@@ -35,7 +35,7 @@ _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 def printable(text: str, keep: str = "") -> str:
     """Escape characters that a terminal acts on or cannot show: control characters, line breaks, marks that change the
     direction of writing, bytes that are not UTF-8. The characters in `keep` stay as they are."""
-    if text.isprintable():  # false for all of these
+    if text.isprintable():  # false if there is any such character
         return text
     return "".join(char if char.isprintable() or char in keep else _escape(char) for char in text)
 
@@ -103,8 +103,7 @@ def json_line(value: Any) -> bytes:
 
 
 def _plain(value: Any) -> Any:
-    """Convert `value` to types of JSON. Numbers are rounded to seven decimals (a centimetre of latitude, as in MAVLink)
-    or, below 1, to seven significant digits."""
+    """Convert `value` to JSON types; numbers get seven decimals (a centimetre of latitude) or, if below 1, 7 digits."""
     if isinstance(value, str):
         return without_passwords(value)
     if value is None or isinstance(value, (bool, int)):
@@ -187,7 +186,7 @@ def require_picture(path: Path) -> None:
 
 def figure(width_in: float, height_in: float) -> "Figure":
     """Make an empty matplotlib figure; sizes in inches."""
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # its messages about fonts are of no use to the user
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # hides its messages about fonts
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout="constrained")

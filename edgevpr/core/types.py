@@ -1,4 +1,4 @@
-"""The values that packages pass to each other: frozen dataclasses."""
+"""The values that packages pass to each other: frozen dataclasses, and the interface of recordings (`Tape`)."""
 
 import math
 from collections.abc import Callable
@@ -164,7 +164,7 @@ class StageCost:
         return StageCost(self.wall_s * times, self.cpu_s * times)
 
     def utilisation(self, cores: int) -> float:
-        """Compute U of equation 5.1: the share of the whole machine that was busy, 0..1."""
+        """Return U of equation 5.1 of the thesis: the share of all `cores` that was busy, 0..1."""
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
 
 
@@ -188,12 +188,12 @@ class Steps:
 
     @property
     def encoding(self) -> StageCost:
-        """Cost of encoding as the thesis defines it: everything before matching."""
+        """Cost of encoding as the thesis defines it: the steps before matching, without `read`."""
         return self.prepare + self.gate + self.encode
 
     @property
     def match(self) -> StageCost:
-        """Cost of matching as the thesis defines it: everything after encoding."""
+        """Cost of matching as the thesis defines it: all steps after encoding."""
         return self.scan + self.compare + self.verify + self.locate
 
 

@@ -67,7 +67,7 @@ class WholePictures:
 
     def __init__(self, container: "InputContainer", are_missed: bool) -> None:
         self.container, self.stream = container, container.streams.video[0]
-        self.time_base = self.stream.time_base or Fraction(1, 1_000_000)  # seconds of a time stamp's unit
+        self.time_base = self.stream.time_base or Fraction(1, 1_000_000)  # unit of the time stamps in seconds
         self.is_stamped = not container.format.flags & _UNSTAMPED
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory

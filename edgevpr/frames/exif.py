@@ -16,7 +16,7 @@ T = TypeVar("T")
 Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSLatitude"
 
 _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
-_MOST_XMP_BYTES = 65_536  # that of a JPEG fits a segment
+_MOST_XMP_BYTES = 65_536  # largest segment of a JPEG
 _BEGIN, _END = b"<x:xmpmeta", b"</x:xmpmeta>"
 _DJI, _PARROT = "{http://www.dji.com/drone-dji/1.0/}", "{http://www.parrot.com/drone-parrot/1.0/}"
 _PIX4D = ("{http://pix4d.com/camera/1.0/}", "{http://pix4d.com/camera/1.0}")
@@ -79,7 +79,7 @@ def _position(tags: Tags, alt_m: float | None) -> Position | None:
 def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
     degrees, minutes, seconds = map(float, tags[name].values)
     value = degrees + minutes / 60 + seconds / 3600
-    # 60 itself is what rounding makes of 59.99999.
+    # 60 is allowed: 59.99999 may have been rounded to it.
     if not (0 <= minutes <= 60 and 0 <= seconds <= 60 and degrees >= 0 and value <= limit):
         raise _Senseless(f"{name.removeprefix('GPS ')} {degrees:g} {minutes:g} {seconds:g}")
     return signs[tags[f"{name}Ref"].values.strip()] * value
@@ -117,7 +117,7 @@ def _time_s(name: str, text: str) -> float:
     if not text.strip("\0 :0"):  # the standard's way of writing "unknown", and that of a clock that was never set
         raise KeyError(name)
     try:
-        if ":" in text:  # else seconds, which are no EXIF
+        if ":" in text:  # without a colon it would be seconds, which EXIF does not have
             return parse_time(text)
     except (ValueError, OverflowError):
         pass

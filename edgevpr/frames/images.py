@@ -69,7 +69,7 @@ def _holds_images(folder: Path) -> bool:
     try:
         return any(is_image(path.name) for path in folder.iterdir())
     except OSError:
-        return False  # no folder, or one that may not be listed
+        return False  # not a folder, or not readable
 
 
 def counting_order(name: str) -> tuple[list[str | int], str]:

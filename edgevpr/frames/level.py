@@ -18,13 +18,13 @@ from edgevpr.frames.images import resized
 
 MOST_TILT_DEG = 45.0
 _MOST_OFF_DOWN_DEG = 85.0  # between a corner's ray and straight down: beyond are the horizon and far too distant ground
-_LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # less than these changes no match
+_LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.
 _ZOOMS = (0.3, 4.0)
 _LEAST_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
 _HIGHEST_M = 10_000.0
-_LONGEST_PX = 1024  # of a warped picture: no technique sees more
+_LONGEST_PX = 1024  # largest side of a warped picture: no technique uses more pixels
 _SUBPIXEL_BITS = 4
 
 
@@ -111,7 +111,7 @@ def levelled(
         return Levelled(frame.image, overlay, view)
 
     side = min(taking.longest_px, _LONGEST_PX)
-    out_px = taking.focal_px * zoom * side / taking.longest_px  # that the output has for each unit of height
+    out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
     turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
     middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
     right, down = (side - 1) / 2 - middle
@@ -179,7 +179,7 @@ class _Taking:
         across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)
         self.corners = np.array([[*across, *across[::-1]], [along[0], along[0], along[1], along[1]], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
-        # Degrees between what the camera looks at and straight down.
+        # Degrees between the viewing direction and straight down.
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
 
     @property

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
 
-_LOOK_PX = (60, 80)  # of the coarse copy, at least: rows and columns
+_LOOK_PX = (60, 80)  # least rows and columns of a coarse copy
 _BANDS = 12
 _REMEMBERED = 6  # pictures: decoders use about as many buffers in rotation
 _SAME_LEVELS, _SAME_SHARE = 1, 0.99  # bands are equal if this share of their pixels differs by at most this many levels
@@ -94,7 +94,7 @@ class Newness:
 
     def __init__(self) -> None:
         self._before: deque[NDArray[np.int16]] = deque(maxlen=_REMEMBERED)  # pictures as bands, the newest first
-        self._moving = np.zeros(_BANDS)  # share of the latest pictures in which each band moved
+        self._moving = np.zeros(_BANDS)  # share of the latest pictures in which each band changed
 
     def refusal(self, look: Image) -> Refusal | None:
         """Return why the picture with the coarse copy `look`, uint8 (h, w), is not new; None if it is new."""

@@ -29,12 +29,12 @@ READ_TIMEOUT_S = 3.0
 # are allowed.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
 _SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
-_BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # pixel formats that begin with a plane of brightness
+_BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # prefixes of pixel formats whose first plane is the brightness
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
 _TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
 _RESTART_S = 5.0  # a larger change of the delay: the sender has restarted, or something has held the stream up
-_BACKLOG_S = 0.005  # while the delay falls by more than this from picture to picture, a backlog is being fetched
-_IN_TIME = 3  # pictures in a row without such a fall after which the backlog is over
+_BACKLOG_S = 0.005  # a picture with a delay shorter than the least so far by more than this was in a backlog
+_IN_TIME = 3  # pictures in a row not in a backlog after which there is none any more
 _WAITED_S = 0.002  # a picture that was returned sooner than this was in a buffer already
 _USUAL_OF, _AS_USUAL = 9, 1.5  # number of waits whose median is the usual one, and the multiple of it that is normal
 _WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due to the path, and not to congestion

@@ -76,7 +76,7 @@ def ask(
     the places of `place_map`, and `rule` is the rule for accepting a match. `pictures` are pairs of a place's number
     and its picture as it was encoded for the map. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
-    assert rule.sure is not None  # of a technique that has a confidence
+    assert rule.sure is not None  # set for a technique that has a confidence model
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
     looks_down = technique.spec.cells is not None

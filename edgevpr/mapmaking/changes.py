@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
 
-_STRENGTH = (0.3, 1.3)  # from a cloud to snow
+_STRENGTH = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
 _TONES = 6  # points of a tone curve
 _PATCHES = 2  # most plain patches that hide a part of the picture
 

@@ -103,7 +103,7 @@ def _require_touching(orthophoto: Orthophoto, area: Area) -> None:
         area.extent_deg,
     )
     if south > other_north + 1 or other_south > north + 1 or west > other_east + 1 or other_west > east + 1:
-        raise _elsewhere(orthophoto, area)  # so far away that metres from here mean nothing
+        raise _elsewhere(orthophoto, area)  # too far away to be projected to this plane
 
 
 def _elsewhere(orthophoto: Orthophoto, area: Area) -> UsageError:

@@ -70,7 +70,7 @@ class Cuttings:
         from edgevpr.mapmaking.cuttings import OrthophotoSource
         from edgevpr.mapmaking.lattice import lattice_of
         from edgevpr.mapmaking.missions import read_area
-        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
+        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
 
         area = read_area(self.area) if self.area else None
         margin_m = self.footprint_m if self.margin_m is None else self.margin_m

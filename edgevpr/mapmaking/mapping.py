@@ -81,7 +81,7 @@ class Gaps:
 
 
 def _frame_of(event: Recognition) -> Frame:
-    assert event.frame is not None  # of a walk of frames
+    assert event.frame is not None  # always set when frames are processed
     return event.frame
 
 
@@ -139,7 +139,7 @@ def build_map(
     def keep(kept: Iterable[Kept]) -> None:
         for event, salience in kept:
             frame = _frame_of(event)
-            assert event.descriptor is not None  # of a frame that could be encoded
+            assert event.descriptor is not None  # set for every frame that could be encoded
             place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
             counts.update(added=1, without_position=frame.position is None)
             if salience and salience.is_low and event.worth:

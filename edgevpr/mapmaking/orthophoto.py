@@ -85,7 +85,7 @@ class Orthophoto:
         and north of `at`."""
         raster = self._raster
         x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
-        if raster.crs.is_geographic:  # a file may count from 0 to 360 degrees, or over the date line
+        if raster.crs.is_geographic:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
             middle, _ = _through(raster.transform, raster.width / 2, raster.height / 2)
             x += 360 * np.round((middle - x) / 360)
         return np.column_stack(_through(~raster.transform, x, y))

@@ -121,7 +121,7 @@ def log_of(pose: Pose) -> complex:
 def _recorded(place: Place) -> Position:
     """Return the position of a place as it was before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
-    assert position is not None  # of a place that has one
+    assert position is not None  # callers pass only places with a position
     return position
 
 

@@ -165,7 +165,7 @@ def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
     """Return the best hypotheses (rotations of query `asking`) for `Technique.match`, by the scores with the place's
     coarse part `part`. Only the map's own height is tried: neighbours are from about the same height."""
     _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
-    assert by_hypothesis is not None  # of a technique that looks down
+    assert by_hypothesis is not None  # set by techniques for a camera that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
     likely: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
     return likely
@@ -177,7 +177,7 @@ def _vote_of(match: FineMatch, cells: int) -> Overlay:
 
 
 def _of_landmarks(found: Agreement) -> Tie:
-    assert found.shift_share is not None  # of landmarks that agree
+    assert found.shift_share is not None  # set if any landmarks agree
     assert found.rotation_deg is not None
     return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
 
