@@ -135,6 +135,7 @@ def test_a_fix_is_sent_and_answered(link):
     assert wait_until(lambda: link.stats().acks) == {"ACCEPTED": 1}
 
 
+@pytest.mark.slow
 def test_a_fix_of_an_old_frame_never_leaves(link):
     link, clock = link
     sending = link.send_fix(fix(clock, age_s=6.2))

@@ -5,6 +5,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 PACKAGE = Path(__file__).parents[1] / "edgevpr"
 # A docstring says what a thing does or is. One that begins so only points at it.
 POINTING = {"What", "Whether", "How", "Those", "Where", "When", "Which", "Who", "Why", "That"}

@@ -17,6 +17,7 @@ def test_the_command_line_imports_nothing_heavy_before_it_knows_what_is_asked():
     assert not loaded & {"av", "cv2", "numpy", "onnxruntime", "pymavlink", "yaml", "psutil", "serial"}
 
 
+@pytest.mark.slow
 def test_imports_run_one_way():
     lint_imports = Path(sys.executable).with_name("lint-imports")
     if not lint_imports.exists():

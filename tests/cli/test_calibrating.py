@@ -146,6 +146,7 @@ def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, co
     assert calibration_in(bare) is None
 
 
+@pytest.mark.slow
 def test_an_export_colours_the_places_that_were_asked_for(mapped, tmp_path):
     out = tmp_path / "m.geojson"
     assert main(["map", "export", str(mapped), "--geojson", str(out)]) == 0
@@ -178,6 +179,7 @@ def test_a_check_before_the_flight_says_what_to_expect(mapped, bare_map, flight,
         assert said in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_damaged_calibration_is_a_warning_and_no_more(mapped, capsys, caplog):
     with PlaceMap.open_for_adding(mapped) as place_map:
         place_map.record_calibration(place_map.calibration.replace("models", "moduls"))

@@ -125,6 +125,7 @@ def test_eval_measures_each_form_in_a_row_of_its_own(capsys, flight):
     assert found["hog"]["weights"] is None
 
 
+@pytest.mark.slow
 def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flight):
     write_network(models, "wrong", fault="nan")
     code, found, said = evaluated(capsys, flight, "--techniques", "wrong,cohog", "--form", "float,8bit")

@@ -80,6 +80,7 @@ def test_seqslam_matches_sequences_of_ten_by_itself(capsys, flight, maps):
     assert any(each["accepted"] for each in alone[:9])
 
 
+@pytest.mark.slow
 def test_run_takes_the_sequence_and_logs_it(flight, maps, tmp_path):
     log_path = tmp_path / "log.jsonl"
     flown = ["run", "--map", maps / "hog.gpkg", "--source", flight / "query", "--rate-hz", "60", "--log", log_path]

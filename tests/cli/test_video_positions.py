@@ -15,6 +15,7 @@ def flight(tmp_path):
     return film(tmp_path / "flight.mp4", "-c:v", "libx264"), table
 
 
+@pytest.mark.slow
 def test_a_map_of_a_video_has_the_positions_of_its_table(flight, tmp_path, capsys):
     video, table = flight
     path = tmp_path / "valley.gpkg"

@@ -106,6 +106,7 @@ def test_a_file_that_is_missing_or_no_image_has_no_tag(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_exif_with_bytes_gone_wrong_never_raises_and_never_leaves_the_earth(tmp_path):
     gps = GPS | {ALT: 198.5, TIME: (16.0, 31.0, 59.5), DATE: "2016:06:23", DIRECTION: 10.0}
     photographs.write_jpeg(tmp_path / "photo.jpg", gps, {TAKEN: "2016:06:23 16:31:59"})

@@ -207,6 +207,7 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
     source.close()
 
 
+@pytest.mark.slow
 def test_the_capture_is_released_by_the_thread_that_reads_it_and_opened_anew():
     cameras = [SteppedCamera(), SteppedCamera()]
     waiting = iter(cameras)

@@ -20,6 +20,8 @@ from edgevpr.mapmaking.lattice import lattice_of
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
+pytestmark = pytest.mark.slow
+
 
 def frames_of(source: OrthophotoSource) -> list:
     frames = []

@@ -71,6 +71,7 @@ def test_noisy_positions_become_exact_by_ties_and_wrong_ties_are_named(wrong):
     assert solved.times == pytest.approx(1, rel=0.4)
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_the_errors():
     position, log = flight(legs=3, a_leg=8)
     far, turned = [], []

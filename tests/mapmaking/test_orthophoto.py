@@ -14,6 +14,8 @@ from rasters import HOME, MARKS_M, grid, in_crs, marked, marked_raster, write_ra
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
+pytestmark = pytest.mark.slow
+
 FOOTPRINT_M, SIDE_PX = 80.0, 400
 PIXEL_M = FOOTPRINT_M / SIDE_PX
 

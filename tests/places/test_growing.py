@@ -86,6 +86,7 @@ def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_do
         np.testing.assert_array_equal(ours.scores, theirs.scores)
 
 
+@pytest.mark.slow
 def test_a_full_index_keeps_its_best_places_and_the_file_keeps_all(empty_map):
     growing = GrowingIndex(
         place_map=empty_map, technique=Signs(), budget_bytes=40 * bytes_per_place(Signs.spec) + 5, room=10**6
@@ -105,6 +106,7 @@ def test_a_full_index_keeps_its_best_places_and_the_file_keeps_all(empty_map):
         np.testing.assert_array_equal([index.lat_deg[slot], index.lon_deg[slot]], position or [np.nan, np.nan])
 
 
+@pytest.mark.slow
 def test_the_budget_holds_at_every_moment_of_growing(empty_map):
     technique, places = Signs(), 2000
     each = bytes_per_place(technique.spec)

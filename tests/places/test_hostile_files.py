@@ -201,6 +201,7 @@ def test_a_map_that_could_not_be_made_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", ["-wal", "-wal and -shm"])
 def test_a_left_over_log_in_a_folder_that_may_not_be_written_is_read(left):
     with tempfile.TemporaryDirectory() as name:  # not pytest's own folder: nobody else may look into that

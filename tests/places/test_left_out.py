@@ -171,6 +171,7 @@ CORRIDOR = Path(os.environ.get("EDGEVPR_DATA", Path(__file__).parents[2].parent 
 DECEIVED = range(58, 68)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason=f"{CORRIDOR} is not there")
 def test_on_real_pictures_no_wrong_place_is_accepted_for_want_of_the_right_ones(tmp_path):
     dataset = load_dataset(CORRIDOR / "query", CORRIDOR / "ref", CORRIDOR / "ground_truth.csv")

@@ -82,6 +82,7 @@ def test_gdal_reads_the_places(map_path):
     np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), descriptor(4).coarse)
 
 
+@pytest.mark.slow
 def test_kill_9_while_adding_loses_nothing_that_was_confirmed(tmp_path):
     path = tmp_path / "killed.gpkg"
     confirmed = 0
@@ -104,6 +105,7 @@ def test_kill_9_while_adding_loses_nothing_that_was_confirmed(tmp_path):
         confirmed = len(held)
 
 
+@pytest.mark.slow
 def test_a_map_left_open_by_a_dead_program_is_read_whole_while_its_log_is_beside_it(tmp_path):
     path = tmp_path / "left.gpkg"
     writer = subprocess.Popen([sys.executable, map_writer.__file__, str(path), "0"], stdout=subprocess.PIPE, text=True)

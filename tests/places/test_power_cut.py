@@ -15,6 +15,8 @@ from map_writer import SPEC, descriptor, frame, make_map
 from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
 
+pytestmark = pytest.mark.slow
+
 FIRST, PLACES = 2, 8  # of an earlier flight, and added to them
 HEADER, FRAME = 32, 24 + 4096  # of SQLite's write-ahead log: its header, and each page with its own
 

@@ -157,6 +157,7 @@ def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
     np.testing.assert_array_equal(dense(ranking, len(row)), row)
 
 
+@pytest.mark.slow
 def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     places, length = 50_000, 10
     index: PlaceIndex = index_of(range(places))

@@ -65,6 +65,7 @@ def _assert_same_goodness(grey: np.ndarray, which: str, cell_px: int) -> None:
         np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("cell_px", [8, 16])
 @pytest.mark.parametrize("name", PICTURES)

@@ -55,6 +55,7 @@ def places_and_queries(name):
     return [it.encode(picture) for picture in pictures], queries
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_picture_finds_itself_darker_and_noisier(name, form):

@@ -53,6 +53,7 @@ def test_they_depend_on_the_order_of_the_scores_alone(queries):
     assert figures(scores[turned], ranks[turned])["precision_recall"] == found["precision_recall"]
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(QUERIES)
 def test_scikit_learn_says_the_same(queries):
@@ -78,6 +79,7 @@ def test_an_interval_holds_the_share_and_is_the_same_every_time(count, share):
     assert interval(hits) == (low, high)
 
 
+@pytest.mark.slow
 def test_more_queries_make_an_interval_narrower_and_all_right_of_few_is_not_all_right():
     few, many = np.arange(43) < 42, np.arange(4300) < 4200
     assert np.ptp(interval(few)) > 5 * np.ptp(interval(many))

@@ -62,6 +62,7 @@ def test_the_later_flight_comes_back_from_elsewhere_and_leaves_the_map():
     assert 6 < max(turned_deg) < 13
 
 
+@pytest.mark.slow
 def test_positions_come_back_to_a_decimetre(tmp_path, scene):
     flight = first_frames(mapping_flight(1), 17)
     names = list(write_flight(tmp_path, scene, flight))

@@ -51,6 +51,7 @@ def test_a_known_point_appears_where_it_must(marked, change, column, row):
     assert mark_in(frame) == pytest.approx((MIDDLE[0] + column, MIDDLE[1] + row), abs=0.6)
 
 
+@pytest.mark.slow
 def test_the_homography_and_the_picture_agree_at_any_pose(marked):
     ground = lit(marked, NOON, 0)
     rng = np.random.default_rng(5)
@@ -69,6 +70,7 @@ def test_the_homography_and_the_picture_agree_at_any_pose(marked):
         assert mark_in(frame) == pytest.approx(expected[:2] / expected[2], abs=0.6)
 
 
+@pytest.mark.slow
 def test_every_part_of_the_light_and_the_camera_has_its_effect():
     scene = make_scene(2, 120, 100, metres_per_pixel=0.4)
     pose = CameraPose(east_m=60, north_m=50, height_m=40, heading_deg=0)
@@ -105,6 +107,7 @@ def plain(width_m: float = 60, metres_per_pixel: float = 0.5) -> Scene:
     return Scene(np.full((side, side, 3), 120, np.uint8), np.full((side, side), 300, np.uint16), metres_per_pixel)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another_one():
     one, again, other = (make_scene(seed, 160, 120, metres_per_pixel=0.5) for seed in (7, 7, 8))
     np.testing.assert_array_equal(one.albedo, again.albedo)

@@ -18,6 +18,8 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, ground_to_pixel
 from edgevpr.lab.simulate.rehearsal import WEATHERS, PlannedPicture, poses_of, read_shots, seen_from, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
+pytestmark = pytest.mark.slow
+
 CLEAR = WEATHERS["clear"].light
 CAMERA = Camera(noise_sigma=0)
 LEVEL = CameraPose(east_m=0, north_m=0, height_m=80, heading_deg=0)

@@ -46,6 +46,7 @@ def test_words_make_the_technique_work(kind, technique, folder, own_models):
     assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
     for out in ("a", "b"):
         assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6", "--out", str(tmp_path / out)) == 0
@@ -53,6 +54,7 @@ def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
     assert first == again
 
 
+@pytest.mark.slow
 def test_words_lie_among_the_descriptors(folder):
     """Each descriptor is nearer to its word than to the mean of all, by far."""
     assert train(folder, "--kind", "vlad", "--count", "16") == 0
@@ -64,6 +66,7 @@ def test_words_lie_among_the_descriptors(folder):
     assert len(np.unique(nearest(local, words))) == 16
 
 
+@pytest.mark.slow
 def test_whitened_vectors_of_the_pictures_learnt_from_are_uncorrelated_and_alike_in_size(folder):
     assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6") == 0
     words = load_words("mine", "vlad", 8)
@@ -94,6 +97,7 @@ def test_what_makes_no_sense_is_refused(folder, own_models, capsys):
     assert "mine_vlad8.npz" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_whitening_of_pictures_that_are_all_alike_is_refused(folder, own_models, capsys):
     first, *others = sorted(folder.iterdir())
     for other in others:

@@ -62,6 +62,7 @@ def flown(recording, tmp_path, clock, results):
         return flight.fly(FakeSource(pictures, clock, work=autopilot.be_seen))
 
 
+@pytest.mark.slow
 def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path, monkeypatch):
     monkeypatch.setattr("edgevpr.runtime.flight.autopilot._SETTLED_WITHIN_S", 60.0)
     clock, statuses = FakeClock(), []

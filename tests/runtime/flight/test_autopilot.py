@@ -116,6 +116,7 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_
     assert all(0.9 <= each <= 1 for each in told)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
     clock = FakeClock()
     link, health = FakeLink(clock), []

@@ -109,6 +109,7 @@ def learning_flight(recording, tmp_path, clock, link):
     return Flight(tmp_path / "m.gpkg", tmp_path / "log", clock, link, learns=True, **settings)
 
 
+@pytest.mark.slow
 def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
     link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
     read = []
@@ -125,6 +126,7 @@ def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
     assert link.texts() == [(6, "edgevpr: learning off by command"), (6, "edgevpr: learning on by command")]
 
 
+@pytest.mark.slow
 def test_fixes_that_are_sent_while_nothing_is_learnt_still_keep_their_echo_from_being_learnt(
     recording, tmp_path, clock
 ):

@@ -5,6 +5,8 @@ from controlled import Controlled
 
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = pytest.mark.slow
+
 FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
 GUIDED, LAND, TAKEOFF = 4, 9, 13
 OUR_GPS = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}

@@ -58,6 +58,7 @@ def mapped(line):
     return position is None or round((position["lat_deg"] - 50) / STEP_DEG) + 1 == line["place"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", range(1, PLACES + 1))
 def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it_may_be_seen(
     place_map, tmp_path, place
@@ -83,6 +84,7 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
     assert flight.end["left_out"] == queries[-1]["totals"]["left_out"] == 1
 
 
+@pytest.mark.slow
 def test_each_damaged_place_is_counted_once_however_often_it_is_met(place_map, tmp_path):
     damages = [lambda n=n: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", n) for n in (4, 9)]
     queries, lines, flight = fly(place_map, tmp_path / "log", [*damages, *[nothing] * 20])
@@ -93,6 +95,7 @@ def test_each_damaged_place_is_counted_once_however_often_it_is_met(place_map, t
     assert sum(line["accepted"] for line in queries) >= 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", COLUMNS)
 def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_is_not_in_the_map(
     place_map, tmp_path, column

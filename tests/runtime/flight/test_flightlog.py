@@ -353,6 +353,7 @@ sys.stdout.write(log.path.read_text())
 """
 
 
+@pytest.mark.slow
 def test_a_file_system_that_fills_up_and_is_cleared_holds_only_whole_lines(tmp_path):
     enter = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
     mount = f"mount -t tmpfs -o size=256k tmpfs {tmp_path}"
@@ -542,6 +543,7 @@ def test_a_disk_that_is_full_when_a_file_begins_loses_lines_and_no_file(path):
     assert log.lost_lines == 1
 
 
+@pytest.mark.slow
 def test_kill_9_at_any_time_loses_no_line_and_no_file(path):
     script = "import sys; from itertools import count; from edgevpr.runtime.flight.flightlog import FlightLog\n"
     script += f"log = FlightLog(sys.argv[1], max_mb={4 * PART_MB})\nlog.write('start')\n"

@@ -7,6 +7,8 @@ from flights import Flight
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.requests import Wish
 
+pytestmark = pytest.mark.slow
+
 
 class Kept:
     def __init__(self):

@@ -9,6 +9,8 @@ from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.metering import FlightMeter, LoadReading
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
+pytestmark = pytest.mark.slow
+
 TURN_S = 4.0  # more than the governor's patience: each reading can bring a change
 CALM = LoadReading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
 BUSY = LoadReading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)

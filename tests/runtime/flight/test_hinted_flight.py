@@ -66,6 +66,7 @@ def fly(place_map, log, frames, says=None, reach_m_s=None, is_live=True, **setti
     return of_kind(flight.fly(FakeSource(frames, clock, is_live=is_live)), "query")
 
 
+@pytest.mark.slow
 def test_a_wrong_compass_costs_one_query_and_not_the_flight(place_map, tmp_path):
     right = [frame(place, 100.0, 100.0) for place in range(3)]
     wrong = [frame(place, 100.0, 250.0) for place in (3, 4, 5, 6)]
@@ -102,6 +103,7 @@ def test_what_the_autopilot_said_more_than_a_second_ago_is_no_hint(place_map, tm
     assert query["hints"] is None
 
 
+@pytest.mark.slow
 def test_a_false_position_costs_time_and_not_the_flight(place_map, tmp_path):
     queries = fly(place_map, tmp_path / "log", [frame(0, MAPPED_DEG)] * 4, (7, None), 1.0)
     assert all(line["place"] == 1 for line in queries if line["accepted"])
@@ -110,6 +112,7 @@ def test_a_false_position_costs_time_and_not_the_flight(place_map, tmp_path):
     assert [line["hints"] for line in queries[1:]] == [None] * 3, "what was found says that it is false"
 
 
+@pytest.mark.slow
 def test_our_own_fix_says_where_to_look_next(place_map, tmp_path):
     queries = fly(place_map, tmp_path / "log", [frame(place, MAPPED_DEG) for place in (2, 2, 3)], None, 10.0)
     assert [line["place"] for line in queries] == [3, 3, 4]

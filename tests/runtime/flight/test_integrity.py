@@ -17,6 +17,8 @@ from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.flight.watching import GpsWatch
 
+pytestmark = pytest.mark.slow
+
 MAP_SD_M = 5.0
 AWAY = np.array([0.6, 0.8])
 

@@ -16,6 +16,8 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 PLACES = 5
 
 

@@ -51,6 +51,7 @@ class Locked:
         self.db.close()
 
 
+@pytest.mark.slow
 def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_map, tmp_path, monkeypatch):
     other, waits_ms = Locked(place_map), []
 
@@ -143,6 +144,7 @@ def learning(place_map, tmp_path, acts):
     return flight.fly(FakeSource(pictures, clock, work=lambda: next(calls)())), flight
 
 
+@pytest.mark.slow
 def test_while_another_program_writes_nothing_is_learnt_and_afterwards_again(place_map, tmp_path):
     other = Locked(place_map)
     lines, flight = learning(place_map, tmp_path, [nothing, other.lock, nothing, nothing, other.unlock, nothing])

@@ -12,6 +12,8 @@ from pictures import textured
 from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.power.thermal import ThermalState
 
+pytestmark = pytest.mark.slow
+
 PICTURE = textured(1, 240, 320)
 
 

@@ -73,6 +73,7 @@ def lengths(errors_m):
     return np.hypot(*errors_m.T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drift", "wrong"), [(RECKONED, {}), (RECKONED, {"wind": (6.0, 0.0)}), (INERTIAL, {"bias": (0.08, -0.05)})]
 )

@@ -13,6 +13,8 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
 from edgevpr.runtime.flight.navigator import Navigator
 
+pytestmark = pytest.mark.slow
+
 WIND = 6.0, 0.0
 LIKE_ONE = math.sqrt(50)  # by so much more a continuous position says that it is wrong
 

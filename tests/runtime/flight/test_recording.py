@@ -80,6 +80,7 @@ def test_each_flight_has_a_folder_and_the_oldest_make_room(tmp_path):
     assert [each.name for each in recordings(tmp_path)] == ["flight-0003", "flight-0004", "flight-0005"]
 
 
+@pytest.mark.slow
 def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
     with caplog.at_level(logging.WARNING), Recording(tmp_path, 10) as tape:
         for _ in range(4):
@@ -95,6 +96,7 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
     assert len(list((tape.path / FRAMES).iterdir())) <= 4
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_too_slow_ends_it(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "WAITING_BYTES", 1000)
     with Recording(tmp_path, 100) as tape:
@@ -104,6 +106,7 @@ def test_a_disk_that_is_too_slow_ends_it(tmp_path, monkeypatch):
     assert "too slow" in tape.state
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
@@ -117,6 +120,7 @@ def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
     assert notes(tape.path) == [["x"]]
 
 
+@pytest.mark.slow
 def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
     disk = os.statvfs(tmp_path)
     monkeypatch.setattr(module, "SPARED_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
@@ -134,6 +138,7 @@ def test_where_none_can_be_made_it_says_what_to_do(tmp_path):
         Recording(tmp_path / "no" / "such", 100)
 
 
+@pytest.mark.slow
 def test_kill_9_costs_no_more_than_what_came_last(tmp_path):
     script = (
         "import sys, time\n"

@@ -95,6 +95,7 @@ def test_what_the_governor_has_lowered_stays_lowered():
     assert (governor.asked.rate_hz, governor.setting.rate_hz) == (4.0, 2.0)
 
 
+@pytest.mark.slow
 def test_the_start_line_is_repeated_with_the_configuration_that_is_in_force(recording, tmp_path):
     config, log = tmp_path / "c.yaml", tmp_path / "flight.jsonl"
     config.write_text("source: {rate_hz: 2}\n")

@@ -102,6 +102,7 @@ def test_a_turn_with_level_moments_is_one_tilt(seen):
     assert seen.look("tttttt" + "-t" * 20) == ["tilt too large"]
 
 
+@pytest.mark.slow
 def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path):
     clock = FakeClock()
     link = FakeLink(clock)

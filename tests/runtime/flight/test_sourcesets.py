@@ -7,6 +7,8 @@ from edgevpr.core.config import SourceSetsConfig
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.autopilot import SourceSets
 
+pytestmark = pytest.mark.slow
+
 ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
 ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
 

@@ -59,6 +59,7 @@ def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
     assert not notify(WATCHDOG=1)
 
 
+@pytest.mark.slow
 def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
     sent = [notify(WATCHDOG=1)]
     while sent[-1] and len(sent) < 10_000:

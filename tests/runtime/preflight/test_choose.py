@@ -140,6 +140,7 @@ def test_what_other_programs_take_does_not_count_and_is_said():
     assert costs.waited == pytest.approx(0.8, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
     class Greedy(TinyTechnique):
         def encode(self, image, mask=None):
@@ -162,6 +163,7 @@ def test_a_technique_without_a_fine_part_is_tried_too():
     assert costs.match_per_place.wall_s > 0
 
 
+@pytest.mark.slow
 def test_the_real_techniques_can_be_probed():
     costs = {name: probe(techniques.create(name)) for name in techniques.AUTOMATIC}
     assert costs["hog"].ram_bytes_per_place > 100 * costs["cohog"].ram_bytes_per_place
@@ -311,6 +313,7 @@ def test_a_technique_of_the_board_that_is_not_there_is_one_sentence():
         preferred(board(technique="cohgo"))
 
 
+@pytest.mark.slow
 def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, accuracies):
     accuracies |= {"cohog": found(0.9), "hog": found(0.4)}
     # The process that runs the tests is large by itself.
@@ -320,6 +323,7 @@ def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch,
         assert pick.picked_technique("this", places) == taken
 
 
+@pytest.mark.slow
 def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog, accuracies):
     accuracies["cohog"] = found(0.9)
     really = pick.made_for

@@ -21,6 +21,7 @@ def no_models(monkeypatch, tmp_path):
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path / "models"))
 
 
+@pytest.mark.slow
 def test_a_technique_is_tried_in_a_process_of_its_own_and_its_memory_is_its_own():
     ballast = np.ones(300_000_000, np.uint8)  # which is ours, and not the technique's
     (found,) = try_each(offers(["seqslam"]), threads=1)
@@ -30,6 +31,7 @@ def test_a_technique_is_tried_in_a_process_of_its_own_and_its_memory_is_its_own(
     assert ballast.size
 
 
+@pytest.mark.slow
 def test_it_is_tried_on_pictures_of_a_folder(tmp_path):
     path = tmp_path / "picture.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8))
@@ -92,6 +94,7 @@ def test_ctrl_c_leaves_no_process_behind(monkeypatch):
         pipe.close()
 
 
+@pytest.mark.slow
 def test_a_trial_goes_through_json_and_back():
     (found,) = try_each(offers(["seqslam"]), threads=1)
     assert trial_of(json.loads(json.dumps(asdict(found)))) == found

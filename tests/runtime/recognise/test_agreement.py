@@ -44,6 +44,7 @@ def kept(image):
     return unpacked(packed(describe(image)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right_px", "down_px", "turned_deg", "scale"),
     [(80, 0, 0, 1.0), (0, -60, 0, 1.0), (40, 30, 30, 1.0), (-50, 20, 315, 1.15), (10, -40, 180, 0.85)],

@@ -136,6 +136,7 @@ def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path,
     assert len(record.message) < 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [b"\xff", "7", "[" * 5000, json.dumps(["x"]), b"\xa5" * 90_000_000])
 def test_a_row_of_another_form_ends_no_flight(path, value):
     with contextlib.closing(sqlite3.connect(path)) as db, db:

@@ -24,6 +24,8 @@ from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettin
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 PLACES, STRIDE = 40, 3
 TWICE = 20, 36  # both places show the same picture
 TECHNIQUE = create("cohog", {"w1": 208})

@@ -13,6 +13,8 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Worth
 
+pytestmark = pytest.mark.slow
+
 NORTH_M = 1 / 111_195  # degrees
 
 

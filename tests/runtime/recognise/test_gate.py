@@ -18,6 +18,8 @@ from edgevpr.runtime.recognise.judge import says_nothing
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 PLACES = 6
 
 

@@ -16,6 +16,8 @@ from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 PLACES = 4
 
 

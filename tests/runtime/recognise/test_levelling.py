@@ -107,6 +107,7 @@ def recognised(event, place):
 HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 
 
+@pytest.mark.slow
 def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, ground):
     as_it_is = walk(None).step(frame(ground, 1, **HARD))
     event = walk(scaling()).step(frame(ground, 1, **HARD))
@@ -120,6 +121,7 @@ def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, grou
     assert event.cost.t_encode_s == pytest.approx((event.steps.prepare + event.steps.gate + event.steps.encode).wall_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -140,6 +142,7 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
     assert recognised(event, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0, 0.01, 100.0])
 def test_a_wrong_height_hides_no_place(walk, ground, factor):
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | {"height_m": HEIGHT_M * factor}))
@@ -155,6 +158,7 @@ def test_hints_go_on_to_work_for_a_picture_that_was_turned(walk, ground, techniq
     assert min(event.best.match.rotation_deg, 360 - event.best.match.rotation_deg) <= 15
 
 
+@pytest.mark.slow
 def test_the_autopilot_is_believed_of_live_frames_while_it_is_fresh(walk, ground):
     blank = replace(frame(ground, 1, t_mono_s=10.0, told={}, **HARD), position=None)
 
@@ -166,6 +170,7 @@ def test_the_autopilot_is_believed_of_live_frames_while_it_is_fresh(walk, ground
     assert seen(True, 8.5) == seen(False, 9.5) == View()
 
 
+@pytest.mark.slow
 def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
     seen = frame(ground, 1, heading_deg=180.0)
     image = seen.image.copy()
@@ -178,6 +183,7 @@ def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
     assert recognised(covered, 1)
 
 
+@pytest.mark.slow
 def test_a_tilt_that_a_picture_does_not_bear_is_said_once(walk, ground, caplog):
     asked = walk(scaling())
     steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 50.0})

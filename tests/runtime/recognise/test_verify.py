@@ -30,6 +30,8 @@ from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.slow
+
 PLACES = 4
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 BY_LANDMARKS = sure_rule(landmarks_count)

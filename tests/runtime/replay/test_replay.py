@@ -24,6 +24,8 @@ from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import TAPE, recordings
 from edgevpr.runtime.flight.watching import Tally
 
+pytestmark = pytest.mark.slow
+
 QUICK = "--rate-hz", "15"
 
 

@@ -20,6 +20,8 @@ from edgevpr.places.mapinfo import identity_of
 from edgevpr.runtime.flight import aboard
 from edgevpr.runtime.flight.flightlog import read_log
 
+pytestmark = pytest.mark.process
+
 
 @pytest.fixture
 def fly(recording, tmp_path):

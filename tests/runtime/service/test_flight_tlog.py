@@ -12,6 +12,8 @@ from mavlink_peers import Peer, UdpPort, wait_until
 
 from edgevpr.mavlink.wire import mavlink
 
+pytestmark = pytest.mark.process
+
 MAVLOGDUMP = Path(sys.prefix) / "bin" / "mavlogdump.py"
 
 

@@ -7,6 +7,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
 from edgevpr.runtime.flight.flightlog import read_log
 
+pytestmark = pytest.mark.process
+
 
 def flown(recording, tmp_path, match="{}", technique="cohog"):
     """The queries of a flight over the pictures of a map, with this section of the configuration."""

@@ -9,6 +9,8 @@ from flight_process import start
 from ground_stations import Router, mavproxy, mavsdk
 from mavlink_peers import AutopilotThread, free_port
 
+pytestmark = pytest.mark.process
+
 ACTIVE, CRITICAL = 4, 5  # MAV_STATE
 
 

@@ -19,6 +19,8 @@ from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 
+pytestmark = pytest.mark.process
+
 QUICK = ("--learn", "--technique", "hog", "--rate-hz", "60")
 
 

@@ -53,6 +53,7 @@ def opened(folder, name, mask):
     return open_recogniser(load_config(None, settings), load_board("this"))
 
 
+@pytest.mark.slow
 def test_the_mask_that_check_learns_covers_the_display(folder, capsys):
     mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)
     assert mask.shape == (240, 320)
@@ -78,6 +79,7 @@ def test_a_mask_that_is_missing_is_said_to_be_the_mask(folder, tmp_path, capsys)
     assert not (tmp_path / "new.gpkg").exists()
 
 
+@pytest.mark.slow
 def test_with_the_mask_more_is_recognised_behind_a_display(folder):
     found = {}
     for name, mask in (("plain.gpkg", False), ("masked.gpkg", True)):

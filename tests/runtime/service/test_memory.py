@@ -13,6 +13,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.techniques import create
 
+pytestmark = pytest.mark.process
+
 PLACES = 1500
 FRAMES = 70
 LIMIT_BYTES = 700_000_000  # of address space: libraries that are mapped and never touched count as well

@@ -40,6 +40,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path):
     assert verify(UNIT.read_text(), tmp_path) == ""
 
 
+@pytest.mark.slow
 @needs_systemd
 def test_every_boards_unit_passes(tmp_path):
     for name in board_names():
