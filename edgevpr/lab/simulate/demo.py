@@ -20,6 +20,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.core.types import Position
+from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import find_positions, read_positions
 from edgevpr.lab.simulate.camera import lit, view_on_ground
 from edgevpr.lab.simulate.generated import (
@@ -273,10 +274,30 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, answers: Sequence
     for place in places:
         cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
     for answer, here, there in zip(answers, taken, named, strict=True):
-        colour = _REJECTED if not answer.accepted else _RIGHT if answer.right else _WRONG
-        cv2.line(picture, here, there, colour, 3 if answer.accepted else 1, cv2.LINE_AA)
-        cv2.circle(picture, here, 7, colour, -1, cv2.LINE_AA)
+        cv2.line(picture, here, there, _colour(answer), 3 if answer.accepted else 1, cv2.LINE_AA)
+        cv2.circle(picture, here, 7, _colour(answer), -1, cv2.LINE_AA)
     legend = {"places of flight 1": _MAPPED, "flight 2": _LATER, "accepted": _RIGHT, "accepted, wrong": _WRONG}
     for row, (text, colour) in enumerate({**legend, "rejected: no position is sent": _REJECTED}.items()):
         cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
-    cv2.imwrite(str(path), picture)
+    cv2.imwrite(str(path), np.hstack([picture, _pairs(path.parent, answers)]))
+
+
+def _pairs(folder: Path, answers: Sequence[JudgedAnswer]) -> Image:
+    """Draw ten queries, evenly spread over the flight, each beside the picture of its place: uint8 (H, W, 3) BGR."""
+    columns: list[list[Image]] = [[], []]
+    for number, index in enumerate(np.linspace(0, len(answers) - 1, 10).astype(int)):
+        answer = answers[index]
+        files = (folder / "flight-1/images" / answer.reference_image, folder / "flight-2/images" / answer.query)
+        place, query = (cv2.resize(read_image(file), (240, 180), interpolation=cv2.INTER_AREA) for file in files)
+        pair = cv2.copyMakeBorder(np.hstack([query, place]), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_colour(answer))
+        said = f"{answer.fix_off_m:.1f} m off" if answer.fix_off_m is not None else "rejected"
+        text = f"query, and its place: {said}, score {answer.score:.2f}"
+        cv2.putText(pair, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        columns[number // 5].append(pair.astype(np.uint8))
+    return np.hstack([np.vstack(column) for column in columns])
+
+
+def _colour(answer: JudgedAnswer) -> tuple[int, int, int]:
+    if not answer.accepted:
+        return _REJECTED
+    return _RIGHT if answer.right else _WRONG
