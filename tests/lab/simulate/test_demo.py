@@ -31,7 +31,7 @@ def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
     assert {"HEARTBEAT", "NAMED_VALUE_FLOAT"} <= set(summary.messages)
     assert summary.costs["cpu_s"] > 0
     picture = cv2.imread(str(summary.picture))
-    assert picture.shape == (1050, 1600, 3)
+    assert picture.shape == (1050, 2580, 3)
     assert picture.std() > 20
     assert "recall@1" in str(summary)
 
