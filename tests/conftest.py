@@ -1,6 +1,7 @@
 """What the tests of several rooms share."""
 
 import os
+import signal
 
 import pytest
 
@@ -8,6 +9,9 @@ import edgevpr  # noqa: F401  # it sets OpenCV's limit of pixels, which counts w
 
 # As edgevpr's command line does, before anything imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# A script that starts the tests in the background has Ctrl-C ignored, and so would every program that they start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # Files that take longest, most of them for a few tests that wait or start programs. They begin first: a process that
