@@ -42,28 +42,30 @@ def wait_for_queries(log, count, process):
 
 @contextmanager
 def autopilot():
-    """A simulated flight controller as a process; gives its link, and a call that ends it and asks what it has seen."""
+    """A simulated flight controller as a process, up; gives its link, and a call that ends it and tells what it saw."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json"]
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def asked():
         process.terminate()
         return json.loads(process.communicate(timeout=60)[0])
 
     try:
+        assert "is up" in process.stderr.readline()
         yield f"udpout:127.0.0.1:{port}", asked
     finally:
         process.kill()
         process.wait()
         process.stdout.close()
+        process.stderr.close()
 
 
 def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
     with autopilot() as (link, asked):
-        run = fly("--link", link, "--rate-hz", "15")
+        run = fly("--link", link, "--rate-hz", "10")
         said = run.communicate(timeout=120)[1]
         seen = asked()
     assert run.returncode == 0, said
