@@ -19,20 +19,14 @@ def answers(results: Results) -> list[list[str]]:
     apart = contradictions()
     leads = f"CoHOG first on {costs.sets_where_cohog_leads()} of {len(THESIS['table_6_1']['sets'])} sets, as it says"
     corridor = f"CALC's AUC {calc:+.3f}, CoHOG's recall@1 {cohog:+.3f}; networks less, being small ones"
-    lost = "pictures are lost at like thresholds; AUC follows none of them"
-    smaller, far = (
-        f"CoHOG's map {costs.map_ratio(results):.0f} times smaller in RAM",
-        f"{apart[0]:.0f} to {apart[-1]:.0f}",
-    )
+    smaller = f"CoHOG's map {costs.map_ratio(results):.0f} times smaller in RAM"
+    far = f"{apart[0]:.0f} to {apart[-1]:.0f}"
     return [
         ["table 5.2", "from its own inputs", f"Ah_t within {worst:.2%}", "ampere-hours"],
         ["figure 6.6", "from table 6.1; run on corridor", leads, "PCU"],
         ["table 6.1", "run on other pictures", "order of techniques, times, RAM", "precision; times; RAM"],
         ["figures 4.8, 6.7 (techniques)", "the author's matrices of corridor", corridor, "Corridor"],
-        ["figure 6.8, Top-G", "run on corridor", "other optima than on ESSEX3IN1", "parameters of CoHOG"],
-        ["figures 3.10, 3.17", "run on two other sets", lost, "thresholds"],
-        ["figure 3.19", "run on two other sets", "rises with the radius, as there", "thresholds"],
-        ["figures 3.12, 3.20, 3.21", "run on other sets", "AUC rises seldom", "thresholds"],
+        ["figures 3.12, 3.20, 3.21", "run on other sets", "AUC rises seldom", "memorable maps"],
         ["figures 4.7, 5.7", "from the sizes in the text", smaller, "memory of a map"],
         ["table 3.1", "held against table 5.2", f"{far} times apart", "of each other"],
     ]
@@ -46,7 +40,7 @@ def page(results: Results) -> str:
     head = f"""# The thesis's tables and figures, and this project's
 
 Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. Made by `make thesis` ({made["date"]}, commit
-{made["commit"]}, {machine["cores"]} cores of an {machine["cpu"]}; {made["cpu_s"] / 60:.0f} minutes of one core). The
+{made["commit"]}, {machine["cores"]} cores of an {machine["cpu"]}). The
 thesis's values stand in [thesis.yaml](../benchmarks/thesis.yaml), each with its source. Values here come from
 [thesis.json](../benchmarks/results/thesis.json), from the results of `make results` and `make bench`, and from the
 thesis's own inputs.
@@ -64,7 +58,6 @@ thesis's own inputs.
         quality.corridor(results),
         quality.precision(results),
         costs.pcu(results),
-        quality.sweeps(results),
         quality.memorable(results),
         costs.memory(results),
         costs.encode_ram(results),

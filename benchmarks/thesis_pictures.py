@@ -1,22 +1,15 @@
-"""The pictures of docs/thesis.md: PR curves, PCU, the sweeps of CoHOG, the thresholds of memorable maps."""
+"""The pictures of docs/thesis.md: PR curves and PCU."""
 
 from pathlib import Path
 
 import base
-from thesis_memorable import CRITERIA, TECHNIQUES
-from thesis_sweep import THESIS as MEAN
-from thesis_sweep import VOTE, W2_PX
 from thesis_values import MATRICES, THESIS, Results, measured_rows, pcu_of, printed_pcu
-
-LOOKS = {MEAN: "C0", VOTE: "C1"}
 
 
 def draw(results: Results, folder: Path) -> None:
     """Draw all pictures into a folder."""
     curves(results, folder / "thesis_curves.png")
     pcu(results, folder / "thesis_pcu.png")
-    sweep(results, folder / "thesis_sweep.png")
-    thresholds(results, folder / "thesis_thresholds.png")
 
 
 def curves(results: Results, path: Path) -> None:
@@ -52,47 +45,4 @@ def pcu(results: Results, path: Path) -> None:
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=7)
     drawn.supxlabel("PCU")
-    base.save(drawn, path)
-
-
-def sweep(results: Results, path: Path) -> None:
-    """Draw the four panels of figure 6.8: precision at 100 % recall by both scores, and the time of encoding."""
-    points = results.thesis["sweep"]["points"]
-    keys = {"GT": "gt", "W1": "w1", "W2": "w2", "W1/W2": "w1"}
-    drawn, axes = base.panels(13, 3.8, len(keys))
-    for axis, letter, (name, key) in zip(axes, "abcd", keys.items(), strict=True):
-        of_sweep = sorted((point for point in points if point["sweep"] == name), key=lambda point: point[key])
-        for (score, chosen), rows in base.groups(of_sweep, lambda point: (point["score"], point["chosen"])):
-            style, label = ("o-", score) if chosen == "filled_bins" else ("x:", f"{score}, Shannon")
-            values = [row["precision_at_100_recall"] for row in rows]
-            axis.plot([row[key] for row in rows], values, style, color=LOOKS[score], label=label)
-        if name != "GT":
-            timed = [(point[key], 1e3 * point["t_encode_s"]) for point in of_sweep if point["score"] == MEAN]
-            beside = axis.twinx()
-            beside.plot(*zip(*timed, strict=True), "--", color="C7")
-            beside.set_ylim(0, None)
-            beside.set_ylabel("t_e, ms CPU (dashed)", color="C7", fontsize=8)
-        if name == "W2":
-            axis.set_xscale("log", base=2)
-            axis.set_xticks(W2_PX, map(str, W2_PX))
-        what = {"W1/W2": "W1, px, W2 = W1 / 32", "GT": "GT"}.get(name, f"{name}, px")
-        axis.set(ylim=(0, 1), xlabel=what, title=f"({letter}) {name}")
-    axes[0].set_ylabel("precision at 100 % recall")
-    axes[0].legend(fontsize=7)
-    base.save(drawn, path)
-
-
-def thresholds(results: Results, path: Path) -> None:
-    """Draw figures 3.17 and 3.10: AUC of the queries that pass each threshold, and the share of pictures that do."""
-    swept = [(each, criterion) for each in results.thesis["thresholds"] for criterion in CRITERIA]
-    drawn, axes = base.panels(12, 3.4 * len(swept) / 3, len(swept), len(swept) // 3, sharey=True)
-    for axis, (each, criterion) in zip(axes, swept, strict=True):
-        rows = [row for row in each["rows"] if row["criterion"] == criterion]
-        for name in TECHNIQUES:
-            shown = [(row["threshold"], row["auc"][name]) for row in rows if row["auc"][name] is not None]
-            axis.plot(*zip(*shown, strict=True), label=f"AUC, {name}")
-        at, kept = [row["threshold"] for row in rows], [row["kept"] for row in rows]
-        axis.fill_between(at, kept, color="C7", alpha=0.3, label="pictures kept")
-        axis.set(xlim=(0, 1), ylim=(0, 1.02), xlabel=f"least {criterion}", ylabel="AUC; share kept", title=each["set"])
-    axes[0].legend(fontsize=7)
     base.save(drawn, path)
