@@ -5,11 +5,10 @@ python benchmarks/soak.py [--minutes M]
 
 A real `edgevpr run` flies with a camera that speaks RTSP, an autopilot over UDP, a second link, a status file, a
 flight log that is limited to 1 MB and a tlog. Again and again the camera or the autopilot goes away and comes back, the
-second link's other end closes, readers of the status come and leave, and the configuration is read again.
+second link's other end closes, and readers of the status come and leave.
 """
 
 import argparse
-import signal
 import socket
 import subprocess
 import sys
@@ -84,7 +83,7 @@ def run(folder: Path, lasts_s: float, every_s: float, radius_m: float = _RADIUS_
         stack.callback(flight.end)
         flight.wait_until_it_flies()
         watch = _Watch(flight, ground, min(_CYCLE_S, lasts_s), every_s)
-        samples = watch.look_until(lasts_s, _absences(camera, autopilot, ground, flight))
+        samples = watch.look_until(lasts_s, _absences(camera, autopilot, ground))
         code, said = flight.end()
     ends = [line for line in read_log(flight.log) if line["kind"] == "end"]
     return {
@@ -103,19 +102,19 @@ class Flight:
 
     def __init__(self, folder: Path, uri: str, port: int, ground_port: int) -> None:
         self.log, self.tlog, self.status = folder / "flight.jsonl", folder / "flight.tlog", folder / "status.json"
-        self._config, self._rate_hz = folder / "config.yaml", 2.0
+        config = folder / "config.yaml"
         self._stderr = folder / "said.txt"
-        self._settings = {
+        settings = {
             "map": str(folder / "map.gpkg"),
-            "source": {"uri": uri, "camera": "nadir", "fov_deg": FOV_DEG, "rate_hz": self._rate_hz},
+            "source": {"uri": uri, "camera": "nadir", "fov_deg": FOV_DEG, "rate_hz": 2.0},
             "mavlink": {"link": f"udpout:127.0.0.1:{port}", "ground": f"udpout:127.0.0.1:{ground_port}"},
             "log": {"path": str(self.log), "max_mb": LOG_MB, "tlog": str(self.tlog)},
             "status": {"file": str(self.status)},
         }
-        self._config.write_text(yaml.safe_dump(self._settings))
+        config.write_text(yaml.safe_dump(settings))
         with open(self._stderr, "w") as stderr:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "edgevpr", "run", "--config", self._config],
+                [sys.executable, "-m", "edgevpr", "run", "--config", config],
                 stdin=subprocess.DEVNULL,
                 stderr=stderr,
             )
@@ -127,13 +126,6 @@ class Flight:
             if self.process.poll() is not None or time.monotonic() > give_up_s:
                 raise RuntimeError(f"the flight does not begin: {self._stderr.read_text()}")
             time.sleep(0.05)
-
-    def reread(self) -> None:
-        """Change the rate in the configuration, and have it read again."""
-        self._rate_hz = 3.5 - self._rate_hz
-        self._settings["source"]["rate_hz"] = self._rate_hz
-        self._config.write_text(yaml.safe_dump(self._settings))
-        self.process.send_signal(signal.SIGHUP)
 
     def end(self) -> tuple[int, str]:
         """End the flight, and return its exit code and what it said."""
@@ -254,12 +246,8 @@ def _timetable(absences: list[Absence], cycle_s: float) -> Iterator[tuple[float,
             yield (cycle + part) * cycle_s, goes, each
 
 
-def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground, flight: Flight) -> list[Absence]:
-    def nothing() -> None:
-        pass
-
+def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground) -> list[Absence]:
     return [
-        Absence("configuration read again", 0.03, 0.06, flight.reread, nothing),
         Absence("camera pulled out", 0.27, 0.33, camera.pull_out, camera.plug_in),
         Absence("autopilot killed", 0.42, 0.49, autopilot.kill, autopilot.start),
         Absence("camera silent", 0.58, 0.63, lambda: camera.fall_silent(True), lambda: camera.fall_silent(False)),

@@ -6,6 +6,7 @@ from pathlib import Path
 import base
 import numpy as np
 from base import Row
+from scipy.stats import theilslopes
 
 GROWTH_MB = 2.0  # asked for: less than that after the first five minutes
 _SETTLED_S = 300.0
@@ -29,7 +30,7 @@ def growth(samples: list[Row], what: str = "rss_mb") -> Row:
     early = after & (t_s < 2 * settled_s)
     late = t_s >= 0.9 * t_s[-1]
     first_mb = float(np.median(values[early if early.any() else after]))
-    last_mb, slope_mb_h = float(np.median(values[late])), 3600 * _slope(t_s[after], values[after])
+    last_mb, slope_mb_h = float(np.median(values[late])), 3600 * float(theilslopes(values[after], t_s[after])[0])
     found = {"settled_s": settled_s, "first_mb": first_mb, "last_mb": last_mb, "slope_mb_h": slope_mb_h}
     return found | {"grown_mb": last_mb - first_mb}
 
@@ -114,16 +115,6 @@ def draw(soak: Row, path: Path) -> None:
     axes[0].axhspan(first_mb, first_mb + GROWTH_MB, color="C0", alpha=0.08, linewidth=0)
     axes[3].set_xlabel("minutes of flight (shaded above: the growth that is allowed; beside: something is away)")
     base.save(drawn, path)
-
-
-def _slope(t_s: np.ndarray, values: np.ndarray) -> float:
-    """Return the median of the slopes of all pairs, per second; of many, of the pairs of every few samples."""
-    step = max(1, len(t_s) // 400)
-    t_s, values = t_s[::step], values[::step]
-    before, after = np.triu_indices(len(t_s), 1)
-    if not len(before):
-        return 0.0
-    return float(np.median((values[after] - values[before]) / (t_s[after] - t_s[before])))
 
 
 def _range(counts: list[int]) -> str:

@@ -15,7 +15,6 @@ import sys
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -46,19 +45,6 @@ _COLUMNS = {
     "AUC": "{quality[auc]:.3f}",
     **_COSTS,
 }
-_NETWORKS = {
-    "network": "{way}",
-    "numbers": "{length:,}",
-    "10^6 parameters": "{parameters_m:.1f}",
-    "10^9 MAC": "{gmacs:.1f}",
-    "file MB": "{file_mb:.0f}",
-    "t_e ms": "{t_encode_ms:,.0f}",
-    "t_m ms": "{t_match_ms:.1f}",
-    "B/place": "{bytes:,}",
-    "1bit": "{bytes_1bit:,}",
-    "RAM MB": "{ram_mb:.0f}",
-    "load s": "{load_s:.2f}",
-}
 
 
 def main() -> None:
@@ -67,7 +53,7 @@ def main() -> None:
     folders = base.find_sets(names=parser.parse_args().sets.split(","))
     training = base.find_sets(names=base.TUNED_ON)
     WORK.mkdir(exist_ok=True)
-    found = {"rows": {}, "networks": {}} | base.read("peers") | base.made_by()
+    found = {"rows": {}} | base.read("peers") | base.made_by()
 
     def measured(key: str, measure: Callable[[], Row]) -> None:
         if key in found["rows"]:
@@ -119,7 +105,7 @@ def page(found: Row) -> str:
         name: {way: rows[key] for way in (OURS, *WAYS) if (key := f"{name}: {way}") in rows}
         for name in sorted({key.partition(": ")[0] for key in rows})
     }
-    commits = sorted({row["commit"] for kind in ("rows", "networks") for row in found[kind].values()})
+    commits = sorted({row["commit"] for row in rows.values()})
     recalls = [
         [way, *(base.cell("{quality[recall_at_1]:.2f}", each.get(way, {})) for each in of_set.values())]
         for way in (OURS, *WAYS)
@@ -131,11 +117,6 @@ def page(found: Row) -> str:
         + base.table([{"way": way, **row} for way, row in each.items()], _COLUMNS)
         for name, each in of_set.items()
     ]
-    networks = [
-        {"way": name, "load_s": row["import_s"] + row["open_s"], **row} for name, row in found["networks"].items()
-    ]
-    ours_ms = median(row["t_encode_ms"] for key, row in rows.items() if key.endswith(OURS))
-    times = [round(row["t_encode_ms"] / ours_ms) for row in networks if row["way"] != "calc"]
     parts = (
         "# Beside other ways",
         f"Made by `make peers`, {found['date']}, commits {', '.join(commits)}, {machine['cores']} cores of "
@@ -144,18 +125,11 @@ def page(found: Row) -> str:
         markdown(("way", *heads), recalls),
         _READING.strip(),
         "## Costs",
-        _joined(_ABOUT_COSTS).format(least=min(kept_kb), most=max(kept_kb)),
+        " ".join(_ABOUT_COSTS.split()).format(least=min(kept_kb), most=max(kept_kb)),
         *sections,
-        "## Modern networks",
-        _joined(_ABOUT_NETWORKS).format(ours_ms=ours_ms, least=min(times), most=max(times)),
-        base.table(networks, _NETWORKS),
         _LEFT_OUT.strip(),
     )
     return "\n\n".join(each if each[0] in "#|*" or "\n" in each else textwrap.fill(each, 120) for each in parts)
-
-
-def _joined(text: str) -> str:
-    return " ".join(text.split())
 
 
 _ABOUT_RECALL = """\
@@ -173,17 +147,6 @@ process above the bare interpreter, with the references in it; maps and words we
 `import` are the seconds of the processor until the libraries are loaded. Words (bag of words, VLAD) are learnt
 on the references of corridor, aerial_caliterra and aerial_garfield28. The 95 % are of recall@1: what other queries of
 the same kind would give. Of a set at most 200 queries are asked, evenly spaced.
-"""
-_ABOUT_NETWORKS = """\
-By the recipes of [modern networks](../../docs/how-to/modern-networks.md), run by edgevpr as techniques, one thread.
-**Their weights are random**: the weights of the authors could not be had here, so nothing is said of what they
-recognise. What they cost does not depend on what they have learnt, nor on edgevpr, so these rows were measured once and
-stay as they are; with real weights `edgevpr eval` tells both. `t_m` is the scan of 1,000 places; `B/place` in half
-precision, and in the form of one bit a number; `cosplace_int8` is by `edgevpr models quantise`. `calc`, which edgevpr
-ships, stands beside. Against the {ours_ms:.1f} ms of `cohog` encoding takes them {least} to {most} times as long;
-matching takes them less. Where a query may cost a second or there is more than a processor, and the camera looks along
-streets, as in their training, they are worth a try; a recipe takes minutes. Looking down at any heading is not what
-they were trained for.
 """
 _READING = """\
 Where `cohog` is ahead: no other way finds more on any set at the first place. aerial_brighton and aerial_copr are too

@@ -58,7 +58,7 @@ def test_what_is_wrong_is_said(found, said):
 def test_a_real_soak_of_some_seconds(tmp_path):
     """Everything goes away and comes back, and the flight goes on."""
     found = soak.run(tmp_path, lasts_s=12.0, every_s=1.0, radius_m=30.0)
-    assert len(found["events"]) == 6
+    assert len(found["events"]) == 5
     assert (found["exit_code"], found["tracebacks"]) == (0, 0)
     assert found["statuses"] > 0
     assert found["end"]["accepted"] > 0
