@@ -191,25 +191,6 @@ def map_damaged(trial: Trial, row: Outcome) -> None:
     row.expect(row.told, "the ground station is told")
 
 
-@fault("configuration changed in flight (systemctl reload), then spoilt")
-def reloaded(trial: Trial, row: Outcome) -> None:
-    trial.configure(match={"accept_precision": 0.99}, battery={"pack": "6S8000"})
-    trial.run("systemctl reload edgevpr")
-    time.sleep(4)
-    trial.machine.put("/etc/edgevpr/config.yaml", b"board: [\n")
-    trial.run("systemctl reload edgevpr")
-    time.sleep(4)
-    said = trial.journal(trial.begin_inside_s)
-    trial.configure()
-    row.again_s = trial.next_match(time.monotonic())
-    row.does = (
-        "takes the keys that may change in flight, names the others, and keeps what it has where a file is spoilt"
-    )
-    row.kept = "the flight"
-    row.expect("accept_precision" in said and "battery" in said, "the journal names what is taken and what waits")
-    row.expect("config.yaml" in said, "a spoilt file is said")
-
-
 @fault("a mistake in the configuration at the start", restarts=None)
 def misconfigured(trial: Trial, row: Outcome) -> None:
     trial.machine.put("/etc/edgevpr/config.yaml", b"sauce: {uri: /dev/video0}\n")
