@@ -3,14 +3,17 @@ limited, the link may be of any kind, and no setting of the autopilot is changed
 """
 
 import select
+import statistics
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.channel import Answers, Kind, kind_of
 from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
@@ -20,9 +23,13 @@ HEARTBEAT_S = 1.0
 HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
 TRIES, ANSWER_WAIT_S = 3, 1.0
 IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
+LISTEN_S = 4.0
+ROUND_TRIPS = 10
+
 _FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
-_WAITING_MAX = 64  # packets; a port that accepts nothing must not fill the memory
-_SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
+_FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
+_RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
+_BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
 class Inquiry:
@@ -31,8 +38,8 @@ class Inquiry:
     method raises LinkError when the connection is lost.
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
-    - `heard`: number of messages from the autopilot, by message name.
-    - `signed`: how many of these messages carry a signature.
+    - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
+    - `says_version_1`: its last message was MAVLink 1.
     - `others`: system ids of any other autopilots on the link.
     """
 
@@ -49,12 +56,11 @@ class Inquiry:
         self.heard: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
-        self.says_version_1 = False  # True if its last message was MAVLink 1
+        self.says_version_1 = False
+        self.signing = signing
         self._address = address
-        self._signing = signing
         self._reader = PacketReader(signing.admits)
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
-        self._waiting: deque[bytes] = deque(maxlen=_WAITING_MAX)  # packets to be written, one datagram each
         self._arrived: deque[Message] = deque()  # from the autopilot, not yet returned to the caller
         self._heartbeat_due_s = 0.0
         self._autopilot_heard = False
@@ -71,7 +77,7 @@ class Inquiry:
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            if self._waiting or self._port.unsent():  # a port that accepts nothing must not delay the end
+            if self._port.unsent():  # a port that accepts nothing must not delay the end
                 self._port.throw_away()
         self._port.close()
 
@@ -79,16 +85,6 @@ class Inquiry:
     def bad_bytes(self) -> int:
         """The number of received bytes that belong to no valid message."""
         return self._reader.bad_bytes
-
-    @property
-    def signs(self) -> bool:
-        """True if there is a signing key, so that our messages are signed."""
-        return self._signing is not NOT_SIGNING
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """The number of messages refused for their signature or its time stamp, by reason. Empty without a key."""
-        return self._signing.refused
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
         """Wait up to `wait_s` seconds for the heartbeat of an autopilot and return it, or None if none came. From then
@@ -147,9 +143,7 @@ class Inquiry:
             self._put(messages.parameter_request(self.system_id or 0, name))
         kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
         while waiting:
-            answer = self._first(
-                ANSWER_WAIT_S, lambda message: message.get_type() in kinds and message.param_id in waiting
-            )
+            answer = self._first(ANSWER_WAIT_S, lambda each: each.get_type() in kinds and each.param_id in waiting)
             if answer is None:
                 return
             waiting.remove(answer.param_id)
@@ -168,31 +162,20 @@ class Inquiry:
             now_s = time.monotonic()
             if now_s >= end_s:
                 return
-            try:
-                self._turn(now_s, min(end_s - now_s, 0.05 if self._waiting else 0.25))
-            except OSError as error:
-                raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
+            with self._unless_lost():
+                self._turn(now_s, min(end_s - now_s, 0.25))
 
     def _turn(self, now_s: float, wait_s: float) -> None:
-        """Queue a heartbeat if one is due, write as much as the port accepts without blocking, then receive for up to
-        `wait_s` seconds."""
-        if self._port.connected:
-            if now_s >= self._heartbeat_due_s:
-                self._heartbeat_due_s = now_s + HEARTBEAT_S
-                self._put(messages.heartbeat(Health.BOOT))
-            while self._waiting:
-                packet = self._waiting.popleft()
-                rest = packet[self._port.write(packet) :]
-                if rest:
-                    self._waiting.appendleft(rest)
-                    break
+        """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
+        if self._port.connected and now_s >= self._heartbeat_due_s:
+            self._heartbeat_due_s = now_s + HEARTBEAT_S
+            self._put(messages.heartbeat(Health.BOOT))
         readable, _, _ = select.select([self._port], [], [], wait_s)
         # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        arrived = self._reader.feed(data, self._port.sender)
-        self._arrived.extend(message for message in arrived if self._is_ours(message))
+        self._arrived.extend(each for each in self._reader.feed(data, self._port.sender) if self._is_ours(each))
 
     def _is_ours(self, message: Message) -> bool:
         beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -209,14 +192,116 @@ class Inquiry:
         if not self._autopilot_heard:
             return False
         self.heard[message.get_type()] += 1
-        self.signed += bool(message.get_header().incompat_flags & _SIGNED)
+        self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
+    @contextmanager
+    def _unless_lost(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
+
     def _put(self, message: Message) -> None:
-        self._signing.stamp(self._packer)
-        self._waiting.append(message.pack(self._packer))
+        """Send a message; what a full port does not take is lost, as on any line: every question is asked again."""
+        self.signing.stamp(self._packer)
+        with self._unless_lost():
+            self._port.write(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotReading:
+    """All that an autopilot tells about itself; None and empty stand for what it did not answer.
+
+    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of a `Kind`. `streams_hz` is the rate of the
+    messages that came unasked, `heard` the names of all that came. `gps_fix` is the fix type of the first and second
+    receiver. `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS. `origin` is (latitude, longitude) in
+    degrees. `signs`: its messages are signed; `is_signed_to`: ours are. `answers`: it has answered any question;
+    `says_version_1`: it sends MAVLink 1. `clock_ahead_s` is its UTC less that of this machine.
+    """
+
+    system_id: int
+    firmware: str
+    vehicle: str
+    is_armed: bool
+    version: tuple[int, int, int] | None
+    version_text: str | None
+    parameters: dict[str, float | int]
+    streams_hz: dict[str, float]
+    heard: tuple[str, ...]
+    gps_fix: tuple[int | None, int | None]
+    filter_flags: int | None
+    origin: tuple[float, float] | None
+    signs: bool
+    is_signed_to: bool
+    answers: bool
+    says_version_1: bool
+    other_systems: tuple[int, ...]
+    bad_bytes: int
+    round_trip_s: float | None
+    clock_ahead_s: float | None
+
+    @property
+    def asked(self) -> Answers:
+        """The answers on which the flight bases its choice of the channel."""
+        return Answers(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
+
+
+def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
+    """Read all that can be read; return None if no heartbeat comes. `wanted`: names of parameters, by firmware.
+
+    It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
+    """
+    beat = asking.heartbeat()
+    if beat is None:
+        return None
+    firmware = _FIRMWARES.get(beat.autopilot, "other")
+    before = asking.heard.copy()
+    asking.listen(LISTEN_S)
+    streams_hz = {name: count / LISTEN_S for name, count in sorted((asking.heard - before).items())}
+    said = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    trips_s = asking.round_trips_s(ROUND_TRIPS if said else 1)
+    answers = bool(said or trips_s or asking.heard["COMMAND_ACK"])
+    is_px4 = firmware == "px4"
+    wanted_ids = {
+        "filter": mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+        "first": mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        "second": mavlink.MAVLINK_MSG_ID_GPS2_RAW,
+        "position": mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        "attitude": mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        "origin": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+        "clock": mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+    }
+    # Without an answer each question would take three seconds.
+    told = {name: asking.message(number) if answers else None for name, number in wanted_ids.items()}
+    first, second, origin, clock = (told[name] for name in ("first", "second", "origin", "clock"))
+    packed = said.flight_sw_version if said else 0
+    version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
+    bytewise = bool(said.capabilities & _BYTEWISE) if said else is_px4
+    return AutopilotReading(
+        system_id=beat.get_srcSystem(),
+        firmware=firmware,
+        vehicle=kind_of(beat.type).value,
+        is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+        version=version if said else None,
+        version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
+        parameters=asking.parameters(wanted.get(firmware, ()) if answers else (), bytewise),
+        streams_hz=streams_hz,
+        heard=tuple(sorted(asking.heard)),
+        gps_fix=(first and first.fix_type, second and second.fix_type),
+        filter_flags=told["filter"] and told["filter"].flags,
+        origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
+        signs=asking.signed > 0,
+        is_signed_to=asking.signing is not NOT_SIGNING,
+        answers=answers,
+        says_version_1=asking.says_version_1,
+        other_systems=tuple(sorted(asking.others)),
+        bad_bytes=asking.bad_bytes,
+        round_trip_s=statistics.median(trips_s) if trips_s else None,
+        clock_ahead_s=clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None,
+    )
 
 
 def _refuses(message: Message) -> bool:

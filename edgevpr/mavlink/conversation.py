@@ -16,7 +16,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener, NoListener
-from edgevpr.mavlink.requests import Requests, Wish, Wished, Wishes
+from edgevpr.mavlink.requests import Requests, Wish, Wished
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
 from edgevpr.mavlink.texts import News, Texts
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
@@ -65,8 +65,7 @@ class Conversation:
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
         self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener)
-        self.fixes, self.texts, self.wishes = Fixes(settings.max_fix_age_s), Texts(), Wishes()
-        self.requests = Requests(self.wishes)
+        self.fixes, self.texts, self.requests = Fixes(settings.max_fix_age_s), Texts(), Requests()
         self.reader = PacketReader(settings.signing.admits, tap=settings.tap)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0
@@ -116,11 +115,11 @@ class Conversation:
 
     def offer(self, wishes: Collection[Wish]) -> None:
         """Set the wishes of the ground station that the flight can fulfil; before the first call there are none."""
-        self.wishes.offered = wishes
+        self.requests.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
         """Return the wishes of the ground station that have arrived since the last call."""
-        return self.wishes.take()
+        return self.requests.take()
 
     def vehicle(self) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
@@ -219,7 +218,7 @@ class Conversation:
             self._ask_for_position(system_id, now_s)
             if self.channel.is_continuous and (state := self._state(system_id, now_s)):
                 return state, None
-            if why := self.wishes.why_no_fix() or self.fixes.why_not(now_s):
+            if why := self.requests.why_no_fix() or self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif sending := self.fixes.next(now_s):
                 if self.channel is Channel.SENSOR:
@@ -229,11 +228,7 @@ class Conversation:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
             return text, None  # not by `put`, which copies to the ground's link: that has its own texts
-        while self._messages:
-            message = self._messages.popleft()
-            if self.requests.admits(message, now_s):
-                return message, None
-        return None
+        return (self._messages.popleft(), None) if self._messages else None
 
     def _heartbeat(self, now_s: float) -> Message:
         is_stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
@@ -279,7 +274,7 @@ class Conversation:
 
     def _hear_request(self, message: Message, now_s: float) -> None:
         us = self._packer.srcSystem, self._packer.srcComponent
-        for reply in self.requests.hear(message, us, now_s, lambda: self._heartbeat(now_s)):
+        for reply in self.requests.hear(message, us, now_s):
             self.put(reply)
 
     def _hear_answer(self, answer: str, now_s: float) -> None:

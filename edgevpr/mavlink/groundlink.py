@@ -14,7 +14,6 @@ from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.requests import Requests
 from edgevpr.mavlink.wire import Message, mavlink
 
 FOR_PEOPLE = frozenset(("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS"))
@@ -54,7 +53,7 @@ class GroundConversation(Conversation):
 
     def __init__(self, flight: Conversation, settings: LinkSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings, clock)
-        self.wishes, self.requests = flight.wishes, Requests(flight.wishes)
+        self.requests = flight.requests
         self._flight = flight
         self._station: Sender | None = None
         self._station_heard_s = -math.inf

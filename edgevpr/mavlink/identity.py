@@ -1,4 +1,4 @@
-"""The identity of the one autopilot that a link talks to, and the rule by which another sender may take its place."""
+"""The identity of the one autopilot that a link talks to, and the rule by which another address may take its place."""
 
 import logging
 import math
@@ -8,9 +8,8 @@ from edgevpr.mavlink.address import Sender
 
 # A flight controller that restarts is back within 20 s; other senders in the meantime are not it.
 RETAKEN_AFTER_S = 30.0
-STEADY_S = 5.0  # another sender takes over after heartbeats for this time (not after one stray packet),
+STEADY_S = 5.0  # another address takes over after heartbeats for this time (not after one stray packet),
 GAP_S = 2.5  # without a longer gap: they come once a second, and one may be lost
-_OTHERS_MAX = 32  # speakers remembered; a flood of invented ones must not fill the memory
 
 log = logging.getLogger(__name__)
 
@@ -33,13 +32,11 @@ class Speaker:
 
 class Identity:
     """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
-    id.
+    id. Another system id never takes its place. The same one at another address does so after 30 s of silence, with
+    steady heartbeats.
 
-    It stays our autopilot for as long as it sends. After 30 s of silence, another sender with steady heartbeats takes
-    its place: the same system id at another address, or else another system id if only one is there. A system id from
-    which a heartbeat came between two heartbeats of ours is another vehicle and is never taken; with `system_id` set,
-    no other is. `kept` is our autopilot (None: not heard yet). `foreign_messages` counts the messages refused since
-    they came from another autopilot or another address.
+    `kept` is our autopilot (None: not heard yet). `foreign_messages` counts the messages refused since they came from
+    another autopilot or another address.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -47,8 +44,7 @@ class Identity:
         self.foreign_messages = 0
         self._configured = system_id
         self._spoke_s = -math.inf
-        self._others: dict[Speaker, tuple[float, float]] = {}  # unbroken heartbeats: times of first and last
-        self._neighbours: set[int] = set()  # system ids of other vehicles
+        self._other: tuple[Speaker, float, float] | None = None  # times of its first and last unbroken heartbeat
         self._warnings: set[str] = set()
         self._news: str | None = None
 
@@ -66,8 +62,6 @@ class Identity:
             self.refuse()
             return False
         self._spoke_s = now_s
-        if beats:  # a sender of heartbeats while ours still sends cannot be ours under another number
-            self._neighbours |= {other.system_id for other in self._others} - {speaker.system_id}
         return True
 
     def is_elsewhere(self, address: Sender | None) -> bool:
@@ -87,44 +81,28 @@ class Identity:
             return False
         if kept is None:
             return True
-        if speaker.system_id == kept.system_id:
-            self._warn("address", f"{speaker} is a second autopilot of that number; fixes go to {kept} only")
-        else:
+        if speaker.system_id != kept.system_id:
             self._warn(
                 "system",
                 f"a second autopilot, {speaker}, is on this link; fixes go to {kept} only: give each vehicle a link "
-                "of its own, or set mavlink.system_id",
+                "of its own, or set mavlink.system_id and restart edgevpr",
             )
-        steady_s = self._steady_s(speaker, now_s)
-        # Another system id is taken only if it is the only candidate; our own system id may always be taken.
-        systems = {other.system_id for other in self._others} - self._neighbours
-        is_only_choice = speaker.system_id == kept.system_id or systems == {speaker.system_id}
-        return now_s - self._spoke_s >= RETAKEN_AFTER_S and steady_s >= STEADY_S and is_only_choice
-
-    def _steady_s(self, speaker: Speaker, now_s: float) -> float:
-        """Note a heartbeat of `speaker`, and forget the speakers whose heartbeats have stopped. Returns for how many
-        seconds those of `speaker` have come without a gap."""
-        since_s, last_s = self._others.pop(speaker, (now_s, now_s))
-        self._others = {other: row for other, row in self._others.items() if now_s - row[1] <= GAP_S}
-        if len(self._others) == _OTHERS_MAX:
-            self._others.pop(next(iter(self._others)))
-        since_s = since_s if now_s - last_s <= GAP_S else now_s
-        self._others[speaker] = since_s, now_s
-        return now_s - since_s
+            return False
+        self._warn("address", f"{speaker} is a second autopilot of that number; fixes go to {kept} only")
+        other, first_s, last_s = self._other or (speaker, now_s, now_s)
+        if other != speaker or now_s - last_s > GAP_S:
+            first_s = now_s
+        self._other = speaker, first_s, now_s
+        return now_s - self._spoke_s >= RETAKEN_AFTER_S and now_s - first_s >= STEADY_S
 
     def _take(self, speaker: Speaker, now_s: float) -> None:
-        before, self.kept = self.kept, speaker
+        before, self.kept, self._other = self.kept, speaker, None
+        self._warnings.clear()
         if before is None:
             log.info("autopilot heard: %s", speaker)
-        else:
-            silent_s = now_s - self._spoke_s
-            log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, silent_s)
-            is_renamed = speaker.system_id != before.system_id
-            self._news = (
-                f"autopilot is now system {speaker.system_id}" if is_renamed else f"autopilot now{speaker.where}"
-            )
-        self._others.clear()
-        self._warnings.clear()
+            return
+        log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, now_s - self._spoke_s)
+        self._news = f"autopilot now{speaker.where}"
 
     def _warn(self, kind: str, text: str) -> None:
         if kind not in self._warnings:

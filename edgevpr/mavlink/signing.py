@@ -36,8 +36,6 @@ KEY_BYTES = 32
 TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
 UNSIGNED, WRONG = "unsigned", "wrong signature"
 OLD, FUTURE = "old time stamp", "time stamp from the future"
-_SIGNATURE_BYTES, _STAMP_BYTES = 6, 6
-_BLOCK_BYTES = 1 + _STAMP_BYTES + _SIGNATURE_BYTES  # link id, time stamp, signature
 _MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
 
 MEANING = {
@@ -59,9 +57,8 @@ class TimeStamps:
     the start, which raises ConfigError if the file is damaged or cannot be made, and from then on every half minute.
 
     With `is_kept` False the file is only read, for a program that asks before the flight: that may run as root, and the
-    service could not overwrite a file of root. So the next flight does not know the time stamps sent meanwhile, and
-    need not: the program has a link id, and so a stream, of its own. The autopilot requires only that a new stream is
-    not more than a minute old. Both start at the same kept time, and the program ends within that minute.
+    service could not overwrite a file of root. The program has a link id, and so a stream, of its own, and ends within
+    the minute by which the autopilot lets a new stream be late.
     """
 
     def __init__(
@@ -75,10 +72,9 @@ class TimeStamps:
         self._lock, self._writing = Lock(), Lock()
         self._streams: dict[Stream, int] = {}
         self._has_warned = False
-        self._written = _read_stamp(path)
-        self._rebase(self._written + _MOVED_ON)
+        self._rebase(_read_stamp(path) + _MOVED_ON)
         self._largest = self._kept = self._now()
-        self._keep(self._kept, may_fail=not path.exists())
+        self._keep(may_fail=not path.exists())
 
     def next(self) -> int:
         """Return the time stamp for the next message to be sent; it is larger than all before."""
@@ -118,15 +114,16 @@ class TimeStamps:
         if stamp - self._kept >= _KEPT_EVERY:
             self._kept = stamp
             # Not in the thread of a link: a slow card must not hold up a fix.
-            Thread(target=self._keep, args=(stamp,), name="signing time", daemon=True).start()
+            Thread(target=self._keep, name="signing time", daemon=True).start()
 
-    def _keep(self, stamp: int, may_fail: bool = False) -> None:
-        """Write a time stamp to the file. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
+    def _keep(self, may_fail: bool = False) -> None:
+        """Write the newest time stamp to be kept. If that fails, log one warning or, with `may_fail`, raise
+        ConfigError."""
+        if not self._is_kept:
+            return
         try:
             with self._writing:
-                if self._is_kept and stamp > self._written:  # two threads may come here in any order
-                    write_whole(self._path, lambda path: path.write_text(f"{stamp}\n"))
-                    self._written = stamp
+                write_whole(self._path, lambda path: path.write_text(f"{self._kept}\n"))
         except OSError as error:
             if may_fail:
                 raise ConfigError(
@@ -185,12 +182,7 @@ class Signing(NotSigning):
         signing.timestamp = self._stamps.next()
 
     def admits(self, message: Message) -> bool:
-        """Return True if a received message may be processed; count it if not. A RADIO_STATUS needs no signature, since
-        a radio has no key, but must not have the component id of an autopilot."""
-        header = message.get_header()
-        reason = self._refusal(message.get_msgbuf(), header)
-        if reason == UNSIGNED and _is_of_radio(header):
-            reason = None
+        reason = self._refusal(message.get_msgbuf(), message.get_header())
         self._verdicts.append(reason)
         if reason is None:
             return True
@@ -200,14 +192,17 @@ class Signing(NotSigning):
         return False
 
     def _refusal(self, packet: bytes, header: Message) -> str | None:
+        """Return why a message is refused (None: it is admitted). A RADIO_STATUS needs no signature, since a radio has
+        no key, but must not have the component id of an autopilot."""
         if not header.incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED:
-            return UNSIGNED
-        signed, signature = packet[:-_SIGNATURE_BYTES], packet[-_SIGNATURE_BYTES:]
-        expected = hashlib.sha256(self._key + signed).digest()[:_SIGNATURE_BYTES]
-        if not hmac.compare_digest(expected, signature):
+            is_status = header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS
+            return None if is_status and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1 else UNSIGNED
+        # At the end: link id (1 byte), time stamp (6), signature (6).
+        expected = hashlib.sha256(self._key + packet[:-6]).digest()[:6]
+        if not hmac.compare_digest(expected, packet[-6:]):
             return WRONG
-        stamp = int.from_bytes(packet[-_STAMP_BYTES - _SIGNATURE_BYTES : -_SIGNATURE_BYTES], "little")
-        return self._stamps.refusal((header.srcSystem, header.srcComponent, packet[-_BLOCK_BYTES]), stamp)
+        stamp = int.from_bytes(packet[-12:-6], "little")
+        return self._stamps.refusal((header.srcSystem, header.srcComponent, packet[-13]), stamp)
 
 
 def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> NotSigning:
@@ -237,8 +232,8 @@ def read_key(path: str) -> bytes:
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Return True if the file is a credential that systemd gives to this service alone. Its mode shows a right of the
-    group to read: that is an access list for the user of the service; the folder is closed to all others."""
+    """Return True if the file is a credential that systemd gives to this service alone: its mode shows a right of the
+    group to read, which is an access list for the user of the service."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 
@@ -254,8 +249,3 @@ def _read_stamp(path: Path) -> int:
     if not (text.isascii() and text.isdigit() and int(text) <= _LATEST):
         raise ConfigError(f"{path} holds no time of signed messages: set the clock, and delete the file.")
     return int(text)
-
-
-def _is_of_radio(header: Message) -> bool:
-    is_status = header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS
-    return bool(is_status and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1)

@@ -21,9 +21,9 @@ class Autopilot:
         self._packers, self.packets = {}, []
         self.beat()
 
-    def say(self, message, system_id=7, component_id=1):
+    def say(self, message, system_id=7, component_id=1, address=None):
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
-        self.conversation.hear(message.pack(packer), self.clock.now_s, None)
+        self.conversation.hear(message.pack(packer), self.clock.now_s, address)
 
     def beat(self, base_mode=0, **sender):
         beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)

@@ -8,10 +8,8 @@ from mavlink_peers import SerialCable, free_port
 
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink import asking as module
-from edgevpr.mavlink import reading
 from edgevpr.mavlink.address import LinkAddress, parse_link
-from edgevpr.mavlink.asking import Inquiry
-from edgevpr.mavlink.reading import read_autopilot
+from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -26,7 +24,7 @@ def address() -> LinkAddress:
 
 @pytest.fixture(autouse=True)
 def _listens_briefly(monkeypatch):
-    monkeypatch.setattr(reading, "LISTEN_S", 0.2)
+    monkeypatch.setattr(module, "LISTEN_S", 0.2)
 
 
 def read(address, names=(), **autopilot):

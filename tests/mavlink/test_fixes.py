@@ -305,12 +305,3 @@ def test_a_peer_that_stops_reading_for_a_minute_finds_a_few_fixes_and_not_all(cl
             pass
         assert found == pytest.approx(sent_s, abs=0.01)
         assert len(found) == 10, "five, and one every ten seconds"
-
-
-def test_another_autopilot_starts_with_a_clean_slate(autopilot):
-    fly(autopilot, 8)
-    for _ in range(35):
-        autopilot.wait(1.0)
-        autopilot.beat(system_id=9)
-    assert autopilot.conversation.autopilot.system_id == 9
-    assert all(autopilot.put_fix(system_id=9).sent for _ in range(5))

@@ -230,11 +230,16 @@ def test_an_accuracy_that_is_none_is_not_believed(autopilot, nothing):
     assert autopilot.sd_m() == pytest.approx(3.0)
 
 
-def test_another_autopilot_is_not_known_as_well(autopilot):
+def test_another_autopilot_is_not_known_as_well_and_starts_with_a_clean_slate(autopilot):
     autopilot.gps()
     assert autopilot.sd_m() == GPS_SD_M
-    for _ in range(60):
+    for _ in range(5):
+        autopilot.put_fix()
+    autopilot.wait(30.0)
+    elsewhere = {"address": ("127.0.0.1", 9)}
+    for _ in range(6):
         autopilot.wait(1.0)
-        autopilot.beat(system_id=9)
-    assert (autopilot.conversation.autopilot.system_id, autopilot.vehicle) == (9, None)
-    assert autopilot.position(system_id=9).position_sd_m is None
+        autopilot.beat(**elsewhere)
+    assert autopilot.vehicle is None
+    assert autopilot.position(**elsewhere).position_sd_m is None
+    assert autopilot.put_fix(**elsewhere).sent

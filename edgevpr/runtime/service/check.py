@@ -191,5 +191,5 @@ def _link(config: Config, offline: bool) -> str:
 
 def _heartbeat(inquiry: Inquiry, address: LinkAddress) -> str:
     if inquiry.heartbeat() is None:
-        raise LinkError(silence(address, inquiry.bad_bytes, inquiry.others, inquiry.refused).message)
+        raise LinkError(silence(address, inquiry.bad_bytes, inquiry.others, inquiry.signing.refused).message)
     return f"autopilot heard: system {inquiry.system_id}"

@@ -8,8 +8,7 @@ from types import MappingProxyType
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import Inquiry
-from edgevpr.mavlink.reading import AutopilotReading, read_autopilot
+from edgevpr.mavlink.asking import AutopilotReading, Inquiry, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
@@ -58,7 +57,7 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
             if reading:
                 about_autopilot = list(autopilot_findings(reading, address, intent_of(config)))
             else:
-                about_autopilot = [silence(address, asking.bad_bytes, asking.others, asking.refused)]
+                about_autopilot = [silence(address, asking.bad_bytes, asking.others, asking.signing.refused)]
     except LinkAddressError:
         raise
     except LinkError as error:

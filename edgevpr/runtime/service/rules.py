@@ -8,6 +8,7 @@ of PX4 is based on the sources of 1.17-alpha.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
+from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import (
     ARDUPILOT,
     CONTROL,
@@ -24,7 +25,6 @@ from edgevpr.mavlink.channel import (
     receiver_name,
 )
 from edgevpr.mavlink.positions import SENSOR_ID
-from edgevpr.mavlink.reading import AutopilotReading
 from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
 
 Parameters = Mapping[str, float | int]

@@ -17,9 +17,9 @@ from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
 from edgevpr.lab.simulate.motion import FlownTrack, Motion, read_track, truth_at
-from edgevpr.mavlink import messages, reading
+from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import Inquiry
+from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 
@@ -124,7 +124,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
 
 @pytest.mark.slow
 def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
-    monkeypatch.setattr(reading, "LISTEN_S", 0.2)
+    monkeypatch.setattr("edgevpr.mavlink.asking.LISTEN_S", 0.2)
     track = FlownTrack(
         t_s=np.array([0.0, 0.1]),
         lat_deg=np.array([50.0, 50.1]),
@@ -136,7 +136,7 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
     autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
     try:
         with Inquiry(parse_link(f"udpout:{link}")) as asking:
-            assert reading.read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
+            assert read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
             there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
         assert there.lat / 1e7 == 50.0
         with link_to(f"udpout:{link}") as flight:

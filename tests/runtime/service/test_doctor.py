@@ -11,11 +11,11 @@ from answering_autopilot import AnsweringAutopilot, healthy_messages
 from mavlink_peers import AutopilotThread, free_port
 
 from edgevpr.cli.main import main
-from edgevpr.mavlink import reading as module
+from edgevpr.mavlink import asking as module
 from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import ardupilot_choice
 from edgevpr.mavlink.positions import SENSOR_ID
-from edgevpr.mavlink.reading import AutopilotReading
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
