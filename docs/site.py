@@ -105,10 +105,10 @@ def configuration() -> str:
 def details(key: Key, default: str) -> str:
     """Return what the code knows of a key: type, default, limits and flag."""
     facts = [KINDS[key.kind], f"default `{default}`"]
-    if key.limits:
-        facts.append(f"{key.limits[0]:g} to {key.limits[1]:g}")
-    if key.flag:
-        facts.append(f"flag {', '.join(f'`{name}`' for name in key.flag.names)}")
+    if key.within:
+        facts.append(f"{key.within[0]:g} to {key.within[1]:g}")
+    if key.flags:
+        facts.append(f"flag {', '.join(f'`{name}`' for name in key.flags)}")
     return f"*{'; '.join(facts)}*"
 
 

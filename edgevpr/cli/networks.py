@@ -124,9 +124,8 @@ def models_list(args: Namespace) -> int:
     for each in found:
         print(f"{each.name:<20} {'ok   ' if each.ok else 'WRONG'}  {each.title or ''}")
         if each.title:
-            head = f", head {each.head}" if each.head else ""
             print(f"{'':<27} {each.licence}; {each.source}")
-            print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}{head}")
+            print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}")
             print(f"{'':<27} used by {', '.join(each.techniques) or 'none, unless told: --param model=' + each.name}")
         if each.problem:
             print(f"{'':<27} {each.problem}")

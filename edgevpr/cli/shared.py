@@ -70,16 +70,13 @@ def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
     """Add the flags of the configuration keys `names` (none: of all keys), such as "source.mask". `texts` replace the
     help of some; they are by the last part of the key's name, such as "mask"."""
     for key in keys_of():
-        flag = key.flag
-        if flag is None or (names and key.name not in names):
+        if not key.flags or (names and key.name not in names):
             continue
-        text = texts.get(key.name.rpartition(".")[2], flag.text)
+        text = texts.get(key.name.rpartition(".")[2], key.text)
+        form: dict[str, Any] = {"type": key.kind, "metavar": key.metavar, "choices": key.choices or None}
         if key.kind is bool:
-            parser.add_argument(*flag.names, dest=_KEY + key.name, action="store_const", const=key.sets, help=text)
-        elif flag.choices:
-            parser.add_argument(*flag.names, dest=_KEY + key.name, choices=flag.choices, help=text)
-        else:
-            parser.add_argument(*flag.names, dest=_KEY + key.name, type=key.kind, metavar=flag.metavar, help=text)
+            form = {"action": "store_const", "const": key.sets}
+        parser.add_argument(*key.flags, dest=_KEY + key.name, help=text, **form)
 
 
 def value_of(args: Namespace, name: str) -> Any:

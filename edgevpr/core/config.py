@@ -6,7 +6,7 @@ An unknown key, a wrong type or a value out of range raises ConfigError with one
 import os
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -33,109 +33,92 @@ _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true o
 _WORDS |= {dict: "a section"}
 
 
-@dataclass(frozen=True, slots=True)
-class Flag:
-    """Command-line flag of a configuration key: its names, the placeholder of its value in the help (None: argparse's
-    own), the help text, and the allowed values (empty: any). `Key` has the type and the range of the value."""
+def key(
+    flag: str = "",
+    text: str = "",
+    *,
+    within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+    sets: bool = True,
+    **default: Any,
+) -> Any:
+    """Make a dataclass field whose value is None, lies `within` two numbers (None: anywhere) and is one of `choices`
+    (empty: any). `flag` sets it on the command line: its names and the placeholder of its value ("" : no flag), with
+    the help `text`. The flag of a boolean key has no value: giving it sets the key to `sets`. `default` is that of
+    `dataclasses.field`."""
+    return field(metadata={"within": within, "choices": choices, "flag": flag, "text": text, "sets": sets}, **default)
 
-    names: tuple[str, ...]
-    metavar: str | None
-    text: str
-    choices: tuple[str, ...] = ()
 
-
-def keyed(flag: Flag | None = None, sets: bool = True) -> Any:
-    """Make a dataclass field that `flag` (None: no flag) sets on the command line. The flag of a boolean key takes no
-    value: giving it sets the key to `sets`."""
-    return field(metadata={"flag": flag, "sets": sets})
-
-
-def bounded(low: float, high: float, flag: Flag | None = None) -> Any:
-    """Make a dataclass field whose value must be None or within low..high, set by `flag` (None: no flag)."""
-    return field(metadata={"range": (low, high), "flag": flag})
+def bounded(low: float, high: float, **default: Any) -> Any:
+    """Make a `key` whose value must be None or within low..high."""
+    return key(within=(low, high), **default)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
-    uri: str | None = keyed(Flag(("--images", "--source"), "SOURCE", SOURCES))
-    camera: str | None = keyed(
-        Flag(
-            ("--camera",),
-            None,
-            "straight down, or ahead (default: the map's; a new map's is forward)",
-            choices=("nadir", "forward"),
-        )
+    uri: str | None = key("--images --source SOURCE", SOURCES)
+    camera: str | None = key(
+        "--camera",
+        "straight down, or ahead (default: the map's; a new map's is forward)",
+        choices=("nadir", "forward"),
     )
-    rate_hz: float | None = bounded(
-        LOWEST_RATE_HZ, HIGHEST_RATE_HZ, Flag(("--rate-hz",), "HZ", "queries a second (default: the board's)")
+    rate_hz: float | None = key(
+        "--rate-hz HZ", "queries a second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     )
-    mask: str | None = keyed(Flag(("--mask",), "PNG", "black where frames show a display and no ground"))
-    fov_deg: float | None = bounded(
-        5, 150, Flag(("--fov-deg",), "DEG", "field of view across the longest side of the picture")
+    mask: str | None = key("--mask PNG", "black where frames show a display and no ground")
+    fov_deg: float | None = key(
+        "--fov-deg DEG", "field of view across the longest side of the picture", within=(5, 150)
     )
-    up_deg: float = bounded(
-        0, 360, Flag(("--up-deg",), "DEG", "where the top of the picture points while the nose points north (0)")
+    up_deg: float = key(
+        "--up-deg DEG", "where the top of the picture points while the nose points north (0)", within=(0, 360)
     )
-    gimbal: bool = field()
+    gimbal: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchConfig:
-    matching: str | None = keyed(
-        Flag(("--matching",), None, "how cohog scores (displacement)", choices=("displacement", "thesis"))
+    matching: str | None = key("--matching", "how cohog scores (displacement)", choices=("displacement", "thesis"))
+    form: str | None = key(
+        "--form", "what a number of a vector takes in RAM: half precision, a byte or a bit (float)", choices=FORMS
     )
-    form: str | None = keyed(
-        Flag(
-            ("--form",),
-            None,
-            "what a number of a vector takes in RAM: half precision, a byte or a bit (float)",
-            choices=FORMS,
-        )
+    candidates: int | None = key("--candidates N", "places compared (the technique's)", within=(1, 1_000_000))
+    follow: bool
+    sequence: int | None = key("--sequence N", "queries matched together (the technique's)", within=(1, 100))
+    accept_precision: float = key(
+        "--accept-precision P", "share of the accepted matches that is to be right (0.999)", within=(0.5, 0.999999)
     )
-    candidates: int | None = bounded(1, 1_000_000, Flag(("--candidates",), "N", "places compared (the technique's)"))
-    follow: bool = field()
-    sequence: int | None = bounded(1, 100, Flag(("--sequence",), "N", "queries matched together (the technique's)"))
-    accept_precision: float = bounded(
-        0.5, 0.999999, Flag(("--accept-precision",), "P", "share of the accepted matches that is to be right (0.999)")
-    )
-    min_score: float | None = bounded(0, 1, Flag(("--min-score",), "S", "accept from this score on"))
-    min_margin: float | None = bounded(
-        0, 1, Flag(("--min-margin",), "M", "accept when this far ahead of a place elsewhere")
-    )
-    verify: bool = field()
+    min_score: float | None = key("--min-score S", "accept from this score on", within=(0, 1))
+    min_margin: float | None = key("--min-margin M", "accept when this far ahead of a place elsewhere", within=(0, 1))
+    verify: bool
     neighbour_m: float = bounded(0, 10_000)
-    reach_m_s: float | None = bounded(
-        0.1, 100, Flag(("--reach-m-s",), "V", "look only where this speed can have led (default: everywhere)")
+    reach_m_s: float | None = key(
+        "--reach-m-s V", "look only where this speed can have led (default: everywhere)", within=(0.1, 100)
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
-    budget_mb: float | None = bounded(
-        *BUDGET_MB, Flag(("--budget-mb",), "MB", "limit of the index in RAM (default: the board's)")
+    budget_mb: float | None = key(
+        "--budget-mb MB", "limit of the index in RAM (default: the board's)", within=BUDGET_MB
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
-    learn: bool = keyed(
-        Flag(
-            ("--learn",),
-            None,
-            "add to the map what it does not know, or make a new one, by the flight controller's position",
-        )
+    learn: bool = key(
+        "--learn", "add to the map what it does not know, or make a new one, by the flight controller's position"
     )
     spacing_m: float = bounded(1, 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
-    use: bool = keyed(Flag(("--salience",), None, "keep, and ask for, only what is worth remembering"))
+    use: bool = key("--salience", "keep, and ask for, only what is worth remembering")
     memorability: float = bounded(0, 1)
     staticity: float = bounded(0, 1)
     entropy: float = bounded(0, 1)
-    network: str | None = field()
-    detector: str | None = field()
+    network: str | None
+    detector: str | None
     detect_every: int = bounded(1, 1000)
     footprint_m: float | None = bounded(1, 10_000)
     gap_frames: int = bounded(1, 10_000)
@@ -150,40 +133,38 @@ class SourceSetsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
-    link: str | None = keyed(
-        Flag(("--link",), "URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
-    )
+    link: str | None = key("--link URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
     component_id: int = bounded(1, 255)
     system_id: int | None = bounded(1, 255)
-    send_fixes: bool = keyed(
-        Flag(("--dry-run",), None, "send no position fix: decide, log and tell all else as in a flight"), sets=False
+    send_fixes: bool = key(
+        "--dry-run", "send no position fix: decide, log and tell all else as in a flight", sets=False
     )
     max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
     source_sets: SourceSetsConfig
-    set_origin: bool = field()
-    ground: str | None = field()
-    signing_key: str | None = field()
-    signing_state: str | None = field()
+    set_origin: bool
+    ground: str | None
+    signing_key: str | None
+    signing_state: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
-    path: str | None = keyed(Flag(("--log",), "FILE", "flight log, JSON lines"))
-    tlog: str | None = keyed(Flag(("--tlog",), "FILE", "every packet of the link, for mavlogdump and ground stations"))
+    path: str | None = key("--log FILE", "flight log, JSON lines")
+    tlog: str | None = key("--tlog FILE", "every packet of the link, for mavlogdump and ground stations")
     max_mb: float | None = bounded(1, 1_000_000)
-    record: str | None = keyed(Flag(("--record",), "FOLDER", "frames and all else that `edgevpr replay` needs"))
+    record: str | None = key("--record FOLDER", "frames and all else that `edgevpr replay` needs")
     record_mb: float = bounded(10, 1_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class StatusConfig:
-    file: str | None = field()
+    file: str | None
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryConfig:
-    pack: str = keyed(Flag(("--battery",), "PACK", "cells and capacity of the pack, e.g. 4S5200"))
+    pack: str = key("--battery PACK", "cells and capacity of the pack, e.g. 4S5200")
     regulator_efficiency: float = bounded(0.1, 1)
 
 
@@ -191,9 +172,9 @@ class BatteryConfig:
 class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 
-    board: str = keyed(Flag(("--board",), "NAME", "hardware profile (default: this machine)"))
-    map: str | None = keyed(Flag(("--map",), "MAP", "the place map"))
-    technique: str | None = keyed(Flag(("--technique",), "NAME", "insist on this technique"))
+    board: str = key("--board NAME", "hardware profile (default: this machine)")
+    map: str | None = key("--map MAP", "the place map")
+    technique: str | None = key("--technique NAME", "insist on this technique")
     source: SourceConfig
     match: MatchConfig
     memory: MemoryConfig
@@ -208,12 +189,16 @@ class Config:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
     """A configuration key: its dotted name ("source.rate_hz"), the type of its value (besides None), its lowest and
-    highest value, its command-line flag (None: there is none), and the value that a boolean flag `sets`."""
+    highest value, its flags on the command line (empty: none), the placeholder of their value (None: argparse's own),
+    and, as in `key`, their help text, the allowed values, and what a boolean flag sets."""
 
     name: str
     kind: type
-    limits: tuple[float, float] | None
-    flag: Flag | None
+    within: tuple[float, float] | None
+    flags: tuple[str, ...]
+    metavar: str | None
+    text: str
+    choices: tuple[str, ...]
     sets: bool
 
 
@@ -222,17 +207,14 @@ def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])
-        if isinstance(kind, type) and is_dataclass(kind):
+        if is_dataclass(kind):
             yield from keys_of(kind, f"{prefix}{each.name}.")
-        else:
-            known = each.metadata
-            yield Key(
-                name=prefix + each.name,
-                kind=kind,
-                limits=known.get("range"),
-                flag=known.get("flag"),
-                sets=known.get("sets", True),
-            )
+            continue
+        known = {"within": None, "choices": (), "flag": "", "text": "", "sets": True, **each.metadata}
+        words = known.pop("flag").split()
+        flags = tuple(word for word in words if word.startswith("-"))
+        metavar = words[-1] if len(words) > len(flags) else None
+        yield Key(name=prefix + each.name, kind=kind, flags=flags, metavar=metavar, **known)
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
@@ -285,7 +267,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     values = {}
     for name, spec in known.items():
         if name in mapping:
-            values[name] = _converted(mapping[name], hints[name], spec.metadata.get("range"), where, prefix + name)
+            values[name] = _converted(mapping[name], hints[name], spec.metadata, where, prefix + name)
         elif spec.default is MISSING and spec.default_factory is MISSING:
             raise ConfigError(f"{where}: the key `{prefix}{name}` is missing: add it.")
     return cls(**values)
@@ -308,11 +290,11 @@ def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) 
     return ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
 
 
-def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where: str, key: str) -> Any:
-    wanted = _kind(hint)
+def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key: str) -> Any:
+    wanted, limits, choices = _kind(hint), rules.get("within"), rules.get("choices")
     if value is None and isinstance(hint, types.UnionType):
         return None
-    if isinstance(wanted, type) and is_dataclass(wanted):
+    if is_dataclass(wanted):
         if not isinstance(value, dict):
             raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
         return build(wanted, value, where, f"{key}.")
@@ -323,10 +305,12 @@ def _converted(value: Any, hint: Any, limits: tuple[float, float] | None, where:
     if isinstance(value, str):
         require_sayable(value, f"{where}: `{key}`")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        word = _WORDS.get(wanted, str(wanted))
-        raise ConfigError(f"{where}: `{key}` must be {word}, not {value!r:.{_SHOWN}}.")
+        raise ConfigError(f"{where}: `{key}` must be {_WORDS.get(wanted, wanted)}, not {value!r:.{_SHOWN}}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
+    if choices and value not in choices:
+        allowed = f"{', '.join(choices[:-1])} or {choices[-1]}"
+        raise ConfigError(f"{where}: `{key}` is `{value:.{_SHOWN}}`: write {allowed}.")
     return value
 
 
@@ -342,8 +326,8 @@ def require_sayable(text: str, what: str) -> None:
         raise ConfigError(f"{what} holds {problem} ({text!a:.60}): write it anew.")
 
 
-def _kind(hint: Any) -> Any:
+def _kind(hint: Any) -> type:
     """Return the class of a type hint, without None or parameters: dict for `dict[str, Any] | None`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    kind = next(option for option in options if option is not type(None))
+    kind: type = next(option for option in options if option is not type(None))
     return typing.get_origin(kind) or kind

@@ -5,7 +5,7 @@ module also detects the machine that it runs on. The flight, `edgevpr profile` a
 """
 
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
@@ -33,7 +33,7 @@ class MachineSpeed:
     multi: float | None = bounded(0.0001, 10_000)
     products: float | None = bounded(0.0001, 100)
     passes: float | None = bounded(0.0001, 100)
-    arm64_mips: float | None = field(default=None, metadata={"range": (1, 1_000_000)})
+    arm64_mips: float | None = bounded(1, 1_000_000, default=None)
     verified: bool
     source: str
 
@@ -69,7 +69,7 @@ class Board:
     thermal_limit_c: float | None = bounded(30, 125)
     benchmark_score: MachineSpeed
     technique: str | None = None
-    threads: int = field(default=1, metadata={"range": (1, 64)})
+    threads: int = bounded(1, 64, default=1)
     machine: str | None = None
 
 

@@ -110,10 +110,7 @@ def _maker(name: str) -> Callable[..., Any]:
 
     card = load_card(name)
     if not card.is_technique:
-        raise UsageError(
-            f"The network `{name}` gives feature maps only: use it as the `model` of a technique, or name a head on "
-            "its card."
-        )
+        raise UsageError(f"The network `{name}` gives no descriptor: use it as the `model` of a technique.")
     from edgevpr.techniques.network import of_card
 
     return partial(of_card, card)

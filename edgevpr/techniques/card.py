@@ -4,12 +4,12 @@ training and the commands for models use it. Every error in a card is reported w
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass, field, make_dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import bounded, build
+from edgevpr.core.config import bounded, build, key
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import ConfigError, ModelError
 from edgevpr.core.files import find_model, model_folders
@@ -17,24 +17,6 @@ from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 
 _ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
-_CHOICES = {
-    "input.layout": ("NCHW", "NHWC"),
-    "input.colour": ("grey", "bgr", "rgb"),
-    "input.resize": ("area", "linear", "cubic"),
-    "similarity": ("cosine", "l1", "l2"),
-    "detector.family": ("yolox", "fastestdet", "nanodet"),
-}
-# The parameters of each head: name, type and, for numbers, the range.
-_HEADS: dict[str, tuple[tuple[Any, ...], ...]] = {
-    "flatten": (),
-    "max": (),
-    "gem": (("p", float, bounded(0.1, 100)),),
-    "grid": (("rows", int, bounded(1, 1024)), ("columns", int, bounded(1, 1024)), ("how", str)),
-    "pyramid": (("levels", list),),
-    "projection": (("length", int, bounded(8, 65_536)), ("seed", int, bounded(0, 2**31))),
-    "vlad": (("words", int, bounded(1, 65_536)),),
-    "rmac": (),
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,20 +26,16 @@ class InputRule:
     interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it keeps its shape
     in the upper left corner, and the rest has that level. With `layout` NHWC feature maps are (1, H, W, C) too."""
 
-    layout: str
+    layout: str = key(choices=("NCHW", "NHWC"))
     height: int = bounded(8, 4096)
     width: int = bounded(8, 4096)
-    colour: str
+    colour: str = key(choices=("grey", "bgr", "rgb"))
     equalise: bool
-    resize: str
+    resize: str = key(choices=("area", "linear", "cubic"))
     scale: float = bounded(1e-9, 1e9)
     mean: list[float]
     std: list[float] | None = None
-    pad: int | None = field(default=None, metadata={"range": (0, 255)})
-
-    @property
-    def channels(self) -> int:
-        return 1 if self.colour == "grey" else 3
+    pad: int | None = bounded(0, 255, default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +49,12 @@ class Outputs:
     memorability: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorRule:
     """Decoding of the outputs `boxes` of an object detector, by the decoder of its `family`. `dynamic` are the classes
     of movable things, such as cars, each with its number in the outputs. A box counts from the score `min_score` on."""
 
-    family: str
+    family: str = key(choices=("yolox", "fastestdet", "nanodet"))
     dynamic: dict[str, int]
     min_score: float = bounded(0.01, 1)
 
@@ -84,7 +62,7 @@ class DetectorRule:
 @dataclass(frozen=True, kw_only=True)
 class Card:
     """One network. `path` is that of the card itself, `file` and `sha256` are the name and hash of the ONNX file beside
-    it. `head` has the name of a head (see `network`) and its parameters (None: no head)."""
+    it. `similarity` is that of its descriptors."""
 
     path: Path
     title: str
@@ -94,8 +72,7 @@ class Card:
     source: str
     input: InputRule
     outputs: Outputs
-    head: dict[str, Any] | None
-    similarity: str = "cosine"
+    similarity: str = key(choices=("cosine", "l1", "l2"), default="cosine")
     detector: DetectorRule | None = None
 
     @property
@@ -109,7 +86,7 @@ class Card:
     @property
     def is_technique(self) -> bool:
         """True if the card makes a descriptor by itself. Other cards only serve techniques that take a `model`."""
-        return self.head is not None or self.outputs.descriptor is not None
+        return self.outputs.descriptor is not None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -161,79 +138,58 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
     values = read_yaml(path)
     if not needs_hash:
         values = {**values, "sha256": values.get("sha256") or ""}
-    card = build(Card, {"path": path, "head": None, **values}, str(path))
-    for key, choices in _CHOICES.items():
-        section, _, last = key.rpartition(".")
-        part = getattr(card, section) if section else card
-        if part is not None and getattr(part, last) not in choices:
-            choice = f"write {', '.join(choices[:-1])} or {choices[-1]}."
-            raise ModelError(f"{path}: `{key}` is `{getattr(part, last)}`: {choice}")
-    if not re.fullmatch("[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?", card.sha256):
-        raise ModelError(f"{path}: `sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.")
-    if card.file in ("", ".", "..") or "/" in card.file:
-        raise ModelError(f"{path}: `file` is `{card.file}`: write the name of a file that lies beside the card.")
-    if card.file.lower().endswith((".yaml", ".yml")):
-        raise ModelError(f"{path}: `file` is `{card.file}`, which is the name of a card: write that of the ONNX file.")
-    if not any(asdict(card.outputs).values()):
-        raise ModelError(
-            f"{path}: `outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of "
-            "memorability."
-        )
-    _require_detector(card)
-    _require_numbers(card, "mean", card.input.mean)
-    _require_numbers(card, "std", card.input.std)
-    head_parameters(card)
+    card = build(Card, {"path": path, **values}, str(path))
+    for is_wrong, remedy in _problems(card, "[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?"):
+        if is_wrong:
+            raise ModelError(f"{path}: {remedy}")
     return card
 
 
-def _require_detector(card: Card) -> None:
-    boxes, rule = card.outputs.boxes, card.detector
-    if (boxes is None) != (rule is None):
-        raise ModelError(f"{card.path}: a detector needs both `outputs.boxes` and the section `detector`: write both.")
-    if boxes is None or rule is None:
-        return
-    if not boxes or not all(isinstance(name, str) for name in boxes):
-        raise ModelError(f"{card.path}: `outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs.")
-    if not rule.dynamic or not all(type(number) is int and 0 <= number < 10_000 for number in rule.dynamic.values()):
-        raise ModelError(f"{card.path}: `detector.dynamic` needs names of classes with their numbers, {{car: 2}}.")
-
-
-def _require_numbers(card: Card, key: str, values: list[float] | None) -> None:
-    """Require that `values` are None, one number, or one per channel. Those of the key `std` are divisors: above 0."""
-    channels, positive = card.input.channels, key == "std"
-    if values is None or (
-        len(values) in (1, channels)
-        and all(type(each) in (int, float) and abs(each) < 1e9 and (each > 0 or not positive) for each in values)
-    ):
-        return
-    also = ", all above 0." if positive else "."
-    raise ModelError(
-        f"{card.path}: `input.{key}` is {values!s:.80}: write one number or {channels}, one a channel{also}"
+def _problems(card: Card, sha256: str) -> tuple[tuple[bool, str], ...]:
+    """Return, for each rule that types and ranges do not hold, whether the card breaks it, and what to do then."""
+    boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
+    dynamic = [] if rule is None else list(rule.dynamic.values())
+    per_channel = f"write one number or {channels}, one a channel"
+    return (
+        (
+            not re.fullmatch(sha256, card.sha256),
+            f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.",
+        ),
+        (
+            card.file in ("", ".", "..") or "/" in card.file,
+            f"`file` is `{card.file}`: write the name of a file that lies beside the card.",
+        ),
+        (
+            card.file.lower().endswith((".yaml", ".yml")),
+            f"`file` is `{card.file}`, which is the name of a card: write that of the ONNX file.",
+        ),
+        (
+            not any(asdict(card.outputs).values()),
+            "`outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of memorability.",
+        ),
+        (
+            (boxes is None) != (rule is None),
+            "a detector needs both `outputs.boxes` and the section `detector`: write both.",
+        ),
+        (
+            boxes is not None and not (boxes and all(isinstance(name, str) for name in boxes)),
+            f"`outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs.",
+        ),
+        (
+            rule is not None and not (dynamic and all(type(each) is int and 0 <= each < 10_000 for each in dynamic)),
+            "`detector.dynamic` needs names of classes with their numbers, {car: 2}.",
+        ),
+        (
+            not _are_per_channel(card.input.mean, channels, -1e9),
+            f"`input.mean` is {card.input.mean!s:.80}: {per_channel}.",
+        ),
+        (
+            not (card.input.std is None or _are_per_channel(card.input.std, channels, 0)),
+            f"`input.std` is {card.input.std!s:.80}: {per_channel}, all above 0.",
+        ),
     )
 
 
-def head_parameters(card: Card) -> dict[str, Any]:
-    """Return the parameters of the card's head by name (empty: the card has no head). Raises ModelError for a head that
-    does not exist, lacks a feature map or has wrong `levels` or `how`, ConfigError for other parameters."""
-    if card.head is None:
-        return {}
-    name = card.head.get("name")
-    if not isinstance(name, str) or name not in _HEADS:
-        name = str(name)[:80]
-        raise ModelError(
-            f"{card.path}: there is no head `{name}`: " + meant(name, _HEADS, f"use {', '.join(_HEADS)}, or null.")
-        )
-    if card.outputs.features is None:
-        raise ModelError(
-            f"{card.path}: the head `{name}` needs a feature map: name it in `outputs: {{features: ...}}`."
-        )
-    written = {key: value for key, value in card.head.items() if key != "name"}
-    parameters: dict[str, Any] = asdict(build(make_dataclass(name, _HEADS[name]), written, str(card.path), "head."))
-    levels = parameters.get("levels", [1])
-    if not levels or not all(type(level) is int and 1 <= level <= 64 for level in levels):
-        raise ModelError(
-            f"{card.path}: `head.levels` is {levels!s:.80}: write whole numbers from 1 to 64, e.g. [1, 2, 3]."
-        )
-    if parameters.get("how", "mean") not in ("mean", "max"):
-        raise ModelError(f"{card.path}: `head.how` is `{parameters['how']}`: write mean or max.")
-    return parameters
+def _are_per_channel(values: list[float], channels: int, above: float) -> bool:
+    """Tell whether `values` are one number or one per channel, all larger than `above` and less than 1e9."""
+    return len(values) in (1, channels) and all(type(each) in (int, float) and above < each < 1e9 for each in values)

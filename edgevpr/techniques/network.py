@@ -1,23 +1,23 @@
 """Techniques that describe a picture by one vector of a network. Either the network gives the vector by itself, or a
 *head*, such as a pooling, makes it from the feature map.
 
-A card that makes a vector by itself is a technique of the card's name, without any code. The techniques of the thesis
-take parameters: `model` is the card of the weights, while `form` (see `vectors`) and `threads` are not part of a map.
+A card that names a descriptor is a technique of the card's name, without any code. The techniques of the thesis take
+parameters: `model` is the card of the weights, while `form` (see `vectors`) and `threads` are not part of a map.
 """
 
 from collections.abc import Callable
-from functools import partial
+from typing import Any
 
 import numpy as np
 
 from edgevpr.core.arrays import Image, Mask, Singles
 from edgevpr.core.errors import UsageError
-from edgevpr.techniques import pooling
-from edgevpr.techniques.card import Card, digest_of, head_parameters
+from edgevpr.techniques.card import Card, digest_of
+from edgevpr.techniques.pooling import gaussian_projection, pyramid
 from edgevpr.techniques.regions import describe, find_regions, region_backbone
 from edgevpr.techniques.session import Backbone, backbone_of, open_backbone
-from edgevpr.techniques.vectors import NEVER, Parameters, VectorTechnique
-from edgevpr.techniques.words import Words, load_words, local_descriptors, sharpness_of, vlad
+from edgevpr.techniques.vectors import NEVER, VectorTechnique
+from edgevpr.techniques.words import load_words, local_descriptors, sharpness_of, vlad
 
 # Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
 # shipped weights: on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them
@@ -31,40 +31,17 @@ _MARGINS = {
     "region_vlad": (0.075, 0.055, 0.03),  # 0.060, 0.042, 0.021
 }
 Head = Callable[[Singles], Singles]  # from an output of a network to a vector, float32 (D,)
-_POOLING: dict[str, Callable[..., Singles]] = {
-    "flatten": np.ravel,
-    "max": pooling.maximum,
-    "gem": pooling.gem,
-    "grid": pooling.grid,
-    "pyramid": pooling.pyramid,
-}
 
 
 class NetworkVector(VectorTechnique):
-    """The vector that a `head` makes of one output of a network. The head raises ModelError for a feature map that is
-    too small for it. `model_sha256` is the hash of all that a vector depends on (None: that of the network alone)."""
+    """The vector that a `head` makes of one output of a network (None: the output itself). The head raises ModelError
+    for a feature map that is too small for it. `spec` are further arguments of `VectorTechnique`."""
 
-    def __init__(
-        self,
-        name: str,
-        parameters: Parameters,
-        backbone: Backbone,
-        head: Head,
-        *,
-        form: str,
-        similarity: str = "cosine",
-        model_sha256: str | None = None,
-    ) -> None:
-        self._backbone, self._head = backbone, head
-        super().__init__(
-            name,
-            parameters,
-            len(head(np.zeros(backbone.shape, np.float32))),
-            form=form,
-            margins=_MARGINS.get(name, (NEVER,) * 3),
-            similarity=similarity,
-            model_sha256=model_sha256 or backbone.sha256,
-        )
+    def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
+        self._backbone, self._head = backbone, head or np.asarray
+        length = len(self._head(np.zeros(backbone.shape, np.float32)))
+        spec = {"margins": _MARGINS.get(name, (NEVER,) * 3), "model_sha256": backbone.sha256, **spec}
+        super().__init__(name, length, **spec)
 
     def vector(self, image: Image, mask: Mask | None) -> Singles:
         return self._head(self._backbone.run(image, mask))
@@ -77,7 +54,9 @@ def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkV
     Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
     histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.
     """
-    return NetworkVector("calc", {"model": model}, open_backbone(model, "descriptor", threads), _itself, form=form)
+    return NetworkVector(
+        "calc", open_backbone(model, "descriptor", threads), None, parameters={"model": model}, form=form
+    )
 
 
 def alexnet(
@@ -93,8 +72,8 @@ def alexnet(
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
     backbone = open_backbone(model, "features", threads)
-    head = pooling.gaussian_projection(int(np.prod(backbone.shape)), dims, seed)
-    return NetworkVector("alexnet", {"model": model, "dims": dims, "seed": seed}, backbone, head, form=form)
+    head = gaussian_projection(int(np.prod(backbone.shape)), dims, seed)
+    return NetworkVector("alexnet", backbone, head, parameters={"model": model, "dims": dims, "seed": seed}, form=form)
 
 
 def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
@@ -114,8 +93,8 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
     """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
 
-    HybridNet has the layers of AMOSNet, but its top five convolutional layers were started from CaffeNet instead of
-    from scratch. Only the weights differ, so give their card as `model`. With the same card both techniques are equal.
+    Its top five convolutional layers were started from CaffeNet instead of from scratch. Only the weights differ, so
+    give their card as `model`. With the same card both techniques are equal.
     """
     return _pyramid("hybridnet", model, form, threads, levels)
 
@@ -135,9 +114,14 @@ def netvlad(
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
     learned = load_words(model, "vlad", words)
-    head = partial(_vlad, learned=learned, sharpness=sharpness_of(learned.words) if assignment == "soft" else None)
-    parameters: Parameters = {"model": model, "words": words, "assignment": assignment}
-    return NetworkVector("netvlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
+    sharpness = sharpness_of(learned.words) if assignment == "soft" else None
+
+    def head(features: Singles) -> Singles:
+        vector = vlad(local_descriptors(features), learned.words, sharpness)
+        return vector if learned.whitening is None else learned.whitening(vector)
+
+    parameters = {"model": model, "words": words, "assignment": assignment}
+    return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=learned.sha256)
 
 
 def region_vlad(
@@ -157,44 +141,22 @@ def region_vlad(
     def head(features: Singles) -> Singles:
         return vlad(describe(features, find_regions(features, regions)), learned.words)
 
-    parameters: Parameters = {"model": model, "regions": regions, "words": words}
-    return NetworkVector("region_vlad", parameters, backbone, head, form=form, model_sha256=learned.sha256)
+    parameters = {"model": model, "regions": regions, "words": words}
+    return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=learned.sha256)
 
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make the technique of a card: the vector of the network or, if the card names a head, the result of the head on
-    the feature map. The technique has no parameters, since the model hash in a map covers all of this.
+    """Make the technique of a card: the vector of its network. It has no parameters, since the model hash in a map
+    covers them.
 
     The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
     """
-    backbone = backbone_of(card, "descriptor" if card.head is None else "features", threads)
-    head, words_sha256 = _head_of_card(card, backbone)
-    sha256 = digest_of([backbone.sha256, card.head, card.similarity, words_sha256])
-    made = NetworkVector(card.name, {}, backbone, head, form=form, similarity=card.similarity, model_sha256=sha256)
+    backbone = backbone_of(card, "descriptor", threads)
+    sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
+    made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     made.encode(noise)  # raises ModelError for numbers that half precision cannot hold
     return made
-
-
-def _head_of_card(card: Card, backbone: Backbone) -> tuple[Head, str | None]:
-    """Return the head of a card, and the hash of its learned words (None: it uses none)."""
-    if card.head is None:
-        return _itself, None
-    parameters, shape = head_parameters(card), backbone.shape
-    match card.head["name"]:
-        case "projection":
-            return pooling.gaussian_projection(int(np.prod(shape)), **parameters), None
-        case "rmac":
-            return partial(_rmac, squares=pooling.square_regions(*shape[1:])), None
-        case "vlad":
-            learned = load_words(card.name, "vlad", parameters["words"])
-            return partial(_vlad, learned=learned, sharpness=None), learned.sha256
-        case name:
-            return partial(_POOLING[name], **parameters), None
-
-
-def _itself(vector: Singles) -> Singles:
-    return vector
 
 
 def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
@@ -202,18 +164,11 @@ def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> Net
         raise UsageError(f"{name}: levels is {levels}; it must be 1 to 64.")
 
     def head(features: Singles) -> Singles:
-        pooled = pooling.pyramid(features, range(1, levels + 1))
+        pooled = pyramid(features, levels)
         shares: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
         return shares
 
     backbone = open_backbone(model, "features", threads)
-    return NetworkVector(name, {"model": model, "levels": levels}, backbone, head, form=form, similarity="l1")
-
-
-def _rmac(features: Singles, squares: list[pooling.Square]) -> Singles:
-    return pooling.unit(pooling.regional_vectors(features, squares).sum(axis=0))
-
-
-def _vlad(features: Singles, learned: Words, sharpness: float | None) -> Singles:
-    vector = vlad(local_descriptors(features), learned.words, sharpness)
-    return vector if learned.whitening is None else learned.whitening(vector)
+    return NetworkVector(
+        name, backbone, head, parameters={"model": model, "levels": levels}, form=form, similarity="l1"
+    )

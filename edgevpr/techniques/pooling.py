@@ -1,7 +1,6 @@
 """Pooling of a feature map to one vector, for `network` and `regions`. A feature map is float32 (channels, rows,
 columns)."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,56 +21,28 @@ def unit(vectors: Array) -> Array:
     return unit_vectors
 
 
-def maximum(features: Singles) -> Singles:
-    """Compute MAC, the largest activation per channel (Tolias et al. 2016, equation 1): (C, H, W) to float32 (C,)."""
-    largest: Singles = features.max(axis=(1, 2))
-    return largest
+def pyramid(features: Singles, levels: int) -> Singles:
+    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C * sum of
+    n^2,), the largest activation of each channel in each cell of one grid of n x n after the other, n = 1 to `levels`.
 
-
-def gem(features: Singles, p: float) -> Singles:
-    """Compute the generalised mean of each channel (Radenović et al. 2018, equation 3): (C, H, W) to float32 (C,).
-
-    p = 1 gives the mean, and p towards infinity the maximum. Activations below 1e-6 count as 1e-6, so that any p is
-    defined. Each channel is divided by its maximum first, so that no power leaves the range of float32.
-    """
-    positive = np.maximum(features, 1e-6)
-    largest = positive.max(axis=(1, 2))
-    shares = positive / largest[:, None, None]
-    means: Singles = (largest * np.mean(shares**p, axis=(1, 2)) ** (1 / p)).astype(np.float32, copy=False)
-    return means
-
-
-def grid(features: Singles, rows: int, columns: int, how: str) -> Singles:
-    """Pool ("mean" or "max") each channel over each cell of a grid: (C, H, W) to float32 (rows * columns * C,).
-
-    The result is ordered by cell. Cell i of n covers floor(i H / n) to ceil((i + 1) H / n) (He et al. 2014, section
-    2.2), so that no activation is left out and no cell is empty. Raises ModelError for a feature map with fewer rows or
-    columns than the grid.
+    Cell i of n covers floor(i H / n) to ceil((i + 1) H / n), so that no activation is left out. The levels 1 to 4 (30
+    cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet (Chen et al. 2017),
+    which leaves out the row and column between two cells. Raises ModelError for a feature map smaller than a grid.
     """
     _, height, width = features.shape
-    if rows > height or columns > width:
+    if levels > min(height, width):
         raise ModelError(
-            f"A feature map of {height}x{width} is too small for a grid of {rows}x{columns}: use a coarser grid or a "
+            f"A feature map of {height}x{width} is too small for a grid of {levels}x{levels}: use fewer levels, or a "
             "network with a larger feature map."
         )
-    reduce = np.mean if how == "mean" else np.max
-    cells = [
-        reduce(features[:, top:bottom, left:right], axis=(1, 2))
-        for top, bottom in _cells(height, rows)
-        for left, right in _cells(width, columns)
-    ]
-    return np.concatenate(cells)
-
-
-def pyramid(features: Singles, levels: Iterable[int]) -> Singles:
-    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2), one grid of n x n cells after the other for
-    each n of `levels`: (C, H, W) to float32 (C * sum of n^2,).
-
-    The levels 1 to 4 (30 cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet
-    (Chen et al. 2017). That code leaves out the row and column between two cells; here nothing is left out. Raises
-    ModelError for a feature map smaller than the finest level.
-    """
-    return np.concatenate([grid(features, n, n, "max") for n in levels])
+    return np.concatenate(
+        [
+            features[:, top:bottom, left:right].max(axis=(1, 2))
+            for n in range(1, levels + 1)
+            for top, bottom in _cells(height, n)
+            for left, right in _cells(width, n)
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ A model file is not trusted: it is run once before it may fly, and every result 
 """
 
 import os
-import threading
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -23,7 +22,6 @@ _RANKS = {"descriptor": 2, "features": 4}
 _FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
 _SEED = 7
 MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
-_RUN_LIMIT_S = 30.0  # of one picture: half of what the watchdog of systemd allows a flight to be silent
 _MOST_THREADS = 256
 _LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
 _RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
@@ -158,27 +156,15 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
     """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs, ordered as `names`.
 
-    Raises ModelError for a run that fails or takes more than 30 s, and for numbers that are not finite or beyond 1e12.
+    Raises ModelError for a run that fails, and for numbers that are not finite or beyond 1e12.
     """
-    feed = {session.get_inputs()[0].name: pictures}
-    options = import_onnxruntime().RunOptions()
-    limit = threading.Timer(_RUN_LIMIT_S, _terminate, (options,))
-    limit.daemon = True
-    limit.start()
     try:
-        results: list[Array] = session.run(names, feed, options)
-    except Exception as error:
-        if options.terminate:
-            raise ModelError(
-                f"{card.file_path} had no result for a picture within {_RUN_LIMIT_S:g} s: it loops, or is too slow for "
-                "this board."
-            ) from error
+        results: list[Array] = session.run(names, {session.get_inputs()[0].name: pictures})
+    except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
             f"{card.file_path} cannot be run as its card says ({_in_one_line(error)}): correct `input` or `outputs` of "
             "the card, or export the network for it."
         ) from error
-    finally:
-        limit.cancel()
     for name, result in zip(names, results, strict=True):
         if result.dtype.kind != "f":
             raise ModelError(f"{card.file_path}: its output `{name}` is {result.dtype}: it must be float.")
@@ -189,10 +175,6 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
                 "weights or `input` of its card are wrong."
             )
     return results
-
-
-def _terminate(options: Any) -> None:
-    options.terminate = True  # onnxruntime looks at it before each operator, in loops too
 
 
 def _in_one_line(error: Exception) -> str:

@@ -7,6 +7,8 @@ does not help to tell them apart, and takes most of the range of a byte. It chan
 independent of the form, and one map serves all forms.
 """
 
+from typing import Any
+
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bytes, Doubles, Image, Ints, Mask, Singles
@@ -15,7 +17,6 @@ from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
 
-Parameters = dict[str, int | float | str]
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
 # other weights no match is accepted until the configuration sets a minimum margin.
 NEVER = 2.0
@@ -45,9 +46,9 @@ class VectorTechnique:
     def __init__(
         self,
         name: str,
-        parameters: Parameters,
         length: int,
         *,
+        parameters: dict[str, Any] | None = None,
         form: str,
         margins: tuple[float, ...],
         similarity: str = "cosine",
@@ -55,6 +56,7 @@ class VectorTechnique:
     ) -> None:
         if form not in FORMS:
             raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
+        parameters = parameters or {}
         is_measured = parameters.get("model", _SHIPPED) == _SHIPPED
         self.min_margin = margins[FORMS.index(form)] if is_measured else NEVER
         self._similarity, self._length = similarity, length
@@ -67,7 +69,6 @@ class VectorTechnique:
             name=name,
             parameters=parameters,
             coarse=PartSpec((length,), "<f2"),
-            fine=None,
             model_sha256=model_sha256,
             packed=packed[form],
             form=form,
@@ -186,7 +187,7 @@ class Hog(VectorTechnique):
         # Every wrong match on corridor and aerial_caliterra (the data sets used for tuning) had a margin below 0.022
         # (float), 0.024 (8bit), 0.017 (1bit).
         margins = (0.03, 0.03, 0.02)
-        super().__init__("hog", {"w1": w1, "cell": cell, "bins": bins}, length, form=form, margins=margins)
+        super().__init__("hog", length, parameters={"w1": w1, "cell": cell, "bins": bins}, form=form, margins=margins)
 
     def vector(self, image: Image, mask: Mask | None) -> Singles:
         """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are left out."""

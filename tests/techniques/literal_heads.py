@@ -5,16 +5,6 @@ import math
 import numpy as np
 
 
-def gem(features, p):
-    pooled = []
-    for plane in features:
-        total = 0.0
-        for value in plane.ravel():
-            total += max(float(value), 1e-6) ** p
-        pooled.append((total / plane.size) ** (1 / p))
-    return np.array(pooled)
-
-
 def pyramid(features, levels):
     """He et al. 2014: bin i of n covers floor(i a / n) to ceil((i + 1) a / n)."""
     channels, height, width = features.shape
@@ -28,21 +18,6 @@ def pyramid(features, levels):
                         for x in range(math.floor(column * width / n), math.ceil((column + 1) * width / n)):
                             largest = max(largest, float(features[channel, y, x]))
                     out.append(largest)
-    return np.array(out)
-
-
-def grid_means(features, rows, columns):
-    channels, height, width = features.shape
-    out = []
-    for row in range(rows):
-        for column in range(columns):
-            for channel in range(channels):
-                values = [
-                    float(features[channel, y, x])
-                    for y in range(math.floor(row * height / rows), math.ceil((row + 1) * height / rows))
-                    for x in range(math.floor(column * width / columns), math.ceil((column + 1) * width / columns))
-                ]
-                out.append(sum(values) / len(values))
     return np.array(out)
 
 

@@ -117,7 +117,7 @@ class FakeSession:
     def get_inputs(self):
         return [type("Input", (), {"name": "picture"})]
 
-    def run(self, names, feed, options):
+    def run(self, names, feed):
         assert feed["picture"].shape == (1, 1, HEIGHT, WIDTH)
         return [self._result]
 

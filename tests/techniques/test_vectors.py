@@ -15,7 +15,7 @@ class Given(VectorTechnique):
     """Encodes the vector that the test hands it as the image."""
 
     def __init__(self, form="float", similarity="cosine", length=LENGTH):
-        super().__init__("given", {}, length, form=form, margins=(0.1, 0.2, 0.3), similarity=similarity)
+        super().__init__("given", length, form=form, margins=(0.1, 0.2, 0.3), similarity=similarity)
 
     def vector(self, image, mask):
         return image

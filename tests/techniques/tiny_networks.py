@@ -24,7 +24,6 @@ CARD = {
         "mean": [0.5],
     },
     "outputs": {"descriptor": "descriptor", "features": "features"},
-    "head": None,
     "similarity": "cosine",
 }
 

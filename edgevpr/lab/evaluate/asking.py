@@ -4,9 +4,9 @@
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,11 +34,6 @@ Progress = Callable[[Iterable[T], int, str], Iterable[T]]  # yields the items, o
 _NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # e.g. of a discarded query
 
 
-def optional(low: float, high: float) -> Any:
-    """Make a dataclass field whose default is None. A value that a configuration gives must lie in low..high."""
-    return field(default=None, metadata=bounded(low, high).metadata)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchOptions:
     """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
@@ -46,8 +41,8 @@ class MatchOptions:
     are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
     """
 
-    candidates: int | None = optional(1, 1_000_000)
-    sequence: int | None = optional(1, 100)
+    candidates: int | None = bounded(1, 1_000_000, default=None)
+    sequence: int | None = bounded(1, 100, default=None)
     exact: bool = False
     follow: bool = False
 

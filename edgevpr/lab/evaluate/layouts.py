@@ -11,7 +11,7 @@
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,6 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import Footprint, footprint, shared
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
-from edgevpr.lab.evaluate.asking import optional
 from edgevpr.lab.evaluate.dataset import Dataset, Judged, ScoredQuery, load_dataset
 from edgevpr.lab.evaluate.numbered import Numbered, read_numbered
 from edgevpr.lab.evaluate.videos import side_of, without_position
@@ -39,10 +38,10 @@ class Nearness:
     share `overlap` (0..1) of the smaller one's ground in common. For `overlap`, `fov_deg` is the camera's field of view
     along the longest side, and each picture needs its height above the ground."""
 
-    within_m: float = field(default=25.0, metadata=bounded(0.01, 1_000_000).metadata)
-    within_deg: float | None = optional(0.1, 180)
-    overlap: float | None = optional(0.001, 1)
-    fov_deg: float | None = optional(5, 150)
+    within_m: float = bounded(0.01, 1_000_000, default=25.0)
+    within_deg: float | None = bounded(0.1, 180, default=None)
+    overlap: float | None = bounded(0.001, 1, default=None)
+    fov_deg: float | None = bounded(5, 150, default=None)
 
 
 def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path) -> Dataset:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr import techniques
-from edgevpr.core.config import FORMS, build
+from edgevpr.core.config import FORMS, bounded, build
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
-from edgevpr.lab.evaluate.asking import MatchOptions, Progress, optional
+from edgevpr.lab.evaluate.asking import MatchOptions, Progress
 from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
@@ -34,7 +34,7 @@ class SetPlan(Nearness):
     ref: str | None = None
     ground_truth: str | None = None
     camera: str | None = None
-    rate_hz: float | None = optional(0.001, 1000)
+    rate_hz: float | None = bounded(0.001, 1000, default=None)
 
     def open(self, cache: Cache, progress: Progress[Any]) -> Dataset:
         """Read the data set; pictures of a video are kept in `cache`. Raises UsageError and SourceError as

@@ -50,7 +50,7 @@ def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
         values["sha256"] = file_sha256(made)
         trial, text = made.with_suffix(".yaml"), card_text(values)
         trial.write_text(text, "utf-8")
-        after = verify(read_card(trial), threads, learned=False)
+        after = verify(read_card(trial), threads)
         target = own_models() / trial.name
         install(made, values["sha256"], target, made.name, text)
     return Quantised(str(target), len(chosen), before, after)

@@ -24,7 +24,7 @@ from edgevpr.power.machine import rss_mb
 from edgevpr.runtime.recognise.detector import Detector
 from edgevpr.runtime.recognise.memorability import CROPS, Memorability
 from edgevpr.techniques.card import Card, card_names, load_card, read_card
-from edgevpr.techniques.session import Backbone, backbone_of, file_sha256, import_onnxruntime
+from edgevpr.techniques.session import backbone_of, file_sha256, import_onnxruntime
 
 _ROUNDS = 10
 _FRAME = (480, 640)
@@ -45,7 +45,6 @@ class Listed:
     source: str | None = None
     file: str | None = None
     outputs: tuple[str, ...] = ()
-    head: str | None = None
     techniques: tuple[str, ...] = ()
 
 
@@ -72,13 +71,13 @@ def list_models() -> tuple[Listed, ...]:
     return tuple(_listed(name) for name in card_names())
 
 
-def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = _LIMIT_S) -> Verified:
+def verify(card: Card, threads: int = 1, limit_s: float = _LIMIT_S) -> Verified:
     """Run `verify_here` in a child process, for at most `limit_s` seconds.
 
     No other network has loaded anything there that would be missing from the figures. A network that is too large for
     the board, or never ends, ends the child process instead of this one. Raises ModelError if that happens.
     """
-    job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads, "learned": learned}
+    job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads}
     ended = ask_child("edgevpr.runtime.preflight.networks", job, limit_s)
     if ended.code is None:
         raise ModelError(
@@ -97,12 +96,13 @@ def verify(card: Card, threads: int = 1, learned: bool = True, limit_s: float = 
     return Verified(**answer | {"shapes": {output: tuple(shape) for output, shape in answer["shapes"].items()}})
 
 
-def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
+def verify_here(card: Card, threads: int = 1) -> Verified:
     """Load the network of a card, run it on ten random pictures, and return its figures.
 
-    Raises ModelError, one sentence, for anything that would prevent its use in flight. With `learned` False, the words
-    of a VLAD head may be missing, since they are learned with the network after it has been added.
+    Raises ModelError, one sentence, for anything that would prevent its use in flight.
     """
+    from edgevpr.techniques.network import of_card
+
     rng = np.random.default_rng(0)
     before_mb = rss_mb()
     import_onnxruntime()
@@ -115,8 +115,6 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
         runs["boxes"], shapes["boxes"] = Detector(card, threads).is_static, _FRAME
     if card.outputs.memorability:
         runs["memorability"], shapes["memorability"] = Memorability(card, threads).matrix, (CROPS, CROPS)
-    if card.head is not None:
-        runs.pop("descriptor", None)  # the head computes the descriptor from the feature map
     run = next(iter(runs.values()))
     times_s = []
     for _ in range(_ROUNDS):
@@ -130,7 +128,7 @@ def verify_here(card: Card, threads: int = 1, learned: bool = True) -> Verified:
         threads=threads,
         file_mb=card.file_path.stat().st_size / 1e6,
         shapes=shapes,
-        vector_length=_vector_length(card, backbones, learned),
+        vector_length=of_card(card).spec.coarse.shape[0] if card.is_technique else None,
         image_ms=1000 * min(times_s),
         runtime_mb=imported_mb - before_mb,
         network_mb=rss_mb() - imported_mb,
@@ -155,7 +153,7 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     target = own_models() / f"{card.name}.yaml"
     # Try the file where it is. The file name on the card is used only in the folder that both are copied to.
     tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
-    verified = verify(tried, threads, learned=False)
+    verified = verify(tried, threads)
     text = _text_of(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
     install(file, found, target, card.file, text)
     return verified, target
@@ -208,7 +206,6 @@ def _listed(name: str) -> Listed:
         source=card.source,
         file=str(card.file_path),
         outputs=outputs,
-        head=card.head["name"] if card.head else None,
         techniques=tuple(_users(card, outputs)),
     )
 
@@ -227,20 +224,10 @@ def _users(card: Card, outputs: tuple[str, ...]) -> Iterator[str]:
         yield "salience.network"
 
 
-def _vector_length(card: Card, backbones: dict[str, Backbone], learned: bool) -> int | None:
-    if not card.is_technique:
-        return None
-    if card.head and card.head["name"] == "vlad" and not learned:
-        return int(card.head["words"]) * backbones["features"].shape[0]
-    from edgevpr.techniques.network import of_card
-
-    return of_card(card).spec.coarse.shape[0]
-
-
 def _answer(job: dict[str, Any]) -> dict[str, Any]:
     card = build(Card, {**job["card"], "path": Path(job["card"]["path"])}, job["card"]["path"])
     try:
-        return asdict(verify_here(card, job["threads"], job["learned"]))
+        return asdict(verify_here(card, job["threads"]))
     except EdgevprError as error:
         return {"problem": str(error)}
 

@@ -26,10 +26,10 @@ def listed(name):
 
 
 def test_the_list_says_whose_weights_and_what_uses_them(models):
-    write_network(models, "mine", card={"head": {"name": "max"}})
+    write_network(models, "mine")
     mine = listed("mine")
     assert (mine.ok, mine.problem, mine.licence, mine.source) == (True, None, "MIT", "made by a test")
-    assert (mine.outputs, mine.head, mine.techniques) == (("descriptor", "features"), "max", ("mine",))
+    assert (mine.outputs, mine.techniques) == (("descriptor", "features"), ("mine",))
     write_network(models, "calc")
     assert {"calc", "alexnet", "netvlad", "rmac", "region_vlad", "cross_region_bow"} <= set(listed("calc").techniques)
     write_network(models, "calc", card={"outputs": {"descriptor": "descriptor"}})
@@ -125,9 +125,8 @@ def test_a_card_without_a_hash_gets_it(models, download, missing):
     ("card", "fault", "says"),
     [
         ({"sha256": "0" * 64}, None, "SHA-256"),
-        ({"head": {"name": "rmak"}}, None, "`rmak`"),
+        ({"similarity": "cosin"}, None, "`cosin`"),
         ({"outputs": {"features": "conv9"}}, None, "conv9"),
-        ({"head": {"name": "pyramid", "levels": [1, 11]}}, None, "11x11"),
         ({}, "no onnx", "ONNX"),
         ({}, "nan", "finite"),
         ({"input": {**CARD["input"], "width": 64}}, None, "card"),
@@ -161,14 +160,6 @@ def test_a_file_or_card_that_is_not_there_is_one_sentence(models, download, caps
         file, card = (str(download / word) for word in words)
         assert main(["models", "add", file, "--card", card]) == code
         assert "none." in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("tried_here")
-def test_a_network_is_added_before_its_words_are_learned(models, download):
-    write_network(download, "mine", card={"head": {"name": "vlad", "words": 5}})
-    assert add(download / "mine.onnx", download / "mine.yaml")[0].vector_length == 5 * 4
-    with pytest.raises(ModelError, match="words"):
-        verify_here(load_card("mine"))
 
 
 @pytest.mark.process
