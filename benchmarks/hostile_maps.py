@@ -217,7 +217,7 @@ def _tried(kind: str, path: Path, whole: Path) -> tuple[int, int, int]:
             tracebacks += 1
     path.write_bytes(damaged)
     readable = _rows_of(path, whole)
-    for words in (("info",), ("check",), ("check", "--json"), ("export", "--geojson", "-"), ("repair",)):
+    for words in (("info",), ("check",), ("check", "--json"), ("repair",)):
         try:
             main(["map", words[0], str(path), *words[1:]])
         except Exception:

@@ -1,7 +1,6 @@
-"""`edgevpr map`: look into, check, repair, merge, shrink and export place maps (`building` makes them); and `edgevpr
+"""`edgevpr map`: look into, check, repair, merge and shrink place maps (`building` makes them); and `edgevpr
 salience`: print how memorable, static and full of information a picture is."""
 
-import sys
 from argparse import ArgumentTypeError, Namespace
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = group(commands, "map", "build, look into, check, repair, merge and export place maps")
+    maps = group(commands, "map", "build, look into, check, repair, merge and shrink place maps")
     building.add(maps)
     info = command(maps, "info", map_info, "say what a map holds")
     info.add_argument("map", metavar="MAP")
@@ -37,9 +36,6 @@ def add(commands: Any) -> None:
     size = smaller.add_mutually_exclusive_group(required=True)
     size.add_argument("--places", type=_number_of_places, metavar="N", help="as many places")
     size.add_argument("--mb", type=positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
-    export = command(maps, "export", map_export, "write the places for a map viewer")
-    export.add_argument("map", metavar="MAP")
-    export.add_argument("--geojson", required=True, metavar="FILE", help="GeoJSON file to write, - for standard output")
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
     worth.add_argument("--out", metavar="PNG", help="draw the picture with its three maps")
@@ -176,33 +172,6 @@ def map_shrink(args: Namespace) -> int:
             raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
     kept, places = shrink(args.map, map_path(args.out), count)
     print(f"{args.out}: {kept} of {places} places")
-    return 0
-
-
-def map_export(args: Namespace) -> int:
-    """Run `map export`: write the places of a map as GeoJSON, to a file or to stdout."""
-    from edgevpr.core.files import require_folder, write_whole
-    from edgevpr.places.geojson import write_geojson
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.recognise.evidence import calibration_of
-
-    with PlaceMap.open(args.map) as place_map:
-        calibration = calibration_of(place_map)
-        recognisable = calibration.recognisable if calibration else {}
-        if args.geojson == "-":
-            write_geojson(place_map, sys.stdout, recognisable)
-            return 0
-        out_path = Path(args.geojson)
-        if out_path.exists() and out_path.samefile(args.map):
-            raise UsageError(f"--geojson {out_path} is the map itself: give another name.")
-        require_folder(out_path)
-
-        def write(unfinished: Path) -> int:
-            with open(unfinished, "w", encoding="utf-8") as out:
-                return write_geojson(place_map, out, recognisable)
-
-        count = write_whole(out_path, write)
-    print(f"{out_path}: {count} places")
     return 0
 
 

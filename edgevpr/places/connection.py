@@ -8,7 +8,7 @@ import os
 import sqlite3
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,8 +36,6 @@ class MapConnection:
         self.path, self.stored = path, read_stored(path, db)
         self.spec = spec_of(path, self.stored)
         self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
-        if lock is not None:
-            sqlite.start_log(db)
         self._wait_s = sqlite.WAIT_S
         self._take(db)
         self._state = self._state_now()
@@ -48,26 +46,24 @@ class MapConnection:
         has content already or cannot be written, and UsageError for a name that no file can have."""
         path = mapfiles.map_path(path)
         mapfiles.require_regular(path)
-        lock = mapfiles.lock(path, make=True)
-        try:
+        with ExitStack() as undo:
+            lock = mapfiles.lock(path, make=True)
+            undo.callback(os.close, lock)
             if os.fstat(lock).st_size:
                 raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
-            try:
-                with sentences(path):
-                    db = sqlite.connect(path, "rw")
-                    db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
-                    db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
-                    sqlite.start_log(db)
-                    db.executescript("BEGIN;" + geopackage.SCHEMA)
-                    write_spec(db, spec)
-                    db.execute("COMMIT")
-                    return cls(path, db, lock)
-            except BaseException:
-                mapfiles.remove(path)
-                raise
-        except BaseException:
-            os.close(lock)
-            raise
+            undo.callback(mapfiles.remove, path)
+            with sentences(path):
+                db = sqlite.connect(path, "rw")
+                undo.callback(db.close)
+                db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
+                db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
+                sqlite.start_log(db)
+                db.executescript("BEGIN;" + geopackage.SCHEMA)
+                write_spec(db, spec)
+                db.execute("COMMIT")
+                place_map = cls(path, db, lock)
+            undo.pop_all()
+        return place_map
 
     @classmethod
     def open(cls, path: str | Path) -> "Self":
@@ -75,13 +71,7 @@ class MapConnection:
         format version, and UsageError for a name that no file can have."""
         path = mapfiles.existing(path)
         sqlite.settle_left_log(path)
-        with sentences(path):
-            db = sqlite.connect_to_read(path)
-            try:
-                return cls(path, db)
-            except BaseException:
-                db.close()
-                raise
+        return cls._opened(path, None)
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "Self":
@@ -90,11 +80,20 @@ class MapConnection:
         path = mapfiles.existing(path)
         lock = mapfiles.lock(path)
         try:
-            with sentences(path):
-                return cls(path, sqlite.connect(path, "rw"), lock)
+            return cls._opened(path, lock)
         except BaseException:
             os.close(lock)
             raise
+
+    @classmethod
+    def _opened(cls, path: Path, lock: int | None) -> "Self":
+        with sentences(path):
+            db = sqlite.connect(path, "ro" if lock is None else "rw")
+            try:
+                return cls(path, db, lock)
+            except BaseException:
+                db.close()
+                raise
 
     def __enter__(self) -> "Self":
         return self
@@ -123,14 +122,10 @@ class MapConnection:
             if state == self._state:
                 return
             mapfiles.existing(self.path)
-            fresh = sqlite.connect_to_read(self.path, self._wait_s)
+            fresh = sqlite.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
             try:
                 if read_stored(self.path, fresh) != self.stored:
                     raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
-                if self._lock is not None:
-                    fresh.close()
-                    fresh = sqlite.connect(self.path, "rw", wait_s=self._wait_s)
-                    sqlite.start_log(fresh)
             except BaseException:
                 fresh.close()
                 raise
@@ -146,21 +141,22 @@ class MapConnection:
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Run the body of `with` as one transaction: commit all it writes, or nothing if it raises an exception. Raises
-        sqlite3.Error."""
-        self.db.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self.db.execute("COMMIT")
-        except BaseException:
-            if self.db.in_transaction:  # SQLite has already rolled back where the disk is full
-                self.db.execute("ROLLBACK")
-            raise
+        MapError for errors of SQLite."""
+        with sentences(self.path):
+            self.db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self.db.execute("COMMIT")
+            except BaseException:
+                if self.db.in_transaction:  # SQLite has already rolled back where the disk is full
+                    self.db.execute("ROLLBACK")
+                raise
 
     def scan(self, columns: str) -> Iterator[tuple[int, Values | None]]:
         """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan`). Raises
         MapError."""
         with sentences(self.path):
-            yield from rows.scan(self.db, columns, self._file_bytes())
+            yield from rows.scan(self.db, columns)
 
     def row(self, place_id: int, columns: str) -> Values | None:
         """Return the values of `columns` of one place; None if it does not exist. Raises PlaceError if SQLite cannot
@@ -177,23 +173,19 @@ class MapConnection:
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
         with sentences(self.path):
-            try:
-                # Counted row by row: SQLite's own count of a table that refers to itself need not end.
-                query = "SELECT count(*) FROM (SELECT 1 FROM places LIMIT ?)"
-                return int(self.db.execute(query, (rows.most_rows(self._file_bytes()),)).fetchone()[0])
+            try:  # total(1) and not count(*), which no progress handler ends in a table that refers to itself
+                return int(self.db.execute("SELECT total(1) FROM places").fetchone()[0])
             except sqlite3.Error as error:
                 if not is_of_one_row(error):
                     raise
         return sum(row is not None for _, row in self.scan("1"))
 
-    def _file_bytes(self) -> int:
-        (pages,), (page_bytes,) = (self.db.execute(f"PRAGMA page_{name}").fetchone() for name in ("count", "size"))
-        return int(pages * page_bytes)
-
     def _take(self, connection: sqlite3.Connection) -> None:
         """Make `connection` the current one. Let SQLite refuse to load any row that is larger than the rows of this map
         can be. Python 3.10 cannot set this limit."""
         self.db = connection
+        if self._lock is not None:
+            sqlite.start_log(connection)
         if sys.version_info >= (3, 11):
             fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
             most_bytes = self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES

@@ -3,28 +3,23 @@
 import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from edgevpr.core.arrays import Ints
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.types import Place
+from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable
-from edgevpr.places.sqlite import sentences
 from edgevpr.places.thin import best_places
 
 T = TypeVar("T")
 Watch = Callable[[Iterable[T], int], Iterable[T]]  # takes items and their number, yields the same items, shows progress
 
 _MOST_FAULTS = 20  # most faults of a file that SQLite lists
-_AT_ONCE = 100  # places copied in one transaction
 _EMPTY_BYTES = 45_056  # size of a map file without places
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
 
@@ -32,12 +27,18 @@ _LOW = 0.5  # factor on the value of a place that was added only because there w
 @dataclass(frozen=True, slots=True)
 class Examined:
     """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` is its
-    row by columns, empty if unreadable. `has_checksums` is True if no value of the row lacks its checksum."""
+    row by columns, empty if unreadable."""
 
     place_id: int
     problem: str | None
     content: Content
-    has_checksums: bool
+
+    @property
+    def has_checksums(self) -> bool:
+        """True if no value of the row lacks its checksum."""
+        content, values = self.content, {"pose": "up_deg"}
+        names = ("geom", "coarse", "fine", "landmarks", "pose")
+        return all(content[values.get(name, name)] is None or content[f"{name}_crc32"] is not None for name in names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,22 +62,18 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
     """Read and check all values of every place, and yield the results in the order the places were added."""
     spec = place_map.spec
     for place_id, row in place_map.scan(rows.ALL):
-        if row is None:
-            yield Examined(place_id, "SQLite cannot read its row", {}, False)
-            continue
-        content = rows.content_of(rows.ALL, row)
-        held = {name: content[name] for name in ("geom", "coarse", "fine", "landmarks")} | {"pose": content["up_deg"]}
-        has_checksums = all(part is None or content[f"{name}_crc32"] is not None for name, part in held.items())
-        problem = None
+        content: Content = {} if row is None else rows.content_of(rows.ALL, row)
+        problem = "SQLite cannot read its row" if row is None else None
         try:
-            rows.place_of(place_id, content)
-            rows.part_of(content["coarse"], spec.coarse, content["coarse_crc32"], "coarse part")
-            if spec.fine:
-                rows.part_of(content["fine"], spec.fine, content["fine_crc32"], "fine part")
-            rows.landmarks_of(content["landmarks"], content["landmarks_crc32"])
+            if content:
+                rows.place_of(place_id, content)
+                rows.part_of(content, "coarse", spec.coarse)
+                rows.landmarks_of(content)
+                if spec.fine:
+                    rows.part_of(content, "fine", spec.fine)
         except Unreadable as error:
             problem = str(error)
-        yield Examined(place_id, problem, content, has_checksums)
+        yield Examined(place_id, problem, content)
 
 
 def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
@@ -87,18 +84,18 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
     """
     place_map.require(other.spec)
     copied = already_here = 0
-    with sentences(place_map.path), place_map.transaction():
+    with place_map.transaction():
         here = place_map.ids_by("source_image, time")
         for each in examine(other):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
-            part = rows.part_of(each.content["coarse"], other.spec.coarse, None, "coarse part")
+            part = rows.part_of(each.content, "coarse", other.spec.coarse)
             alike = here.get((each.content["source_image"], each.content["time"]), ())
             if any(place_map.is_of(place_id, part) for place_id in alike):
                 already_here += 1
-                continue
-            place_map.insert(each.content)
-            copied += 1
+            else:
+                place_map.insert(each.content)
+                copied += 1
     return copied, already_here
 
 
@@ -114,10 +111,12 @@ def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
             else:
                 places += 1
                 without += not each.has_checksums
-        faults = _faults(place_map)
-    return MapCheck(
-        path=str(path), places=places, damaged=tuple(damaged), faults=tuple(faults), without_checksums=without
-    )
+        try:
+            found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            found = [str(error)]
+    faults = () if found == ["ok"] else tuple(found)
+    return MapCheck(path=str(path), places=places, damaged=tuple(damaged), faults=faults, without_checksums=without)
 
 
 def repair(path: str | Path, watch: Watch[Examined]) -> Path:
@@ -134,18 +133,18 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
     copy = path.with_name(f".{path.name}.{os.getpid()}")
     lock = mapfiles.lock(path)  # meanwhile no program can add places, which the copy would lack
     try:
-        with PlaceMap.open(path) as damaged, PlaceMap.create(copy, damaged.spec) as repaired:
-            whole = (each for each in watch(examine(damaged), len(damaged)) if not each.problem)
-            with sentences(copy):
-                while block := list(islice(whole, _AT_ONCE)):
-                    with repaired.transaction():
-                        for each in block:
-                            repaired.insert(each.content, each.place_id)
-            repaired.record_mask(damaged.mask_sha256)
-            repaired.record_calibration(damaged.calibration)
-            if not len(repaired):
+        with PlaceMap.open(path) as damaged:
+            if not _copy(damaged, copy, watch(examine(damaged), len(damaged))):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
-        _exchange(path, copy, original)
+        for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
+            if left.exists():  # else SQLite would apply the log of the damaged map to the copy
+                left.rename(kept)
+        try:
+            os.link(path, original)  # a link first, so that there is a map at `path` at every moment
+        except OSError:
+            path.rename(original)  # a FAT file system has no links
+        copy.replace(path)
+        os.sync()
     finally:
         mapfiles.remove(copy)
         os.close(lock)
@@ -159,18 +158,9 @@ def places_in(file_bytes: int, place_map: PlaceMap) -> int:
     return places if each <= 0 else min(places, max(0, int((file_bytes - _EMPTY_BYTES) / each)))
 
 
-def worth_of(place: Place) -> float:
-    """Return the value of keeping a place, 0..1: quality times memorability and staticity, if known; half of that for a
-    place that was added only because there would have been too wide a gap."""
-    salience = place.salience
-    if salience is None:
-        return place.quality
-    scores = [score for score in (salience.memorability, salience.staticity) if score is not None]
-    return place.quality * float(np.prod(scores)) * (_LOW if salience.is_low else 1.0)
-
-
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
-    """Copy the `count` best places of a map to the new file `out`; return (places copied, readable places of the map).
+    """Copy the `count` best places of a map to the new file `out`, by quality and small gaps; return (places copied,
+    readable places of the map).
 
     The places keep their ids. Mask hash and calibration are copied; the calibration refers to places by id. Places that
     cannot be read are not copied. Raises MapError if the map cannot be read, or if `out` exists or cannot be written;
@@ -179,48 +169,32 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
         whole = [each.place_id for each in examine(place_map) if not each.problem]
         places = list(place_map.places(whole))
-        kept = {whole[number] for number in chosen(places, count)}
-        with PlaceMap.create(unfinished, place_map.spec) as smaller:
-            smaller.record_mask(place_map.mask_sha256)
-            smaller.record_calibration(place_map.calibration)
-            with sentences(unfinished), smaller.transaction():
-                for each in examine(place_map):
-                    if each.place_id in kept:
-                        smaller.insert(each.content, each.place_id)
+        points = [place.position or Position(np.nan, np.nan) for place in places]
+        lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
+        best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
+        kept = {whole[number] for number in best.tolist()}
+        _copy(place_map, unfinished, (each for each in examine(place_map) if each.place_id in kept))
     return len(kept), len(whole)
 
 
-def chosen(places: list[Place], count: int) -> Ints:
-    """Choose `count` of the places for high `worth_of` and small gaps; return their indices in `places`, ascending."""
-    points = [
-        (place.position.lat_deg, place.position.lon_deg) if place.position else (np.nan, np.nan) for place in places
-    ]
-    lat_deg, lon_deg = np.array(points, float).reshape(-1, 2).T
-    return best_places(lat_deg, lon_deg, np.array([worth_of(place) for place in places]), count)
+def _worth_of(place: Place) -> float:
+    """Return the value of keeping a place, 0..1: quality, times memorability and staticity as far as known."""
+    salience = place.salience
+    if salience is None:
+        return place.quality
+    scores = [score for score in (salience.memorability, salience.staticity) if score is not None]
+    return place.quality * float(np.prod(scores)) * (_LOW if salience.is_low else 1.0)
 
 
-def _exchange(path: Path, copy: Path, original: Path) -> None:
-    """Rename the map, and the files that SQLite keeps beside it, to `original`; then rename the copy to `path`."""
-    for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
-        if left.exists():  # else SQLite would apply the log of the damaged map to the copy
-            left.rename(kept)
-    try:
-        os.link(path, original)  # a link first, so that there is a map at `path` at every moment
-    except OSError:
-        path.rename(original)  # a FAT file system has no links
-    copy.replace(path)
-    with suppress(OSError):
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-
-def _faults(place_map: PlaceMap) -> list[str]:
-    """Return SQLite's messages about faults of the file as a whole; empty if it finds none."""
-    try:
-        found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        found = [str(error)]
-    return [] if found == ["ok"] else found
+def _copy(place_map: PlaceMap, out: Path, places: Iterable[Examined]) -> int:
+    """Make the map `out` of the undamaged `places`, with ids, mask and calibration; return their number."""
+    copied = 0
+    with PlaceMap.create(out, place_map.spec) as copy:
+        copy.record_mask(place_map.mask_sha256)
+        copy.record_calibration(place_map.calibration)
+        with copy.transaction():
+            for each in places:
+                if not each.problem:
+                    copy.insert(each.content, each.place_id)
+                    copied += 1
+    return copied

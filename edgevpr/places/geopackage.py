@@ -67,65 +67,38 @@ WHERE table_name = 'places'
 
 # The spatial index of the standard (OGC 12-128r18, annex F.3): an R-tree, and triggers that follow every change of the
 # places. Other programs use it and keep it up to date as well.
-SPATIAL_INDEX = """
-CREATE TABLE IF NOT EXISTS gpkg_extensions (
+_NEW, _OLD = (f"({row}.geom NOTNULL AND NOT ST_IsEmpty({row}.geom))" for row in ("NEW", "OLD"))
+_SAME = "OLD.place_id = NEW.place_id"
+_BOX = "ST_MinX({0}geom), ST_MaxX({0}geom), ST_MinY({0}geom), ST_MaxY({0}geom)"
+_PUT = f"INSERT OR REPLACE INTO rtree_places_geom VALUES (NEW.place_id, {_BOX.format('NEW.')});"
+_DROP = "DELETE FROM rtree_places_geom WHERE id = OLD.place_id;"
+_TRIGGERS = (  # name, event, condition, and what is done to the tree
+    ("insert", "INSERT", _NEW, _PUT),
+    ("update6", "UPDATE OF geom", f"{_SAME} AND {_NEW} AND {_OLD}", _PUT),
+    ("update7", "UPDATE OF geom", f"{_SAME} AND {_NEW} AND NOT {_OLD}", _PUT),
+    ("update2", "UPDATE OF geom", f"{_SAME} AND NOT {_NEW}", _DROP),
+    ("update5", "UPDATE", f"NOT {_SAME} AND {_NEW}", _DROP + _PUT),
+    ("update4", "UPDATE", f"NOT {_SAME} AND NOT {_NEW}", _DROP),
+    ("delete", "DELETE", "OLD.geom NOTNULL", _DROP),
+)
+SPATIAL_INDEX = (
+    """CREATE TABLE IF NOT EXISTS gpkg_extensions (
     table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
-    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name));
-INSERT INTO gpkg_extensions VALUES
-    ('places', 'geom', 'gpkg_rtree_index', 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only');
-CREATE VIRTUAL TABLE rtree_places_geom USING rtree(id, minx, maxx, miny, maxy);
-INSERT INTO rtree_places_geom
-    SELECT place_id, ST_MinX(geom), ST_MaxX(geom), ST_MinY(geom), ST_MaxY(geom) FROM places
-    WHERE geom NOT NULL AND NOT ST_IsEmpty(geom);
-CREATE TRIGGER rtree_places_geom_insert AFTER INSERT ON places
-WHEN (new.geom NOT NULL AND NOT ST_IsEmpty(NEW.geom))
-BEGIN
-    INSERT OR REPLACE INTO rtree_places_geom VALUES
-        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
-END;
-CREATE TRIGGER rtree_places_geom_update6 AFTER UPDATE OF geom ON places
-WHEN OLD.place_id = NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
-    AND (OLD.geom NOTNULL AND NOT ST_IsEmpty(OLD.geom))
-BEGIN
-    UPDATE rtree_places_geom SET
-        minx = ST_MinX(NEW.geom), maxx = ST_MaxX(NEW.geom), miny = ST_MinY(NEW.geom), maxy = ST_MaxY(NEW.geom)
-        WHERE id = NEW.place_id;
-END;
-CREATE TRIGGER rtree_places_geom_update7 AFTER UPDATE OF geom ON places
-WHEN OLD.place_id = NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
-    AND (OLD.geom ISNULL OR ST_IsEmpty(OLD.geom))
-BEGIN
-    INSERT INTO rtree_places_geom VALUES
-        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
-END;
-CREATE TRIGGER rtree_places_geom_update2 AFTER UPDATE OF geom ON places
-WHEN OLD.place_id = NEW.place_id AND (NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))
-BEGIN
-    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
-END;
-CREATE TRIGGER rtree_places_geom_update5 AFTER UPDATE ON places
-WHEN OLD.place_id != NEW.place_id AND (NEW.geom NOTNULL AND NOT ST_IsEmpty(NEW.geom))
-BEGIN
-    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
-    INSERT OR REPLACE INTO rtree_places_geom VALUES
-        (NEW.place_id, ST_MinX(NEW.geom), ST_MaxX(NEW.geom), ST_MinY(NEW.geom), ST_MaxY(NEW.geom));
-END;
-CREATE TRIGGER rtree_places_geom_update4 AFTER UPDATE ON places
-WHEN OLD.place_id != NEW.place_id AND (NEW.geom ISNULL OR ST_IsEmpty(NEW.geom))
-BEGIN
-    DELETE FROM rtree_places_geom WHERE id IN (OLD.place_id, NEW.place_id);
-END;
-CREATE TRIGGER rtree_places_geom_delete AFTER DELETE ON places
-WHEN old.geom NOT NULL
-BEGIN
-    DELETE FROM rtree_places_geom WHERE id = OLD.place_id;
-END;
-"""
+    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name))""",
+    "INSERT INTO gpkg_extensions VALUES ('places', 'geom', 'gpkg_rtree_index', "
+    "'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
+    "CREATE VIRTUAL TABLE rtree_places_geom USING rtree(id, minx, maxx, miny, maxy)",
+    f"""INSERT INTO rtree_places_geom SELECT place_id, {_BOX.format("")} FROM places
+    WHERE geom NOT NULL AND NOT ST_IsEmpty(geom)""",
+    *(
+        f"CREATE TRIGGER rtree_places_geom_{name} AFTER {event} ON places WHEN {when} BEGIN {done} END"
+        for name, event, when, done in _TRIGGERS
+    ),
+)
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
-_MOST_POINT_BYTES = 8 + 64 + 1 + 4 + 4 * 8  # header, the largest envelope, and four coordinates
-_KINDS_OF_POINT = (1, 1001, 2001, 3001)  # xy, xyz, xym, xyzm; z and m are ignored
+_FORM = (b"GP", 0, 1, 1, 1)  # all of these but the reference system and the coordinates
 
 
 def point_blob(lat_deg: float, lon_deg: float) -> bytes:
@@ -134,21 +107,12 @@ def point_blob(lat_deg: float, lon_deg: float) -> bytes:
 
 
 def read_point(blob: object) -> tuple[float, float]:
-    """Decode a GeoPackage point, written by `point_blob` or another program, as (lat_deg, lon_deg).
-
-    Raises ValueError with a short message for anything that is not a WGS-84 point on the Earth.
-    """
-    try:
-        if not isinstance(blob, bytes) or blob[:2] != b"GP" or len(blob) > _MOST_POINT_BYTES:
-            raise ValueError("its geometry is no point")
-        order = "<" if blob[3] & 1 else ">"
-        (srs_id,) = struct.unpack_from(f"{order}i", blob, 4)
-        wkb = 8 + (0, 32, 48, 48, 64)[(blob[3] >> 1) & 7]  # bytes of header and envelope, whose kind is in the flags
-        order = {0: ">", 1: "<"}[blob[wkb]]
-        kind, lon_deg, lat_deg = struct.unpack_from(f"{order}Idd", blob, wkb + 1)
-    except (IndexError, KeyError, struct.error) as error:
-        raise ValueError("its geometry is no point") from error
-    if kind not in _KINDS_OF_POINT:
+    """Decode a GeoPackage point, as `point_blob`, QGIS and GDAL write it, as (lat_deg, lon_deg). Raises ValueError with
+    a short message for anything that is not a WGS-84 point on the Earth."""
+    if not isinstance(blob, bytes) or len(blob) != _POINT.size:
+        raise ValueError("its geometry is no point")
+    *start, srs_id, order, kind, lon_deg, lat_deg = _POINT.unpack(blob)
+    if (*start, order, kind) != _FORM:
         raise ValueError("its geometry is no point")
     if srs_id != WGS84:
         raise ValueError(f"its position is in the reference system {srs_id}, not in WGS 84")
@@ -166,8 +130,8 @@ def point_or_none(geom: object) -> tuple[float, float] | None:
 
 
 def utc_text(t_utc_s: float | None) -> str | None:
-    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds. Return None for None, and for a time
-    outside the years 1 to 9999."""
+    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None and for an impossible
+    time."""
     if t_utc_s is None:
         return None
     try:

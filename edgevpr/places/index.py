@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32  # places
 _MOVED_AT_ONCE = 256  # places
+_OUTLINE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
 
 CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.coarse_parts`
 
@@ -63,7 +64,11 @@ class PlaceIndex:
 
     def first(self, count: int) -> "PlaceIndex":
         """Return the index of the first `count` places, as views of these arrays."""
-        return replace(self, **{name: array[:count] for name, array in self.arrays.items()})
+        return self.only(slice(count))
+
+    def only(self, slots: slice | Array) -> "PlaceIndex":
+        """Return the index of some places: views for a slice, copies for slots or a mask, bool (N,)."""
+        return replace(self, **{name: array[slots] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
         """Return the median distance in metres between successive places; None if no two successive places have
@@ -73,11 +78,7 @@ class PlaceIndex:
         return float(np.median(known)) if len(known) else None
 
     def within(self, position: Position, radius_m: float) -> Bools:
-        """Return True for each place within `radius_m` metres of `position`, bool (N,); False without a position.
-
-        SQLite could search the map file by area too. But 10 000 distances from these arrays take less than half a
-        millisecond, of tens of milliseconds for a query. They need no file access, and are in the order of the slots.
-        """
+        """Return True for each place within `radius_m` metres of `position`, bool (N,); False without a position."""
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 
@@ -112,12 +113,10 @@ def load_index(
             f"{budget_bytes / 1e6:g} MB: the {capacity} best are used; raise --budget-mb to "
             f"{np.ceil(places * each / 1e5) / 10:g} for all."
         )
-        place_ids, lat_deg, lon_deg, quality = _outlines(place_map, places)
-        kept = place_ids[best_places(lat_deg, lon_deg, quality, capacity)]
-        parts = (part for part in parts if _holds(kept, part[0]))
-    loaded = 0
-    for written in fill(into, parts, technique):
-        loaded = written
+        seen = np.fromiter(islice(place_map.outlines(), places), _OUTLINE)
+        kept = seen["id"][best_places(seen["lat_deg"], seen["lon_deg"], seen["quality"], capacity)]
+        parts = (part for part in parts if _slot_of(kept, part[0]) is not None)
+    loaded = max(fill(into, parts, technique), default=0)
     if not loaded:
         raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
     if place_map.left_out:
@@ -171,18 +170,10 @@ def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: 
     return min(wanted, budget_bytes // place_bytes)
 
 
-def _outlines(place_map: PlaceMap, places: int) -> Doubles:
-    """Return float64 (4, N): id, lat_deg, lon_deg and quality of the first N places that can be read, N <= `places`."""
-    columns = np.empty((4, places))
-    count = 0
-    for count, outline in enumerate(islice(place_map.outlines(), places), start=1):
-        columns[:, count - 1] = outline
-    return columns[:, :count]
-
-
-def _holds(ascending: Array, number: int) -> bool:
-    at = int(np.searchsorted(ascending, number))
-    return at < len(ascending) and ascending[at] == number
+def _slot_of(ascending: Array, place_id: int) -> int | None:
+    """Return the index of a place in the `ascending` ids; None if it is not there."""
+    at = int(np.searchsorted(ascending, place_id))
+    return at if at < len(ascending) and ascending[at] == place_id else None
 
 
 class GrowingIndex:
@@ -204,8 +195,7 @@ class GrowingIndex:
         self._in_file = len(place_map)
         capacity = _capacity(place_map, each, budget_bytes, self._in_file + room)
         self._map, self._technique = place_map, technique
-        self._packs = technique.spec.packed is not None
-        self._mean = place_map.mean_coarse() if self._packs else None
+        self._mean = place_map.mean_coarse() if technique.spec.packed else None
         self._mean_of = self._in_file  # number of places that this mean was computed from
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
@@ -232,15 +222,12 @@ class GrowingIndex:
         """
         if self._taken == len(self._slots):
             self._thin()
-        at, slots = self._taken, self._slots
-        slots.place_ids[at] = place_id
-        slots.lat_deg[at], slots.lon_deg[at] = (position.lat_deg, position.lon_deg) if position else (np.nan, np.nan)
-        slots.heading_deg[at] = np.nan if heading_deg is None else heading_deg
-        slots.rows[at] = coarse if self._mean is None else self._technique.pack(coarse[None], self._mean)[0]
-        self._taken += 1
+        point = (position.lat_deg, position.lon_deg) if position else None
+        free = replace(self._slots.only(slice(self._taken, self._taken + 1)), mean=self._mean)
+        self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique))
         self._in_file += 1
         # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
-        if self._packs and self._in_file >= 2 * self._mean_of:
+        if self._mean is not None and self._in_file >= 2 * self._mean_of:
             self._repack()
 
     def _thin(self) -> None:
@@ -248,8 +235,7 @@ class GrowingIndex:
         # Quality is read from the file: places are dropped too rarely to justify four more bytes per place in RAM.
         quality = np.full(len(index), np.nan)
         for place_id, _, _, known in self._map.outlines():
-            at = int(np.searchsorted(index.place_ids, place_id))
-            if at < len(index) and index.place_ids[at] == place_id:
+            if (at := _slot_of(index.place_ids, place_id)) is not None:
                 quality[at] = known
         for place_id in index.place_ids[np.isnan(quality)].tolist():
             self._map.left_out.setdefault(place_id, "its row is gone")

@@ -23,6 +23,8 @@ from edgevpr.places.connection import MapConnection
 from edgevpr.places.rows import Content, Unreadable, Values
 from edgevpr.places.sqlite import is_of_one_row, sentences
 
+_OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
+_OF_FINE = "geom, geom_crc32, fine, fine_crc32"
 _OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
 _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
 
@@ -41,12 +43,12 @@ class PlaceMap(MapConnection):
     @property
     def map_id(self) -> str | None:
         """The random id that the map was given when it was created; None if the file has none."""
-        return self._stored_text("map_id")
+        return _text(self.stored.get("map_id"))
 
     @property
     def made_by(self) -> str | None:
         """Name and version of the program that created the map; None if the file has none."""
-        return self._stored_text("made_by")
+        return _text(self.stored.get("made_by"))
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
@@ -65,7 +67,7 @@ class PlaceMap(MapConnection):
         as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
         """
         content = rows.frame_content(frame, descriptor, self.spec, salience, landmarks)
-        with sentences(self.path), self.transaction():
+        with self.transaction():
             return self.insert(content)
 
     def insert(self, content: Content, place_id: int | None = None) -> int:
@@ -111,10 +113,8 @@ class PlaceMap(MapConnection):
 
         Raises PlaceError for a place that is missing or damaged.
         """
-        found: Iterable[tuple[int, Values | None]]
-        if place_ids is None:
-            found = self.scan(rows.OF_PLACE)
-        else:
+        found: Iterable[tuple[int, Values | None]] = self.scan(rows.OF_PLACE)
+        if place_ids is not None:
             found = ((int(place_id), self.row(int(place_id), rows.OF_PLACE)) for place_id in place_ids)
         for place_id, row in found:
             with self._named(place_id):
@@ -124,23 +124,19 @@ class PlaceMap(MapConnection):
     def coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
         """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
         every readable place, in the order they were added. Note the other places in `left_out`."""
-        for place_id, row in self.scan(f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"):
-            try:
-                *values, geom_checksum, coarse, checksum = rows.present(row)
-                point, heading_deg = rows.where_of(values, geom_checksum)
-                part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
-            except Unreadable as error:
-                self.left_out.setdefault(place_id, str(error))
-                continue
-            yield place_id, point, heading_deg, part
+        for place_id, row in self.scan(_OF_COARSE):
+            with self._noted(place_id):
+                content = rows.content_of(_OF_COARSE, row)
+                point, heading_deg = rows.where_of(content)
+                part = rows.part_of(content, "coarse", self.spec.coarse)
+                yield place_id, point, heading_deg, part
 
     def mean_coarse(self) -> Singles:
         """Return the mean of all coarse parts that can be read, float32, in the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan("coarse, coarse_crc32"):
             with suppress(Unreadable):
-                coarse, checksum = rows.present(row)
-                part = rows.part_of(coarse, self.spec.coarse, checksum, "coarse part")
+                part = rows.part_of(rows.content_of("coarse, coarse_crc32", row), "coarse", self.spec.coarse)
                 count += 1
                 mean += (part - mean) / count
         return mean.astype(np.float32)
@@ -151,13 +147,12 @@ class PlaceMap(MapConnection):
 
         Raises PlaceError for a place that is missing or damaged.
         """
-        place_id = int(place_id)
         with self._named(place_id):
             if self.spec.fine is None:
                 raise Unreadable("it has no fine part")
-            geom, geom_checksum, fine, checksum = rows.present(self.row(place_id, "geom, geom_crc32, fine, fine_crc32"))
-            point = rows.point_of(geom, geom_checksum)
-            return rows.part_of(fine, self.spec.fine, checksum, "fine part"), point
+            content = rows.content_of(_OF_FINE, self.row(int(place_id), _OF_FINE))
+            point = rows.point_of(content)
+            return rows.part_of(content, "fine", self.spec.fine), point
 
     def footprint_m(self) -> float | None:
         """Return the median footprint in metres of the places with a known pose; None if there are none."""
@@ -169,7 +164,8 @@ class PlaceMap(MapConnection):
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""
         with self._named(place_id):
-            return rows.landmarks_of(*rows.present(self.row(int(place_id), "landmarks, landmarks_crc32")))
+            columns = "landmarks, landmarks_crc32"
+            return rows.landmarks_of(rows.content_of(columns, self.row(int(place_id), columns)))
 
     def ids_by(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
@@ -187,8 +183,8 @@ class PlaceMap(MapConnection):
         array lies in memory. If the numbers are codes, a few of them may then be quite different.
         """
         try:
-            (blob,) = rows.present(self.row(place_id, "coarse"))
-            there = rows.part_of(blob, self.spec.coarse, None, "coarse part").astype(np.float32)
+            content = rows.content_of("coarse", self.row(place_id, "coarse"))
+            there = rows.part_of(content, "coarse", self.spec.coarse).astype(np.float32)
         except (Unreadable, PlaceError):
             return False
         here = np.asarray(coarse, np.float32).reshape(there.shape)
@@ -198,38 +194,31 @@ class PlaceMap(MapConnection):
     def outlines(self) -> Iterator[tuple[int, float, float, float]]:
         """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Note
         the other places in `left_out`."""
-        for place_id, row in self.scan("geom, quality, geom_crc32"):
-            try:
-                geom, quality, checksum = rows.present(row)
-                lat_deg, lon_deg = rows.point_of(geom, checksum) or (math.nan, math.nan)
-                yield place_id, lat_deg, lon_deg, rows.quality_of(quality)
-            except Unreadable as error:
-                self.left_out.setdefault(place_id, str(error))
+        columns = "geom, quality, geom_crc32"
+        for place_id, row in self.scan(columns):
+            with self._noted(place_id):
+                content = rows.content_of(columns, row)
+                lat_deg, lon_deg = rows.point_of(content) or (math.nan, math.nan)
+                yield place_id, lat_deg, lon_deg, rows.quality_of(content)
 
     def _grow_extent(self, lat_deg: float, lon_deg: float) -> None:
         self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
 
-    def _stored_text(self, key: str) -> str | None:
-        text = self.stored.get(key)
-        return text if isinstance(text, str) else None
-
     def _text_beside(self, key: str) -> str | None:
-        """Return the text stored under `key` in edgevpr_map; None if there is none or it cannot be read. Raises
-        MapError."""
+        """Return the text stored under `key` in edgevpr_map; None if there is none or it cannot be read."""
         with sentences(self.path):
             try:
                 row = self.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
-                text = json.loads(row[0]) if row else None
+                return _text(json.loads(row[0])) if row else None
             except (ValueError, TypeError, RecursionError):
                 return None
             except sqlite3.Error as error:
                 if is_of_one_row(error):
                     return None
                 raise
-        return text if isinstance(text, str) else None
 
     def _record_beside(self, key: str, text: str | None) -> None:
-        with sentences(self.path), self.transaction():
+        with self.transaction():
             self.db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES (?, ?)", (key, json.dumps(text)))
 
     @contextmanager
@@ -239,3 +228,15 @@ class PlaceMap(MapConnection):
             yield
         except Unreadable as error:
             raise PlaceError(self.path, place_id, str(error)) from error
+
+    @contextmanager
+    def _noted(self, place_id: int) -> Iterator[None]:
+        """Note a place for which the body of `with` raises Unreadable in `left_out`."""
+        try:
+            yield
+        except Unreadable as error:
+            self.left_out.setdefault(place_id, str(error))
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None

@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,12 +19,10 @@ def beside(path: Path) -> list[Path]:
 def map_path(name: str | Path) -> Path:
     """Return `name` as a path. Raises UsageError for a name that no file can have."""
     text = str(name)
-    possible = False
     with suppress(UnicodeEncodeError):
-        possible = bool(Path(text).name) and b"\0" not in os.fsencode(text)
-    if not possible:
-        raise UsageError(f"{text!r} cannot be the name of a map: give the path of a file, e.g. valley.gpkg.")
-    return Path(text)
+        if Path(text).name and b"\0" not in os.fsencode(text):
+            return Path(text)
+    raise UsageError(f"{text!r} cannot be the name of a map: give the path of a file, e.g. valley.gpkg.")
 
 
 def existing(name: str | Path) -> Path:
@@ -37,10 +34,7 @@ def existing(name: str | Path) -> Path:
             raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
         require_regular(path)
     except OSError as error:
-        raise MapError(
-            f"{path}: it cannot be opened ({error.strerror}): check the path, and the permissions of the file and its "
-            "folder."
-        ) from error
+        raise _closed(path, error) from error
     return path
 
 
@@ -48,7 +42,7 @@ def require_regular(path: Path) -> None:
     """Raise MapError if the map, or a file of SQLite beside it, exists but is not a regular file: a folder, or a pipe,
     from which a program would read for ever."""
     for each in (path, *beside(path)):
-        if each.exists() and not stat.S_ISREG(each.stat().st_mode):
+        if each.exists() and not each.is_file():
             raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")
 
 
@@ -62,10 +56,7 @@ def lock(path: Path, make: bool = False) -> int:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
     except OSError as error:
-        raise MapError(
-            f"{path}: it may not be written ({error.strerror}): check the path, and the permissions of the file and "
-            "its folder."
-        ) from error
+        raise _closed(path, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -97,3 +88,10 @@ def remove(path: Path) -> None:
     """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
     for each in (path, *beside(path)):
         each.unlink(missing_ok=True)
+
+
+def _closed(path: Path, error: OSError) -> MapError:
+    return MapError(
+        f"{path}: it cannot be opened ({error.strerror}): check the path, and the permissions of the file and its "
+        "folder."
+    )

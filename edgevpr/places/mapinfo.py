@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import sqlite3
 from dataclasses import dataclass
 
 from edgevpr.core.contract import TechniqueSpec
@@ -16,9 +15,11 @@ Extent = tuple[float, float, float, float]
 
 _SUMMARY = """
 SELECT count(*), count(geom), avg(quality), total(is_low_quality = 1), count(up_deg), avg(footprint_m),
-    avg(var_east_m2 + var_north_m2), min(time), max(time)
+    avg(var_east_m2 + var_north_m2), min(CASE typeof(time) WHEN 'text' THEN time END),
+    max(CASE typeof(time) WHEN 'text' THEN time END)
 FROM places
 """
+_EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
 _IN_BOX = """
 SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id
 WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
@@ -63,10 +64,7 @@ class MapIdentity:
 def info_of(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
-        summary = place_map.db.execute(_SUMMARY).fetchone()
-        extent = place_map.db.execute(
-            "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
-        ).fetchone()
+        summary, extent = (place_map.db.execute(query).fetchone() for query in (_SUMMARY, _EXTENT))
     places, with_position, quality, of_low_quality, with_pose, footprint_m, var_m2, first, last = summary
     is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
@@ -75,13 +73,13 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         places=places,
         with_position=with_position,
         extent=extent if with_position and is_extent else None,
-        first_time=first if isinstance(first, str) else None,
-        last_time=last if isinstance(last, str) else None,
+        first_time=first,
+        last_time=last,
         mean_quality=quality,
         of_low_quality=int(of_low_quality),
         with_pose=with_pose,
         footprint_m=footprint_m,
-        position_sd_m=math.sqrt(max(0.0, var_m2) / 2) if var_m2 is not None else None,
+        position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
         file_bytes=place_map.path.stat().st_size,
         made_by=place_map.made_by,
     )
@@ -106,31 +104,23 @@ def identity_of(place_map: PlaceMap) -> MapIdentity:
 def index_positions(place_map: PlaceMap) -> None:
     """Add an R-tree of the positions to the map file, unless it has one. Damaged positions are left out. Raises
     MapError."""
-    db = place_map.db
-    with sentences(place_map.path):
-        if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
-            try:
-                db.executescript("BEGIN IMMEDIATE;" + geopackage.SPATIAL_INDEX + "COMMIT;")
-            except sqlite3.Error:
-                if db.in_transaction:
-                    db.execute("ROLLBACK")
-                raise
+    with place_map.transaction():
+        if not place_map.db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
+            for statement in geopackage.SPATIAL_INDEX:
+                place_map.db.execute(statement)
 
 
 def nearest_m(place_map: PlaceMap, position: Position, within_m: float) -> float | None:
     """Return the distance in metres from `position` to the nearest readable place of the file; None if it is greater
-    than `within_m`.
-
-    Call `index_positions` before. Raises MapError if the file cannot be read.
-    """
+    than `within_m`. Call `index_positions` before. Raises MapError if the file cannot be read."""
     lat_deg, lon_deg = position.lat_deg, position.lon_deg
     north_deg = math.degrees(within_m / EARTH_RADIUS_M)
     east_deg = min(180.0, north_deg / max(math.cos(math.radians(min(abs(lat_deg) + north_deg, 90.0))), 1e-9))
     nearest = math.inf
     with sentences(place_map.path):
-        for turn_deg in (-360.0, 0.0, 360.0):  # places on the other side of the date line
-            box = (lat_deg - north_deg, lat_deg + north_deg, lon_deg + turn_deg - east_deg)
-            for place_id, geom in place_map.db.execute(_IN_BOX, (*box, lon_deg + turn_deg + east_deg)):
+        for turned_deg in (lon_deg - 360, lon_deg, lon_deg + 360):  # places on the other side of the date line
+            box = (lat_deg - north_deg, lat_deg + north_deg, turned_deg - east_deg, turned_deg + east_deg)
+            for place_id, geom in place_map.db.execute(_IN_BOX, box):
                 if place_id not in place_map.left_out and (point := geopackage.point_or_none(geom)):
                     nearest = min(nearest, float(distance_m(lat_deg, lon_deg, *point)))
     return nearest if nearest <= within_m else None

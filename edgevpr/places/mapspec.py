@@ -4,7 +4,6 @@ import json
 import math
 import sqlite3
 import uuid
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ FORMAT_VERSION = 1
 _BEFORE_RELEASE = 4  # format version in maps made before the first release; their format is the same
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
+_PARTS = ("coarse", "fine", "packed")
 BESIDE = MASK, CALIBRATION = ("mask_sha256", "calibration")  # keys of texts that a map may lack
 _MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
@@ -35,14 +35,10 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
         "technique": spec.name,
         "parameters": spec.parameters,
         "model_sha256": spec.model_sha256,
-        "coarse": asdict(spec.coarse),
-        "fine": asdict(spec.fine) if spec.fine else None,
-        "packed": asdict(spec.packed) if spec.packed else None,
+        **{part: getattr(spec, part) and asdict(getattr(spec, part)) for part in _PARTS},
     }
-    db.executemany(
-        "INSERT INTO edgevpr_map (key, value) VALUES (?, ?)",
-        [(key, json.dumps(value)) for key, value in described.items()],
-    )
+    rows = [(key, json.dumps(value)) for key, value in described.items()]
+    db.executemany("INSERT INTO edgevpr_map (key, value) VALUES (?, ?)", rows)
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
@@ -77,27 +73,27 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
 def spec_of(path: Path, stored: Stored) -> TechniqueSpec:
     """Return the specification of the technique that made the map, from `stored`. Raises MapError if it is invalid."""
     try:
-        coarse, model = _part_spec(stored["coarse"]), stored["model_sha256"]
-        parameters = dict(stored["parameters"])
-        if coarse is None or not isinstance(stored["technique"], str) or not isinstance(model, str | None):
+        name, parameters, model = stored["technique"], dict(stored["parameters"]), stored["model_sha256"]
+        coarse, fine, packed = (_part_spec(stored[part]) for part in _PARTS)
+        if coarse is None or not isinstance(name, str) or not isinstance(model, str | None):
             raise ValueError("no coarse part, or names that are no text")
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
             raise ValueError(f"the parameters {parameters!r}")
-        return TechniqueSpec(
-            name=stored["technique"],
-            parameters=parameters,
-            coarse=coarse,
-            fine=_part_spec(stored["fine"]),
-            model_sha256=model,
-            packed=_part_spec(stored["packed"]),
-        )
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise _damaged(path, error) from error
+    return TechniqueSpec(name=name, parameters=parameters, coarse=coarse, fine=fine, model_sha256=model, packed=packed)
 
 
 def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
     """Return one phrase for each difference between the technique of a map and ours; empty if they are equal."""
-    return [f"{what} is {there}, not {here}" for what, there, here in _compared(theirs, ours) if there != here]
+    if theirs.name != ours.name:
+        return [f"technique is {theirs.name}, not {ours.name}"]
+    there, here = (
+        {**spec.parameters, "model sha256": spec.model_sha256, "coarse part": spec.coarse, "fine part": spec.fine}
+        for spec in (theirs, ours)
+    )
+    different = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+    return [f"{name} is {there.get(name)}, not {here.get(name)}" for name in different]
 
 
 def _require_layer(path: Path, db: sqlite3.Connection) -> None:
@@ -120,16 +116,6 @@ def _require_layer(path: Path, db: sqlite3.Connection) -> None:
         )
 
 
-def _compared(theirs: TechniqueSpec, ours: TechniqueSpec) -> Iterator[tuple[str, object, object]]:
-    yield "technique", theirs.name, ours.name
-    if theirs.name == ours.name:
-        for key in sorted(theirs.parameters.keys() | ours.parameters.keys()):
-            yield key, theirs.parameters.get(key), ours.parameters.get(key)
-        yield "model sha256", theirs.model_sha256, ours.model_sha256
-        yield "form of the coarse part", theirs.coarse, ours.coarse
-        yield "form of the fine part", theirs.fine, ours.fine
-
-
 def _damaged(path: Path, error: Exception) -> MapError:
     shown = repr(error)[:_MOST_STORED]
     return MapError(f"{path}: its table edgevpr_map is damaged ({shown}): restore a copy or build the map again.")
@@ -141,8 +127,6 @@ def _part_spec(value: Any) -> PartSpec | None:
     shape, dtype = value["shape"], value["dtype"]
     if not isinstance(shape, list) or not all(isinstance(side, int) and side > 0 for side in shape):
         raise ValueError(f"the shape {shape!r}")
-    if dtype not in _DTYPES:
-        raise ValueError(f"the dtype {dtype!r}")
-    if math.prod(shape) * np.dtype(dtype).itemsize > _MOST_PART_BYTES:
-        raise ValueError(f"a part of {shape} {dtype}")
+    if dtype not in _DTYPES or math.prod(shape) * np.dtype(dtype).itemsize > _MOST_PART_BYTES:
+        raise ValueError(f"a part of {shape} {dtype!r}")
     return PartSpec(tuple(shape), dtype)

@@ -8,8 +8,10 @@ other programs write in many forms: a value that is not a time counts as unknown
 import math
 import sqlite3
 import struct
+import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,10 +35,19 @@ ALL = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
 MOST_LANDMARK_BYTES = 10_000  # per place
 
 _POSE = tuple(POSE.split(", "))
-_LEAST_ROW_BYTES = 16  # no row of a map is smaller, so a file has no more rows than its size allows
-_LOWEST_M, _HIGHEST_M = -1000, 100_000  # allowed altitudes above sea level, as in positions.csv
-_MOST_METRES = 1e5  # largest footprint, and largest standard deviation of a position
-_MOST_MISSING = 100_000  # successive ids without a place, after which a scan by ids ends
+_ALTITUDES_M = (-1000, 100_000)  # above sea level, as in positions.csv
+_VARIANCES_M2 = (1e-12, 1e10)
+_RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a column
+    "alt_m": _ALTITUDES_M,
+    "quality": (0, 1),
+    "footprint_m": (1e-6, 1e5),
+    "var_east_m2": _VARIANCES_M2,
+    "var_north_m2": _VARIANCES_M2,
+    "recorded_lat_deg": (-90, 90),
+    "recorded_lon_deg": (-180, 180),
+}
+_AFTER = "SELECT place_id, {} FROM places WHERE place_id > ? ORDER BY place_id"
+_MOST_UNREADABLE = 100_000  # successive ids without a readable place, after which a scan ends
 
 # Values of some columns of a row as SQLite returns them; their types are not checked yet.
 Values = tuple[Any, ...]
@@ -47,78 +58,72 @@ class Unreadable(ValueError):
     """A value of a row is missing or invalid; the message says which, in a few words."""
 
 
-def present(row: Values | None) -> Values:
-    """Return `row` itself. Raises Unreadable if it is None, that is missing or unreadable."""
-    if row is None:
-        raise Unreadable("its row is gone")
-    return row
-
-
 def content_of(columns: str, row: Values | None) -> Content:
     """Return the values of a row by the names in `columns`. Raises Unreadable if `row` is None."""
-    return dict(zip(columns.split(", "), present(row), strict=True))
+    if row is None:
+        raise Unreadable("its row is gone")
+    return dict(zip(columns.split(", "), row, strict=True))
 
 
-def point_of(geom: object, checksum: object) -> LatLon | None:
+def point_of(content: Content) -> LatLon | None:
     """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises Unreadable."""
-    if geom is None:
-        if checksum is not None:
+    if content["geom"] is None:
+        if content["geom_crc32"] is not None:
             raise Unreadable("its position is gone")
         return None
     try:
-        point = geopackage.read_point(geom)
+        point = geopackage.read_point(content["geom"])
     except ValueError as error:
         raise Unreadable(str(error)) from error
-    _hold(geom, checksum, "position")
+    _hold(content, "geom", "position")
     return point
 
 
-def part_of(blob: object, spec: PartSpec, checksum: object, name: str) -> Array:
-    """Decode a part of a descriptor as a read-only array of `spec`. Raises Unreadable; its message has `name`."""
+def part_of(content: Content, name: str, spec: PartSpec) -> Array:
+    """Decode the part `name` ("coarse", "fine") of a descriptor as a read-only array of `spec`; its checksum counts if
+    it is in `content`. Raises Unreadable."""
+    blob = content[name]
     if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
-        raise Unreadable(f"its {name} has a wrong size")
-    _hold(blob, checksum, name)
+        raise Unreadable(f"its {name} part has a wrong size")
+    _hold(content, name, f"{name} part")
     part: Array = np.frombuffer(blob, spec.dtype).reshape(spec.shape)
     if part.dtype.kind == "f" and not np.isfinite(part).all():
-        raise Unreadable(f"its {name} is not finite")
+        raise Unreadable(f"its {name} part is not finite")
     return part
 
 
-def landmarks_of(blob: object, checksum: object) -> bytes | None:
-    """Check the encoded landmarks of a place and return them; None if there are none. Raises Unreadable."""
+def landmarks_of(content: Content) -> bytes | None:
+    """Return the encoded landmarks of a place; None if there are none. Raises Unreadable."""
+    blob = content["landmarks"]
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) > MOST_LANDMARK_BYTES:
         raise Unreadable("its landmarks have a wrong size")
-    _hold(blob, checksum, "set of landmarks")
+    _hold(content, "landmarks", "set of landmarks")
     return blob
 
 
-def quality_of(value: object) -> float:
-    """Check a quality and return it, 0 to 1. Raises Unreadable."""
-    quality = _number(value, "quality")
-    if quality is None or not 0 <= quality <= 1:
-        raise Unreadable("its quality is not from 0 to 1")
+def quality_of(content: Content) -> float:
+    """Return the quality of a place, 0 to 1. Raises Unreadable."""
+    quality = _number(content, "quality")
+    if quality is None:
+        raise Unreadable("its quality is gone")
     return quality
 
 
-def where_of(values: Sequence[Any], geom_checksum: object) -> tuple[LatLon | None, float | None]:
+def where_of(content: Content) -> tuple[LatLon | None, float | None]:
     """Check the `VALUES` of a row; return its (lat_deg, lon_deg), and its heading in degrees, 0 up to 360. Each is
     None if unknown. Raises Unreadable."""
-    geom, _, alt_m, heading_deg, source_image, quality = values
-    point = point_of(geom, geom_checksum)
-    if _number(alt_m, "alt_m") != _altitude(alt_m):
-        raise Unreadable(f"its alt_m is {alt_m:g}")
-    heading_deg = _number(heading_deg, "heading_deg")
-    if not isinstance(source_image, str):
+    point, heading_deg, _ = point_of(content), _number(content, "heading_deg"), _number(content, "alt_m")
+    if not isinstance(content["source_image"], str):
         raise Unreadable("its source_image is no text")
-    quality_of(quality)
+    quality_of(content)
     return point, None if heading_deg is None else heading_deg % 360
 
 
 def place_of(place_id: int, content: Content) -> Place:
     """Make a Place from the columns `OF_PLACE` of its row. Raises Unreadable."""
-    point, _ = where_of([content[name] for name in VALUES.split(", ")], content["geom_crc32"])
+    point, _ = where_of(content)
     return Place(
         place_id=place_id,
         source_image=content["source_image"],
@@ -127,7 +132,7 @@ def place_of(place_id: int, content: Content) -> Place:
         heading_deg=content["heading_deg"],
         quality=content["quality"],
         salience=_salience_of([content[name] for name in SALIENCE.split(", ")]),
-        pose=_pose_of([content[name] for name in _POSE], content["pose_crc32"]),
+        pose=_pose_of(content),
     )
 
 
@@ -139,10 +144,11 @@ def frame_content(
     A time that is not a date and an altitude outside the allowed range are stored as unknown (NULL).
     """
     position, scores = frame.position, salience.scores if salience else {}
+    altitude = position.alt_m if position else None
     return {
         "geom": geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None,
         "time": geopackage.utc_text(frame.t_utc_s),
-        "alt_m": _altitude(position.alt_m) if position else None,
+        "alt_m": altitude if altitude is not None and _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None,
         "heading_deg": frame.heading_deg,
         "source_image": readable(frame.name),
         "quality": descriptor.quality,
@@ -182,64 +188,51 @@ def readable(name: str) -> str:
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-def most_rows(file_bytes: int) -> int:
-    """Return the largest number of rows that a file of this size can hold."""
-    return file_bytes // _LEAST_ROW_BYTES
-
-
-def scan(db: sqlite3.Connection, columns: str, file_bytes: int) -> Iterator[tuple[int, Values | None]]:
+def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
     """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
 
-    A query of the whole table ends at the first damaged page. The rows after it are then read one by one, by id. Raises
-    sqlite3.Error if the file cannot be read at all, or yields more rows than fit into `file_bytes`.
+    Where reading fails, at a damaged page, the next place is read by its id, and so on. Raises sqlite3.Error if the
+    file cannot be read at all.
     """
-    left, last = most_rows(file_bytes), -(2**63)
-    try:
-        for place_id, *row in db.execute(f"SELECT place_id, {columns} FROM places ORDER BY place_id"):
-            left -= 1
-            if not isinstance(place_id, int) or place_id <= last or left < 0:
-                raise sqlite3.DatabaseError("malformed: the table of places does not end")
-            last = place_id
-            yield place_id, tuple(row)
-        return
-    except sqlite3.Error as error:
-        if left < 0 or not is_of_one_row(error):
-            raise
-        highest = _highest_id(db, error)
-    missing = 0
-    for place_id in range(max(last, 0) + 1, highest + 1):
-        if missing >= _MOST_MISSING or left <= 0:
-            return
-        found: Values | None = None
+    last, highest, unreadable = -(2**63), -1, 0
+    while unreadable < _MOST_UNREADABLE:
         try:
-            found = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
-            missing += 1
+            for place_id, *row in db.execute(_AFTER.format(columns), (last,)):
+                if place_id <= last:
+                    raise sqlite3.DatabaseError("malformed: the table of places does not end")
+                last, unreadable = place_id, 0
+                yield place_id, tuple(row)
+            return
         except sqlite3.Error as error:
-            if not is_of_one_row(error):
-                raise
-            missing, left = 0, left - 1
-            yield place_id, None
-        if found is not None:
-            missing, left = 0, left - 1
-            yield place_id, found
+            highest = _highest_id(db, error) if highest < 0 else highest
+        before = max(last, 0)
+        # Python has stepped to the damaged row before it gives out the row before that: this one may be readable.
+        last, *found = _one_after(db, columns, max(before, _one_after(db, "place_id", before)[0] - 1))
+        if last > highest:
+            return
+        unreadable += not found
+        yield last, tuple(found) or None
+
+
+def _one_after(db: sqlite3.Connection, columns: str, last: int) -> Values:
+    """Return id and values of `columns` of the first place after the id `last`; if SQLite cannot read it, the next
+    number alone."""
+    try:
+        return db.execute(f"{_AFTER.format(columns)} LIMIT 1", (last,)).fetchone() or (sys.maxsize,)
+    except sqlite3.Error as error:
+        if not is_of_one_row(error):
+            raise
+        return (last + 1,)
 
 
 def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
-    """Return the highest id that a place of a damaged file may have. Raises `error`, the one that showed the damage, if
-    that cannot be read."""
+    """Return the highest id of a damaged file. Raises `error`, which showed the damage, if that cannot be read."""
     for query in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
-        try:
+        with suppress(sqlite3.Error):
             (highest,) = db.execute(query).fetchone() or (None,)
-        except sqlite3.Error:
-            continue
-        if isinstance(highest, int):
-            return highest
+            if is_of_one_row(error) and isinstance(highest, int):
+                return highest
     raise error
-
-
-def _altitude(alt_m: float | None) -> float | None:
-    """Return an altitude above sea level, or None if it is outside the allowed range."""
-    return alt_m if alt_m is not None and _LOWEST_M <= alt_m <= _HIGHEST_M else None
 
 
 def _salience_of(values: Sequence[Any]) -> Salience | None:
@@ -253,33 +246,25 @@ def _salience_of(values: Sequence[Any]) -> Salience | None:
     return Salience(memorability, staticity, entropy, is_low=is_low == 1)
 
 
-def _pose_of(values: Sequence[Any], checksum: object) -> Pose | None:
-    """Make a Pose from the values of `POSE`; None if they are unknown. Raises Unreadable for invalid values: a wrong
+def _pose_of(content: Content) -> Pose | None:
+    """Make a Pose from the columns `POSE`; None if they are unknown. Raises Unreadable for invalid values: a wrong
     pose would give wrong positions in flight."""
-    if checksum is None and all(value is None for value in values):
-        return None
+    values, checksum = [_number(content, name) for name in _POSE], content["pose_crc32"]
     if checksum is not None and checksum != pose_crc32(values):
         raise Unreadable("its pose does not match its checksum")
-    *measured, is_surveyed, lat_deg, lon_deg = map(_number, values, _POSE)
-    known = [value for value in measured if value is not None]
-    if len(known) < len(measured):
+    if all(value is None for value in values):
+        return None
+    up_deg, footprint_m, var_east, cov, var_north, is_surveyed, lat_deg, lon_deg = values
+    if up_deg is None or footprint_m is None or var_east is None or cov is None or var_north is None:
         raise Unreadable("its pose is not whole")
-    up_deg, footprint_m, var_east, cov, var_north = known
-    if not (0 < footprint_m <= _MOST_METRES and 0 < var_east <= _MOST_METRES**2 and 0 < var_north <= _MOST_METRES**2):
-        raise Unreadable("its pose is out of range")
     if not cov**2 <= var_east * var_north:
         raise Unreadable("its pose has no covariance")
-    recorded = None
-    if lat_deg is not None and lon_deg is not None:
-        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
-            raise Unreadable("its recorded position is not on the Earth")
-        recorded = Position(lat_deg, lon_deg)
     return Pose(
         up_deg=up_deg % 360,
         footprint_m=footprint_m,
         covariance_m2=(var_east, cov, var_north),
         is_surveyed=is_surveyed == 1,
-        recorded=recorded,
+        recorded=None if lat_deg is None or lon_deg is None else Position(lat_deg, lon_deg),
     )
 
 
@@ -295,14 +280,15 @@ def crc32(blob: Any) -> int | None:
     return None if blob is None else zlib.crc32(blob)
 
 
-def _hold(blob: Any, checksum: object, name: str) -> None:
-    if checksum is not None and checksum != zlib.crc32(blob):
-        raise Unreadable(f"its {name} does not match its checksum")
+def _hold(content: Content, name: str, called: str) -> None:
+    checksum = content.get(f"{name}_crc32")
+    if checksum is not None and checksum != zlib.crc32(content[name]):
+        raise Unreadable(f"its {called} does not match its checksum")
 
 
-def _number(value: object, name: str) -> float | None:
-    if value is None:
-        return None
-    if not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise Unreadable(f"its {name} is no number")
-    return value
+def _number(content: Content, name: str) -> float | None:
+    """Return the number in a column, None for NULL. Raises Unreadable for anything else, or one out of its range."""
+    value, (least, most) = content[name], _RANGES.get(name, (-math.inf, math.inf))
+    if value is None or (isinstance(value, (int, float)) and math.isfinite(value) and least <= value <= most):
+        return value
+    raise Unreadable(f"its {name} is {repr(value)[:20]}")

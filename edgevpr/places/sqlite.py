@@ -2,7 +2,7 @@
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from edgevpr.core.errors import MapBusyError, MapError
@@ -15,27 +15,21 @@ WAIT_S = 5.0  # longest wait for another program that is writing
 _MOST_STEPS = 500_000_000
 
 # Words of SQLite's messages, and advice to the user.
-_ADVICE = (
-    (("full",), "the disk is full: make room; every place confirmed so far is kept"),
-    (("not a database",), "this is not a place map: give a .gpkg file made by `edgevpr map build`"),
-    (("no such module",), "the SQLite of this Python lacks what learning needs ({said}): use the system's own Python"),
-    (
-        ("malformed", "no such", "unsupported file format"),
-        "the file is damaged or no place map ({said}): restore a copy or build it again",
-    ),
-    (("readonly",), "it may not be written: check its permissions and those of its folder"),
-    (("unable to open",), "it cannot be opened: check the path, and the permissions of the file and its folder"),
-    (("interrupted",), "reading its table of places does not end, so this is no place map: restore a copy"),
-)
-_ANY_ADVICE = "SQLite says: {said}: check the disk and its free space"
+_ADVICE = {
+    "full": "the disk is full: make room; every place confirmed so far is kept",
+    "not a database": "this is not a place map: give a .gpkg file made by `edgevpr map build`",
+    "readonly": "it may not be written: check its permissions and those of its folder",
+    "unable to open": "it cannot be opened: check the path, and the permissions of the file and its folder",
+    "": "the file or its disk is damaged, or it is no place map ({said}): restore a copy or build it again",
+}
 
 
-def connect(path: Path, mode: str, options: str = "", wait_s: float = WAIT_S) -> sqlite3.Connection:
-    """Open a map file in SQLite's `mode`, ro or rw. `options` are appended to the URI, each with "&". `wait_s` seconds
-    is the longest wait for another program that is writing. Raises sqlite3.Error."""
+def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection:
+    """Open a map file in SQLite's `mode`, ro or rw. `wait_s` seconds is the longest wait for another program that is
+    writing. Raises sqlite3.Error."""
     # Autocommit: transactions are begun explicitly, so that nothing is ever half committed.
     db = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}{options}",
+        f"{path.absolute().as_uri()}?mode={mode}",
         uri=True,
         isolation_level=None,
         timeout=wait_s,
@@ -68,30 +62,8 @@ def settle(db: sqlite3.Connection) -> None:
 def settle_left_log(path: Path) -> None:
     """Merge the log of a map that was not closed into its file, if file and folder may be written."""
     if beside(path)[0].exists():
-        with suppress(sqlite3.Error):  # read-only medium: `connect_to_read` reads file and log, or raises
-            db = connect(path, "rw")
+        with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
             settle(db)
-            db.close()
-
-
-def connect_to_read(path: Path, wait_s: float = WAIT_S) -> sqlite3.Connection:
-    """Open a map file for reading, even if a log was left beside it in a folder that may not be written.
-
-    SQLite keeps the index of a log in a file beside it. If it cannot create that file, the index is kept in memory. For
-    this SQLite wants exclusive access, so file locks are switched off: nobody writes to a read-only medium. Raises
-    sqlite3.Error.
-    """
-    db = connect(path, "ro", wait_s=wait_s)
-    try:
-        db.execute("PRAGMA application_id").fetchone()
-    except sqlite3.OperationalError as error:
-        db.close()
-        log, index, _ = beside(path)
-        if "locked" in str(error) or not log.exists() or index.exists():
-            raise
-        db = connect(path, "ro", "&vfs=unix-none")
-        db.execute("PRAGMA locking_mode = EXCLUSIVE")
-    return db
 
 
 def is_of_one_row(error: sqlite3.Error) -> bool:
@@ -106,17 +78,13 @@ def sentences(path: Path) -> Iterator[None]:
     if another program is writing."""
     try:
         yield
-    except UnicodeDecodeError as error:  # raised by Python if SQLite's message quotes a damaged schema
-        raise MapError(
-            f"{path}: the file is damaged or no place map (its schema is no text): restore a copy or build it again."
-        ) from error
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
         said = str(error)
         if "locked" in said:
             raise MapBusyError(
                 f"{path}: another program is writing to it: close that program and try again."
             ) from error
-        advice = next((advice for words, advice in _ADVICE if any(word in said for word in words)), _ANY_ADVICE)
+        advice = next(advice for words, advice in _ADVICE.items() if words in said)
         raise MapError(f"{path}: {advice.format(said=said)}.") from error
 
 

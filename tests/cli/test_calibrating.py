@@ -147,18 +147,6 @@ def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, co
 
 
 @pytest.mark.slow
-def test_an_export_colours_the_places_that_were_asked_for(mapped, tmp_path):
-    out = tmp_path / "m.geojson"
-    assert main(["map", "export", str(mapped), "--geojson", str(out)]) == 0
-    found = {each["id"]: each["properties"] for each in json.loads(out.read_text())["features"]}
-    recognisable = calibration_in(mapped).recognisable
-    assert {number: each["recognisable"] for number, each in found.items()} == {
-        number: pytest.approx(share, abs=1e-3) for number, share in recognisable.items()
-    }
-    assert all(each["marker-color"].startswith("#") for each in found.values())
-
-
-@pytest.mark.slow
 def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, bare_map, tmp_path, capsys):
     assert main(["map", "shrink", str(mapped), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
     assert calibration_in(tmp_path / "small.gpkg") == calibration_in(mapped)

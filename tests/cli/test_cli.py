@@ -183,20 +183,10 @@ def test_a_score_that_says_nothing_is_not_accepted_for_want_of_another_place(cap
     assert not any(each["accepted"] for each in found)
 
 
-def test_a_map_is_never_overwritten_by_its_own_export(capsys, valley):
-    before = valley.read_bytes()
-    assert refused(capsys, "map", "export", valley, "--geojson", valley) == (
-        2,
-        f"edgevpr: --geojson {valley} is the map itself: give another name.",
-    )
-    assert valley.read_bytes() == before
-
-
-def test_maps_are_merged_and_exported(capsys, flight, valley, tmp_path):
+def test_maps_are_merged(capsys, valley, tmp_path):
     assert main(["map", "merge", str(tmp_path / "all.gpkg"), str(valley), str(valley)]) == 0
     assert "6 there already" in capsys.readouterr().out
-    assert main(["map", "export", str(tmp_path / "all.gpkg"), "--geojson", "-"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["features"]) == 6
+    assert run_json(capsys, "map", "info", tmp_path / "all.gpkg", "--json")["places"] == 6
 
 
 def test_a_map_without_positions_says_that_it_sends_no_fixes(capsys, flight, tmp_path):
@@ -258,7 +248,6 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", ""], "no MAVLink link"),
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
-        (["map", "export", valley, "--geojson", tmp_path / "no" / "x.json"], "no such folder: make it first"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
         (["match", valley, "--images", query, "--battery", "lots"], "battery pack `lots`"),
         (["run", "--config", config], "did you mean `match`"),

@@ -81,11 +81,6 @@ def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of
     assert built["added"] == len(places)
     assert built["of_low_quality"] == len(low)
     assert built["not_memorable"] == {"entropy": 30 - len(low)}
-
-    assert main(["map", "export", str(place_map), "--geojson", str(tmp_path / "m.geojson")]) == 0
-    drawn = json.loads((tmp_path / "m.geojson").read_text())["features"]
-    colours = {each["properties"]["low_quality"]: each["properties"]["marker-color"] for each in drawn}
-    assert len(set(colours.values())) == 2
     capsys.readouterr()
     assert main(["map", "info", str(place_map)]) == 0
     assert f"{len(low)} of low" in capsys.readouterr().out

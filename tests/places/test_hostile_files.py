@@ -8,8 +8,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
 
 import map_writer
 import numpy as np
@@ -118,13 +116,12 @@ def test_a_summary_says_what_it_can(map_path):
     written(
         map_path,
         "UPDATE gpkg_contents SET min_x = NULL, max_y = 'north'",
-        "UPDATE places SET time = 1, quality = 'good' WHERE place_id < 9",
+        "UPDATE places SET time = 1, quality = 'good'",
         "DELETE FROM edgevpr_map WHERE key = 'made_by'",
     )
     with PlaceMap.open(map_path) as place_map:
         info = info_of(place_map)
     assert (info.places, info.extent, info.first_time, info.made_by) == (PLACES, None, None, None)
-    assert info.last_time.startswith("2023-11-14")
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -199,41 +196,6 @@ def test_a_map_that_could_not_be_made_leaves_no_file(tmp_path):
     with no_file_larger_than(10_000), pytest.raises(MapError):
         PlaceMap.create(tmp_path / "m.gpkg", SPEC)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("left", ["-wal", "-wal and -shm"])
-def test_a_left_over_log_in_a_folder_that_may_not_be_written_is_read(left):
-    with tempfile.TemporaryDirectory() as name:  # not pytest's own folder: nobody else may look into that
-        folder = Path(name)
-        writer = subprocess.Popen(
-            [sys.executable, map_writer.__file__, str(folder / "m.gpkg"), "0"], stdout=subprocess.PIPE, text=True
-        )
-        for _ in range(5):
-            writer.stdout.readline()
-        writer.kill()
-        writer.communicate()
-        if left == "-wal":
-            (folder / "m.gpkg-shm").unlink()
-        before = sorted(entry.name for entry in folder.iterdir())
-        for entry in folder.iterdir():
-            entry.chmod(0o444)
-        folder.chmod(0o555)
-        code = f"""
-import os, sys
-sys.path[:0] = {sys.path!r}
-from edgevpr.places.mapfile import PlaceMap
-os.getuid() or os.setuid(65534)  # whom permissions hold for
-with PlaceMap.open({str(folder / "m.gpkg")!r}) as place_map:
-    print(len(place_map), len(list(place_map.coarse_parts())))
-    place_map.require_unchanged()
-"""
-        read = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-        folder.chmod(0o755)
-        assert read.returncode == 0, read.stderr
-        counted, parts = map(int, read.stdout.split())
-        assert counted == parts >= 5
-        assert sorted(entry.name for entry in folder.iterdir()) == before
 
 
 @pytest.mark.parametrize("part", ["geom", "coarse", "fine"])
