@@ -122,7 +122,7 @@ def models_list(args: Namespace) -> int:
         print_json([asdict(each) for each in found])
         return 0
     for each in found:
-        print(f"{each.name:<20} {'ok   ' if each.ok else 'WRONG'}  {each.title or ''}")
+        print(f"{each.name:<20} {'WRONG' if each.problem else 'ok   '}  {each.title or ''}")
         if each.title:
             print(f"{'':<27} {each.licence}; {each.source}")
             print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}")

@@ -29,7 +29,6 @@ def add(commands: Any) -> None:
         action="store_true",
         help="measure every technique here, and the power if there is a meter; keep it",
     )
-    parser.add_argument("--images", metavar="DIR", help="pictures to measure on (default: generated ones)")
     parser.add_argument("--out", metavar="FILE", help="where --detect (.yaml) or --measure (.json) write to")
     add_json(parser)
 
@@ -50,10 +49,11 @@ def profile(args: Namespace) -> int:
     """Run `profile`: estimate what each technique costs in a flight, or list, detect or measure boards."""
     from edgevpr.core.text import progress, require_picture
     from edgevpr.power.boards import board_names, load_board
-    from edgevpr.runtime.preflight.choose import require_technique
+    from edgevpr.runtime.preflight.choose import preferred
     from edgevpr.runtime.preflight.estimate import estimate
-    from edgevpr.runtime.preflight.presentation import format_table
-    from edgevpr.runtime.preflight.stored import default_path, known_and_tried, load, scaled_from
+    from edgevpr.runtime.preflight.presentation import format_table, plot
+    from edgevpr.runtime.preflight.stored import default_path, load, scaled_from
+    from edgevpr.runtime.preflight.trial import try_each
 
     if args.list:
         for name in board_names():
@@ -61,8 +61,6 @@ def profile(args: Namespace) -> int:
         return 0
     if args.out and not (args.detect or args.measure):
         raise UsageError("--out is for --detect and --measure: name one of them too.")
-    if args.images and not args.measure:
-        raise UsageError("--images is for --measure: give both.")
     asked = args.map is not None or args.places is not None
     if args.detect:
         if asked or args.plot:
@@ -73,26 +71,26 @@ def profile(args: Namespace) -> int:
     if args.plot:
         require_picture(Path(args.plot))
     board = load_board(args.board)
-    require_technique(board)
+    preferred(board)  # raises if the profile names a technique that is not there
     plan, map_technique, wanted = _plan(args, board) if asked else (None, None, ())
-    code = _measure(args, quiet=asked) if args.measure else 0
+    if args.measure:
+        _measure(args, quiet=asked)
     if plan is None:
-        return code
+        return 0
     stored, refused = load(Path(args.out) if args.measure and args.out else default_path())
     if refused:
         print(f"edgevpr: {refused}", file=sys.stderr)
-    trials = progress(known_and_tried(wanted, board, stored), len(wanted), "trying techniques")
+    trials = try_each(wanted, board.threads, stored.of if stored else lambda offer: None)
+    trials = progress(trials, len(wanted), "trying techniques")
     here = scaled_from(load_board("this"), board, stored)
     result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
     if args.plot:
-        from edgevpr.runtime.preflight.presentation import plot
-
         plot(result, Path(args.plot))
     if args.json:
         print_json(asdict(result))
     else:
         print(format_table(result))
-    return code
+    return 0
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
@@ -133,11 +131,9 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
 def _detect(args: Namespace) -> int:
     from edgevpr.power.boards import describe, detect, own_profile
     from edgevpr.power.speed import micro_benchmark
-    from edgevpr.runtime.preflight.stored import require_new_profile, write_profile
+    from edgevpr.runtime.preflight.stored import write_profile
 
     found = detect()
-    if args.out:
-        require_new_profile(Path(args.out))
     if args.json:
         print_json(asdict(found))
     else:
@@ -150,9 +146,9 @@ def _detect(args: Namespace) -> int:
     return 0
 
 
-def _measure(args: Namespace, quiet: bool) -> int:
-    """Measure this machine, store the figures, and return the exit code. `quiet`: an estimate follows, which prints the
-    only JSON of --json."""
+def _measure(args: Namespace, quiet: bool) -> None:
+    """Measure this machine, and store the figures. `quiet`: an estimate follows, which prints the only JSON of
+    --json."""
     from edgevpr import techniques
     from edgevpr.core.text import progress
     from edgevpr.power.boards import load_board
@@ -162,12 +158,10 @@ def _measure(args: Namespace, quiet: bool) -> int:
     from edgevpr.runtime.preflight.trial import offers, try_each
 
     path = Path(args.out) if args.out else stored.default_path()
-    stored.require_room(path, make=not args.out)
-    images, pictures = stored.pictures_of(args.images)
-    threads, wanted = load_board("this").threads, offers(techniques.names())
-    speed = micro_benchmark()
-    trials = try_each(wanted, threads, images, rounds=stored.MEASURED_PICTURES)
-    figures = stored.gathered(progress(trials, len(wanted), "measuring techniques"), pictures, threads, speed)
+    stored.require_room(path)
+    threads, wanted, speed = load_board("this").threads, offers(techniques.names()), micro_benchmark()
+    trials = progress(try_each(wanted, threads), len(wanted), "measuring techniques")
+    figures = stored.gathered(trials, threads, speed)
     stored.save(figures, path)
     try:
         own, power = stored.measured_profile(path, speed)
@@ -176,6 +170,4 @@ def _measure(args: Namespace, quiet: bool) -> int:
     if args.json and not quiet:
         print_json({**asdict(figures), "file": str(path), "profile": own and str(own), "power": power})
     elif not args.json:
-        print(format_stored(figures))
-        print(f"Kept in {path}.\n{power}\n" if quiet else f"Kept in {path}.\n{power}")
-    return 0
+        print(f"{format_stored(figures)}\nKept in {path}.\n{power}")

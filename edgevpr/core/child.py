@@ -11,24 +11,19 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
+
+from edgevpr.core.errors import EdgevprError
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """Result of a child process. `code` is its exit code (0: it has answered; negative: minus the signal that ended it;
-    None: it was killed at the time limit), `answer` its answer (any JSON; None: no answer), and `said` its stderr."""
+def ask_child(module: str, job: Any, limit_s: float, what: str) -> Any:
+    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON).
 
-    code: int | None
-    answer: Any
-    said: str
-
-
-def ask_child(module: str, job: Any, limit_s: float) -> Ended:
-    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return how it ended."""
+    Raises EdgevprError, a sentence that begins with `what` was done, if it takes longer or crashes, and the error that
+    the work itself raised.
+    """
     # The child gets its own session, so that only the parent process receives Ctrl-C.
     process = subprocess.Popen(
         [sys.executable, "-m", module],
@@ -42,24 +37,36 @@ def ask_child(module: str, job: Any, limit_s: float) -> Ended:
     try:
         answer, said = process.communicate(json.dumps({"parent_pid": os.getpid(), "job": job}), timeout=limit_s)
     except subprocess.TimeoutExpired:
-        return Ended(None, None, "")
+        raise EdgevprError(f"{what} took longer than {limit_s:g} s: it has no end, or is too slow here.") from None
     finally:
         process.kill()
         process.wait()
+    if process.returncode < 0:
+        hint = "memory ran out" if process.returncode == -signal.SIGKILL else "a library does not suit this processor"
+        raise EdgevprError(f"{what} was ended by {signal.Signals(-process.returncode).name}: {hint}.")
     try:
-        return Ended(process.returncode, json.loads(answer) if process.returncode == 0 else None, said)
-    except ValueError:  # a library has ended the process with exit code 0
-        return Ended(1, None, said)
+        reply = json.loads(answer)
+    except ValueError:  # it failed, or a library has ended it
+        why = (said.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:200]
+        raise EdgevprError(f"{what} failed ({why}): install edgevpr and its packages again.") from None
+    if reply["problem"]:
+        raise EdgevprError(reply["problem"])
+    return reply["answer"]
 
 
 def serve_parent(work: Callable[[Any], Any]) -> None:
-    """Serve one request, in the child: read the job from stdin, call `work` with it, and write the result to stdout as
-    JSON. Text that a library prints goes to stderr, not into the answer."""
+    """Serve one request, in the child: read the job from stdin, call `work` with it, and write its result, or the
+    EdgevprError that it raises, to stdout as JSON. Text that a library prints goes to stderr, not into the answer."""
     request = json.load(sys.stdin)
     end_with_parent(request["parent_pid"])
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answer:
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as reply:
         os.dup2(2, 1)
-        json.dump(work(request["job"]), answer)
+        answer, problem = None, None
+        try:
+            answer = work(request["job"])
+        except EdgevprError as error:
+            problem = str(error)
+        json.dump({"answer": answer, "problem": problem}, reply)
 
 
 def end_with_parent(parent_pid: int) -> None:
@@ -70,8 +77,3 @@ def end_with_parent(parent_pid: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:  # the parent ended before the line above
         sys.exit(1)
-
-
-def last_line(ended: Ended) -> str:
-    """Return the last line of a failed child's stderr (else its exit code), at most 200 characters, for a message."""
-    return (ended.said.strip().splitlines() or [f"exit code {ended.code}"])[-1][:200]

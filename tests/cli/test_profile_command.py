@@ -1,6 +1,7 @@
 """`edgevpr profile` as a user meets it: before the flight, on which board, and measured rather than guessed."""
 
 import json
+from dataclasses import asdict
 
 import cv2
 import numpy as np
@@ -8,12 +9,12 @@ import pytest
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.files import shipped
 from edgevpr.core.types import StageCost
 from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.preflight import accuracy, trial
-from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
 
@@ -48,18 +49,14 @@ def tried(monkeypatch):
     """What was tried, by trials that take no time."""
     asked = []
 
-    def try_each(wanted, threads, images=(), rounds=0):
-        for offer in wanted:
-            asked.append(offer.label)
-            if offer.name == "calc":
-                yield Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
-                continue
-            yield Trial(
-                label=offer.label, name=offer.name, settings=offer.settings, costs=HOG if offer.name == "hog" else COSTS
-            )
+    def answer(module, job, limit_s, what):
+        asked.append(job["label"])
+        if job["name"] == "calc":
+            raise EdgevprError("There is no model `calc`.")
+        costs = HOG if job["name"] == "hog" else COSTS
+        return asdict(Trial(label=job["label"], name=job["name"], settings=job["settings"], costs=costs))
 
-    monkeypatch.setattr(measured, "try_each", try_each)
-    monkeypatch.setattr(trial, "try_each", try_each)
+    monkeypatch.setattr(trial, "ask_child", answer)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
     counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
@@ -88,7 +85,7 @@ def a_map(tmp_path, technique="hog"):
         cv2.imwrite(str(folder / f"{number}.png"), image)
     path = tmp_path / "valley.gpkg"
     assert main(["map", "build", str(path), "--images", str(folder), "--technique", technique]) == 0
-    return path, folder
+    return path
 
 
 @pytest.mark.process
@@ -96,14 +93,13 @@ def a_map(tmp_path, technique="hog"):
 def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog"))
     found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--hover-w", 90, "--json").out)
-    rows = {row["technique"]: row for row in found["techniques"]}
+    rows = {row["option"]["label"]: row for row in found["techniques"]}
     fewer = ["cohog, 20 candidates", "cohog, 10 candidates"]
     assert list(rows) == ["cohog", *fewer, "hog", "hog 8bit", "hog 1bit"]
-    assert not rows["hog"]["fits"], "286 KB a place is 2.9 GB: more than the board has"
-    assert any("RAM" in why for why in rows["hog"]["shortfalls"])
+    assert any("RAM" in why for why in rows["hog"]["option"]["fit"]["shortfalls"]), "286 KB a place is 2.9 GB"
     assert found["times"] == "scaled"
     assert 0 < rows["cohog"]["lost_marginal_min"] < rows["cohog"]["lost_min"]
-    assert rows["cohog"]["u_encode"] <= 1
+    assert rows["cohog"]["query"]["u_encode"] <= 1
     assert found["recommended"] == "cohog"
 
 
@@ -121,13 +117,11 @@ def test_the_cheapest_that_finds_enough_is_recommended(capsys, tried):
     assert found["recommended"] == "cohog", "ways to use the board's own technique come first"
     nothing = run(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 0.95).out
     assert "the most is 0.90" in nothing
-    assert refused(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 2)[1].startswith(
-        "The least recall is 2:"
-    )
+    assert refused(capsys, "--board", "rpi-5", "--places", 20, "--min-recall", 2)[1].startswith("`min_recall` is 2:")
 
 
 def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, tmp_path, tried):
-    path, _ = a_map(tmp_path)
+    path = a_map(tmp_path)
     capsys.readouterr()
     found = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--json").out)
     assert found["plan"]["places"] == 3
@@ -141,20 +135,19 @@ def test_with_a_map_its_places_count_and_only_its_forms_are_recommended(capsys, 
 @pytest.mark.slow
 def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "seqslam"))
-    _, folder = a_map(tmp_path, "seqslam")
+    a_map(tmp_path, "seqslam")
     capsys.readouterr()
-    said = run(capsys, "--measure", "--images", folder)
+    said = run(capsys, "--measure")
     assert "measuring techniques" in said.err
     kept = tmp_path / "data/edgevpr/measured.json"
     assert f"Kept in {kept}.\n{sensors.NO_METER}" in said.out
-    assert f"3 pictures of {folder}" in said.out
     fields = json.loads(kept.read_text())
     assert [trial["label"] for trial in fields["trials"]] == ["cohog", "seqslam"]
     assert fields["trials"][0]["costs"]["encode"]["cpu_s"] > 0
-    monkeypatch.setattr(measured, "try_each", lambda wanted, threads: iter(wanted and pytest.fail("anew")))
+    monkeypatch.setattr(trial, "ask_child", lambda *_: pytest.fail("anew"))
     found = json.loads(run(capsys, "--places", 50, "--json").out)
     assert (found["measured_on"], found["times"]) == (fields["date"], "measured")
-    assert found["techniques"][0]["t_encode_s"] == fields["trials"][0]["costs"]["encode"]["wall_s"]
+    assert found["techniques"][0]["query"]["t_encode_s"] == fields["trials"][0]["costs"]["encode"]["wall_s"]
     assert fields["date"] in run(capsys, "--places", 50).out
     other = json.loads(run(capsys, "--places", 50, "--board", "rpi-4b", "--json").out)
     assert other["times"] == "scaled"
@@ -196,11 +189,10 @@ def test_an_interruption_leaves_the_old_figures_as_they_were(capsys, tmp_path, m
     folder = tmp_path / "data/edgevpr"
     before = (folder / "measured.json").read_bytes()
 
-    def interrupted(*_, **__):
-        yield Trial(label="cohog", name="cohog", settings={}, costs=COSTS)
+    def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trial, "try_each", interrupted)
+    monkeypatch.setattr(trial, "ask_child", interrupted)
     assert main(["profile", "--measure"]) == 130
     assert "stopped" in capsys.readouterr().err
     assert (folder / "measured.json").read_bytes() == before
@@ -241,8 +233,8 @@ def test_the_boards_are_listed(capsys):
 @pytest.mark.parametrize(
     ("argv", "sentence"),
     [
-        (["--places", "50", "--hover-w", "0"], "The hover power in W is 0: give a number above 0."),
-        (["--places", "50", "--hover-w", "nan"], "The hover power in W is nan: give a number above 0."),
+        (["--places", "50", "--hover-w", "0"], "`hover_w` is 0: give a number above 0."),
+        (["--places", "50", "--hover-w", "nan"], "`hover_w` is nan: give a number above 0."),
         (["--places", "50", "--battery", "4X"], "The battery pack `4X` cannot be read: write its cells in series"),
         (
             ["--places", "50", "--plot", "nowhere/chart.png"],
@@ -252,8 +244,6 @@ def test_the_boards_are_listed(capsys):
         (["--map", "nowhere.gpkg"], "There is no map"),
         (["--plot", "chart.png", "--measure"], "Say how many places will be flown with"),
         (["--places", "50", "--out", "x.json"], "--out is for --detect and --measure"),
-        (["--places", "50", "--images", "."], "--images is for --measure"),
-        (["--measure", "--images", "nowhere"], "The folder nowhere does not exist"),
         (["--measure", "--out", "nowhere/m.json"], "nowhere/m.json: there is no such folder"),
         (["--measure", "--out", "mine.yaml"], "mine.yaml: the name of a file of figures ends in .json"),
         (["--detect", "--places", "50"], "--detect says what this machine is: ask what a flight costs without it."),

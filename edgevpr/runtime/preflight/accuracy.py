@@ -4,13 +4,13 @@ The figures (accuracy.json) are installed with the program, so that no cost is e
 """
 
 import json
+import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 PATH = Path(__file__).with_name("accuracy.json")
-_FEWER = "{}, {} candidates"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,20 +32,21 @@ class Accuracy:
     accepted_elsewhere: int
 
     @property
-    def is_trusted(self) -> bool:
-        """Tell whether no query was accepted as a place far from the right one."""
-        return self.accepted_elsewhere == 0
+    def wrong(self) -> str:
+        """How many accepted places were wrong, and how many more were neighbours of the right one, for people."""
+        beside = self.accepted_wrong - self.accepted_elsewhere
+        return f"{self.accepted_elsewhere}" + (f" (+{beside} beside)" if beside else "")
 
     def __str__(self) -> str:
-        sets = f"{self.sets} image sets" if self.sets > 1 else "one image set"
-        beside = self.accepted_wrong - self.accepted_elsewhere
-        wrong = f"{self.accepted_elsewhere} wrong" + (f" ({beside} as a neighbour)" if beside else "")
-        return f"recall@1 {self.recall_at_1:.2f} on {sets}, {self.accepted} of {self.asked} accepted, {wrong}"
+        return (
+            f"recall@1 {self.recall_at_1:.2f} on {self.sets} image sets, {self.accepted} of {self.asked} accepted, "
+            f"{self.wrong} wrong"
+        )
 
 
 def labelled(label: str, candidates: int | None) -> str:
     """Return `label` (technique and form), followed by the number of candidates unless that is the default (None)."""
-    return label if candidates is None else _FEWER.format(label, candidates)
+    return label if candidates is None else f"{label}, {candidates} candidates"
 
 
 def of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
@@ -60,12 +61,11 @@ def of(label: str, camera: str | None, candidates: int | None = None) -> Accurac
 
 def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
     """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
-    before, after = _FEWER.format(label, "|").split("|")
-    names = (name for name in _content()[camera or "forward"] if name.startswith(before) and name.endswith(after))
-    return tuple(sorted((int(name[len(before) : -len(after)]) for name in names), reverse=True))
+    known = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in _content()[camera or "forward"])
+    return tuple(sorted((int(found[1]) for found in known if found), reverse=True))
 
 
-@lru_cache(maxsize=1)
+@cache
 def _content() -> dict[str, dict[str, dict[str, Any]]]:
     content: dict[str, dict[str, dict[str, Any]]] = json.loads(PATH.read_text("utf-8"))
     return content

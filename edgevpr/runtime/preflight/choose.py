@@ -18,6 +18,8 @@ from edgevpr.runtime.preflight import accuracy
 from edgevpr.runtime.preflight.accuracy import Accuracy
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
+_NAMED = 3  # options whose objections are told where nothing can be chosen
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
@@ -33,16 +35,24 @@ class Demand:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
     """Fit of a technique on a board. `t_query_s`: wall seconds of a query. `cpu_s`: its CPU-seconds of all cores
-    together. `map_ram_mb`: RAM of the map's index. `process_ram_mb`: RAM of the process with it. `reachable_hz`: most
-    queries per second. `shortfalls`: why it does not fit (empty: it fits). `remedies`: what would make it fit."""
+    together. `map_ram_mb`, `map_disk_mb`: the map's index and file. `process_ram_mb`: RAM of the process with the
+    index. `reachable_hz`: most queries per second. `shortfalls`: why it does not fit (empty: it fits). `remedies`: what
+    would make it fit."""
 
     t_query_s: float
     cpu_s: float
     map_ram_mb: float
+    map_disk_mb: float
     process_ram_mb: float
     reachable_hz: float
     shortfalls: tuple[str, ...]
     remedies: tuple[str, ...]
+
+    @property
+    def misfit(self) -> str | None:
+        """Why it does not fit and what would make it fit, as words that follow a name; None if it fits."""
+        would = f"; it would fit {' or '.join(self.remedies)}" if self.remedies else ""
+        return f"does not fit: {' and '.join(self.shortfalls)}{would}" if self.shortfalls else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,38 +69,30 @@ class Option:
     accuracy: Accuracy | None
 
     @property
-    def is_sound(self) -> bool:
-        """Tell whether the option may be chosen automatically: its accuracy is measured and trusted, and it matches
-        single queries. To match a sequence, a flight must follow the mapped route, which is not certain."""
-        return self.accuracy is not None and self.accuracy.is_trusted and self.costs.sequence == 1
-
-    @property
     def recall(self) -> float:
         """Recall@1, 0..1, or 0 if it was not measured."""
         return self.accuracy.recall_at_1 if self.accuracy else 0.0
 
     @property
     def objection(self) -> str | None:
-        """Reason not to choose the option automatically, as text; None if there is none."""
-        if self.fit.shortfalls:
-            return f"{self.label} does not fit, {' and '.join(self.fit.shortfalls)}"
+        """Reason not to choose the option automatically, as words that follow its label; None if there is none."""
+        if self.fit.misfit:
+            return self.fit.misfit
         if self.accuracy is None:
-            return f"{self.label} was never measured: name it to use it"
-        if not self.accuracy.is_trusted:
-            wrong = f"{self.accuracy.accepted_elsewhere} wrong places in {self.accuracy.asked} queries"
-            return f"{self.label} accepted {wrong}: name it to use it"
+            return "was never measured: name it to use it"
+        if self.accuracy.accepted_elsewhere:
+            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: name it to use it"
         if self.costs.sequence > 1:
-            return f"{self.label} needs a flight along the mapped way: name it to use it"
+            return "needs a flight along the mapped way: name it to use it"
         return None
 
 
 def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
     """Yield the technique `name` with its default number of candidates, then with each smaller number that was
     measured. `label` is technique and form; `costs` are those on `board`."""
-    for candidates in (None, *accuracy.fewer_candidates(label, demand.camera)):
-        if candidates is not None and (costs.candidates is None or candidates >= costs.candidates):
-            continue
-        fewer = costs if candidates is None else replace(costs, candidates=candidates)
+    measured = accuracy.fewer_candidates(label, demand.camera)
+    for candidates in (None, *(count for count in measured if count < (costs.candidates or 0))):
+        fewer = replace(costs, candidates=candidates or costs.candidates)
         yield Option(
             label=accuracy.labelled(label, candidates),
             name=name,
@@ -105,7 +107,7 @@ def front(wanted: Iterable[Option]) -> list[Option]:
     """Return the options of the front (see above): fitting, trusted, and not both less accurate and dearer than
     another. The cheapest is first."""
     best_so_far: list[Option] = []
-    sound = [option for option in wanted if not option.fit.shortfalls and option.is_sound]
+    sound = [option for option in wanted if option.objection is None]
     for option in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
         if not best_so_far or option.recall > best_so_far[-1].recall:
             best_so_far.append(option)
@@ -119,7 +121,7 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
     Without `min_recall`, the board's own technique is chosen even if it was not measured, since the profile names it.
     """
     own = [option for option in wanted if option.name == board.technique]
-    unmeasured = [option for option in own if option.accuracy is None and not option.fit.shortfalls]
+    unmeasured = [option for option in own if option.accuracy is None and not option.fit.misfit]
     for among in (own, wanted):
         reaching = [option for option in front(among) if option.recall >= (min_recall or 0.0)]
         if reaching:
@@ -127,6 +129,14 @@ def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None
         if unmeasured and min_recall is None:
             return unmeasured[0]
     return None
+
+
+def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> str:
+    """Return the reason why `best` returned None."""
+    if sound := front(wanted):
+        return f"nothing that fits has a recall@1 of {min_recall:g}; the most is {sound[-1].recall:.2f}"
+    against = (f"{option.label} {option.objection}" for option in wanted[:_NAMED])
+    return f"nothing is chosen for {board.title} by itself: {', and '.join(against)}"
 
 
 def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
@@ -169,6 +179,7 @@ def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
         t_query_s=query.wall_s,
         cpu_s=query.cpu_s,
         map_ram_mb=map_ram_mb,
+        map_disk_mb=costs.disk_bytes_per_place * demand.places / 1e6,
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
         shortfalls=tuple(shortfalls),
@@ -181,61 +192,33 @@ def too_late(t_query_s: float) -> str:
     return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
-def require_technique(board: Board) -> None:
-    """Raise ConfigError if the board's profile names a technique that does not exist."""
-    if board.technique is not None and not techniques.is_known(board.technique):
-        raise ConfigError(
-            f"The profile of {board.title} names the technique `{board.technique}`, which is not there: use one of "
-            f"{', '.join(techniques.names())}."
-        )
-
-
 def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     """Return the techniques to try if the user names none, best first: the board's own, then those offered to any
     board.
 
     For a `camera` that looks down ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
-    if the board's own technique does not exist.
+    if the board's profile names a technique that does not exist.
     """
-    require_technique(board)
-    own = () if board.technique is None else (board.technique,)
-    names = (*own, *(name for name in techniques.AUTOMATIC if name not in own))
+    own = board.technique
+    if own is not None and not techniques.is_known(own):
+        raise ConfigError(
+            f"The profile of {board.title} names the technique `{own}`, which is not there: use one of "
+            f"{', '.join(techniques.names())}."
+        )
+    names = dict.fromkeys((own, *techniques.AUTOMATIC) if own else techniques.AUTOMATIC)
     return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
 
 
-def objections(wanted: Iterable[Option]) -> str:
-    """Return the objections to all `wanted` options as one text."""
-    return "; ".join(option.objection for option in wanted if option.objection)
-
-
-def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> str:
-    """Return the reason why `best` returned None. If no option fits, it names what would make an eligible one fit."""
-    fitting = [option for option in wanted if not option.fit.shortfalls]
-    if not fitting:
-        remedies = [
-            f"{option.label} {' or '.join(option.fit.remedies)}"
-            for option in wanted
-            if option.fit.remedies and (option.is_sound or option.name == board.technique)
-        ]
-        hint = f"what would fit is {', or '.join(remedies[:3])}" if remedies else "use a larger board"
-        return f"nothing that was tried fits {board.title}; {hint}"
-    if sound := front(fitting):
-        most = max(option.recall for option in sound)
-        return f"nothing that fits has a recall@1 of {min_recall:g}; the most is {most:.2f}"
-    return f"of what fits {board.title} nothing is chosen by itself: {objections(fitting)}"
-
-
-def described(board: Board, found: Fit, demand: Demand) -> str:
-    """Return a line of figures about a fit and, if the technique does not fit, why not and what would make it fit."""
+def described(board: Board, option: Option, demand: Demand) -> str:
+    """Return the accuracy of an option, the figures of its fit and, if it does not fit, why not and what would help."""
+    found = option.fit
     figures = (
-        f"{demand.places} places take {found.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the process "
-        f"{found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_rounded_down(found.reachable_hz):g} Hz of "
-        f"{demand.rate_hz:g} are reached with {board.cores * board.cpu_share:.2g} of {board.cores} cores"
+        f"{option.accuracy or 'never measured'}; {demand.places} places take {found.map_ram_mb:.1f} of "
+        f"{demand.budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and "
+        f"{_rounded_down(found.reachable_hz):g} Hz of {demand.rate_hz:g} are reached with "
+        f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"
     )
-    if not found.shortfalls:
-        return figures
-    remedies = f", it would fit {' or '.join(found.remedies)}" if found.remedies else ""
-    return f"{figures}; it does not fit ({' and '.join(found.shortfalls)}{remedies})"
+    return f"{figures}; it {found.misfit}" if found.misfit else figures
 
 
 def _rounded_down(value: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from edgevpr import techniques
 from edgevpr.core.arrays import Image
-from edgevpr.core.child import ask_child, last_line, serve_parent
+from edgevpr.core.child import ask_child, serve_parent
 from edgevpr.core.config import build
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.files import own_models, read_file, write_whole
@@ -33,13 +33,11 @@ _LIMIT_S = 120.0  # of a trial: at this limit, each of its ten pictures takes tw
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """One card in a listing. `ok`: card and network file agree. `problem`: why not, in a sentence (None: they do
-    agree). `techniques`: those that use it by default. Of a card that cannot be read, only `name`, `ok` and `problem`
-    are set."""
+    """One card in a listing. `problem`: why card and network file cannot be used together, in a sentence (None: they
+    can); then only `name` is set beside it. `techniques`: those that use it by default."""
 
     name: str
-    ok: bool
-    problem: str | None
+    problem: str | None = None
     title: str | None = None
     licence: str | None = None
     source: str | None = None
@@ -75,32 +73,16 @@ def verify(card: Card, threads: int = 1, limit_s: float = _LIMIT_S) -> Verified:
     """Run `verify_here` in a child process, for at most `limit_s` seconds.
 
     No other network has loaded anything there that would be missing from the figures. A network that is too large for
-    the board, or never ends, ends the child process instead of this one. Raises ModelError if that happens.
+    the board, or never ends, ends the child process instead of this one. Raises EdgevprError if that happens.
     """
     job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads}
-    ended = ask_child("edgevpr.runtime.preflight.networks", job, limit_s)
-    if ended.code is None:
-        raise ModelError(
-            f"{card.file_path} was tried for {limit_s:g} s and had no end: it loops, or is too slow for this board."
-        )
-    if ended.code < 0:
-        raise ModelError(
-            f"{card.file_path} ended the process that tried it, most likely for want of memory: use a smaller "
-            "network, or a board with more RAM."
-        )
-    if ended.code:
-        raise ModelError(f"{card.file_path} could not be tried ({last_line(ended)}): install edgevpr again.")
-    answer = ended.answer
-    if "problem" in answer:
-        raise ModelError(answer["problem"])
+    answer = ask_child("edgevpr.runtime.preflight.networks", job, limit_s, f"Trying {card.file_path}")
     return Verified(**answer | {"shapes": {output: tuple(shape) for output, shape in answer["shapes"].items()}})
 
 
 def verify_here(card: Card, threads: int = 1) -> Verified:
-    """Load the network of a card, run it on ten random pictures, and return its figures.
-
-    Raises ModelError, one sentence, for anything that would prevent its use in flight.
-    """
+    """Load the network of a card, run it on ten random pictures, and return its figures. Raises ModelError for anything
+    that would prevent its use in flight."""
     from edgevpr.techniques.network import of_card
 
     rng = np.random.default_rng(0)
@@ -136,13 +118,9 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
 
 
 def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
-    """Copy a network's file and card to the user's models folder, if the network works.
-
-    The SHA-256 on the card must be that of the file; a card without one gets it. Raises ModelError or ConfigError.
-    Returns two things:
-    - the figures of the network;
-    - the path of the new card.
-    """
+    """Copy a network's file and card to the user's models folder, if the network works. The SHA-256 on the card must be
+    that of the file; a card without one gets it. Returns the figures of the network and the path of the new card.
+    Raises EdgevprError."""
     card = read_card(card_path, needs_hash=False)
     found = file_sha256(file)
     if card.sha256 not in ("", found):
@@ -162,14 +140,14 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
 def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
     """Copy a network's `file`, whose hash is `sha256`, as `file_name` into the folder of `card_path`, then write the
     card's `text` there, each completely or not at all. Raises ModelError if another network has either name."""
-    folder, target = card_path.parent, card_path.parent / file_name
-    if card_path.exists() and _text_of(card_path) != text:
+    target = card_path.with_name(file_name)
+    card_differs = card_path.exists() and _text_of(card_path) != text
+    if card_differs or (target.exists() and file_sha256(target) != sha256):
         raise ModelError(
-            f"{card_path} is there already and says something else: take it away, or name yours otherwise."
+            f"{card_path if card_differs else target} is there already and is of another network: take it away, or "
+            "name yours otherwise."
         )
-    if target.exists() and file_sha256(target) != sha256:
-        raise ModelError(f"{target} is there already and is another file: write another `file` on the card.")
-    folder.mkdir(parents=True, exist_ok=True)
+    card_path.parent.mkdir(parents=True, exist_ok=True)
     if not target.exists():
         write_whole(target, lambda unfinished: shutil.copyfile(file, unfinished))
     write_whole(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
@@ -187,20 +165,14 @@ def card_text(values: dict[str, Any]) -> str:
 def _listed(name: str) -> Listed:
     try:
         card = load_card(name)
-    except EdgevprError as error:
-        return Listed(name=name, ok=False, problem=str(error))
-    problem = None
-    try:
         sha256 = file_sha256(card.file_path)
         if sha256 != card.sha256:
-            problem = f"{card.file_path} is not the file of its card: its SHA-256 is {sha256}, not {card.sha256}."
-    except ModelError as error:
-        problem = str(error)
+            raise ModelError(f"{card.file_path} is not the file of its card: its SHA-256 is {sha256}.")
+    except EdgevprError as error:
+        return Listed(name=name, problem=str(error))
     outputs = tuple(output for output, layer in asdict(card.outputs).items() if layer)
     return Listed(
         name=name,
-        ok=problem is None,
-        problem=problem,
         title=card.title,
         licence=card.licence,
         source=card.source,
@@ -224,13 +196,10 @@ def _users(card: Card, outputs: tuple[str, ...]) -> Iterator[str]:
         yield "salience.network"
 
 
-def _answer(job: dict[str, Any]) -> dict[str, Any]:
+def _verify_job(job: dict[str, Any]) -> dict[str, Any]:
     card = build(Card, {**job["card"], "path": Path(job["card"]["path"])}, job["card"]["path"])
-    try:
-        return asdict(verify_here(card, job["threads"]))
-    except EdgevprError as error:
-        return {"problem": str(error)}
+    return asdict(verify_here(card, job["threads"]))
 
 
 if __name__ == "__main__":
-    serve_parent(_answer)
+    serve_parent(_verify_job)

@@ -12,16 +12,7 @@ from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight import accuracy
-from edgevpr.runtime.preflight.choose import (
-    Demand,
-    Option,
-    best,
-    described,
-    nothing_to_choose,
-    objections,
-    options,
-    preferred,
-)
+from edgevpr.runtime.preflight.choose import Demand, Option, best, described, nothing_to_choose, options, preferred
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.preflight.scale import counted_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
@@ -59,12 +50,10 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
     taken = best(wanted, board)
     if taken is None:
-        lacks = f"{nothing_to_choose(wanted, board)} ({objections(wanted)})"
-        _log.warning("technique %s is taken all the same: %s", wanted[0].name, lacks)
+        _log.warning("technique %s is taken all the same: %s", wanted[0].name, nothing_to_choose(wanted, board))
         return wanted[0].name
-    chosen = f"{taken.label}: {taken.accuracy or 'never measured'}; {described(board, taken.fit, demand)}"
-    against = [option.objection for option in wanted if option.name != taken.name and option.objection]
-    _log.info("technique %s", "; ".join([chosen, *against]))
+    against = [f"{each.label} {each.objection}" for each in wanted if each.name != taken.name and each.objection]
+    _log.info("technique %s: %s", taken.label, "; ".join([described(board, taken, demand), *against]))
     return taken.name
 
 
@@ -72,11 +61,11 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     """Report which technique flies and why, and measure now whether the board can afford it. If it cannot, fewer
     candidates are taken that fit, unless the configuration sets their number (see `choose`). A failed measurement is
     only reported: it must not prevent a flight."""
-    technique, board = recogniser.technique, recogniser.meter.board
+    technique = recogniser.technique
     usual = candidates = recogniser.candidates or technique.candidates
     t_query_s = None
     try:
-        taken, afforded = _afforded(recogniser, config, board)
+        taken, afforded = _afforded(recogniser, config)
         t_query_s, candidates = taken.fit.t_query_s, taken.candidates or candidates
     except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
         afforded = f"what it takes could not be tried ({error})"
@@ -90,28 +79,26 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     return Outlook(f"technique {_label(technique)}: {'; '.join([*parts, afforded])}", candidates, t_query_s)
 
 
-def _afforded(recogniser: Recogniser, config: Config, board: Board) -> tuple[Option, str]:
-    """Return how the flight will recognise places:
-    - the technique with its number of candidates;
-    - its accuracy and cost, as a short text."""
-    technique = recogniser.technique
-    costs = _costs_on(technique, board)
-    beside_bytes = bytes_beside_place(recogniser.sequence)
-    costs = replace(costs, ram_bytes_per_place=bytes_per_place(technique.spec) + beside_bytes)
-    if technique.spec.fine:
-        costs = replace(costs, candidates=recogniser.candidates)
+def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
+    """Return the technique with the number of candidates that the flight will compare, and its accuracy and cost as a
+    short text."""
+    technique, board = recogniser.technique, recogniser.meter.board
+    spec, costs = technique.spec, _costs_on(technique, board)
+    costs = replace(
+        costs,
+        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(recogniser.sequence),
+        candidates=recogniser.candidates if spec.fine else costs.candidates,
+    )
     demand = Demand(
         places=len(recogniser.index),
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
         camera=_camera(technique),
     )
-    usual, *fewer = options(board, _label(technique), technique.spec.name, costs, demand)
-    is_open = config.match.candidates is None and recogniser.sequence == 1
-    fitting = [option for option in fewer if not option.objection] if is_open and usual.fit.shortfalls else []
-    taken = fitting[0] if fitting else usual
-    figures = described(board, taken.fit, demand)
-    return taken, f"{taken.accuracy}; {figures}" if taken.accuracy else figures
+    taken, *fewer = options(board, _label(technique), spec.name, costs, demand)
+    if taken.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:
+        taken = next((option for option in fewer if not option.objection), taken)
+    return taken, described(board, taken, demand)
 
 
 def _label(technique: Technique) -> str:
@@ -138,7 +125,7 @@ def trusted_candidates(technique: Technique) -> tuple[int, ...]:
     from the right one on the image sets, largest first."""
     label, camera = _label(technique), _camera(technique)
     measured = ((count, accuracy.of(label, camera, count)) for count in accuracy.fewer_candidates(label, camera))
-    return tuple(count for count, figures in measured if figures and figures.is_trusted)
+    return tuple(count for count, figures in measured if figures and not figures.accepted_elsewhere)
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:

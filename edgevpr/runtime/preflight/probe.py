@@ -1,10 +1,10 @@
-"""Costs of a technique on this machine, measured in a short trial on generated or real pictures."""
+"""Costs of a technique on this machine, measured in a short trial on generated pictures."""
 
 import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
@@ -47,10 +47,8 @@ class TechniqueCosts:
     `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
     technique has one stage, and compares all). `scan_per_place`: of scanning one place. `scan_once`: of preparing the
     query for it.
-    `process_mb`: peak resident memory of the process without a map. `encode_mb`: part of it that encoding takes for a
-    moment (None: the kernel does not report it).
-    `is_network`: pictures go through a network. `sequence`: number of queries matched together. `waited`: share of the
-    time of the trial in which other programs had the processor.
+    `process_mb`: peak resident memory of the process without a map.
+    `is_network`: pictures go through a network. `sequence`: number of queries matched together.
     """
 
     encode: StageCost
@@ -63,9 +61,7 @@ class TechniqueCosts:
     scan_once: StageCost = NO_COST
     compare_once: StageCost = NO_COST
     in_full: int = 1
-    encode_mb: float | None = None
     is_network: bool = False
-    waited: float = 0.0
     sequence: int = 1
 
     def match(self, places: int) -> StageCost:
@@ -98,62 +94,55 @@ def noise(count: int) -> list[Image]:
 
 def probe(
     technique: Technique,
-    images: Sequence[Image] | None = None,
     *,
     tried_s: float = 0.0,
     wall_clock: Callable[[], float] = time.perf_counter,
     cpu_clock: Callable[[], float] = time.process_time,
 ) -> TechniqueCosts:
-    """Measure the costs of a technique here and now. Pictures go through the steps of a query, first with an empty map,
-    then with a small map on disk, then with a large index.
+    """Measure the costs of a technique here and now. Pictures of `noise` go through the steps of a query, first with an
+    empty map, then with a small map on disk, then with a large index.
 
-    `images`: uint8 (H, W[, 3]). All are tried and the median counts, since some real pictures are quick and some slow.
-    None: a few pictures of `noise` are tried, and the quickest counts. Each is tried again for about `tried_s` seconds
-    per map, and the least CPU time counts, since the time of other programs is no cost of the technique. Raises
-    ModelError for a technique that fails on a picture.
+    Each is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of other
+    programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
     meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
-    bench = _Bench(technique, noise(_PICTURES) if images is None else images, meter, tried_s)
-    typical = _least if images is None else _median
-    spec = technique.spec
-    fewer = max(spec.in_full or 1, technique.candidates // 2)
+    bench = _Bench(technique, meter, tried_s)
+    spec, candidates = technique.spec, technique.candidates
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
         peak_is_new = machine.forget_peak()
-        encode_mb = bench.fill(trial_map)
+        bench.fill(trial_map)
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
         small = bench.tries(trial_map, index, 1)
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
         many = _many(technique, index)
-        large = bench.tries(trial_map, many, technique.candidates)
+        large = bench.tries(trial_map, many, candidates)
+        fewer = max(spec.in_full or 1, candidates // 2)
         half = bench.tries(trial_map, many, fewer) if spec.in_full else large
-    whole = typical([steps.scan if spec.fine else steps.match for steps in large])
-    once = typical([steps.scan for steps in small]) if spec.fine else NO_COST
+    once = _least([steps.scan for steps in small]) if spec.fine else NO_COST
     # The time of scanning six places is not spent on them, but on preparing the query and on the call.
-    scan = _beyond(whole, once) * (1 / len(many))
-    compare, part = (typical([steps.compare for steps in tries]) for tries in (large, half))
+    scan = _beyond(_least([steps.scan if spec.fine else steps.match for steps in large]), once) * (1 / len(many))
+    compare, part = (_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
-        one_more = _beyond(compare, part) * (1 / max(1, technique.candidates - fewer))
+        one_more = _beyond(compare, part) * (1 / max(1, candidates - fewer))
         # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
-        compare_once = _beyond(compare, one_more * technique.candidates) + verify
+        compare_once = _beyond(compare, one_more * candidates) + verify
     else:
-        one_more, compare_once = compare * (1 / technique.candidates) if spec.fine else scan, NO_COST
+        one_more, compare_once = compare * (1 / candidates) if spec.fine else scan, NO_COST
     fine_bytes = spec.fine.nbytes if spec.fine else 0
     return TechniqueCosts(
-        encode=typical([steps.encode for steps in [*small, *large]]),
+        encode=_least([steps.encode for steps in [*small, *large]]),
         match_per_place=one_more,
         compare_once=compare_once,
         in_full=spec.in_full or 1,
         ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(bench.sequence),
         disk_bytes_per_place=spec.coarse.nbytes + fine_bytes + (MOST_LANDMARK_BYTES if spec.cells else 0),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
-        candidates=technique.candidates if spec.fine else None,
+        candidates=candidates if spec.fine else None,
         scan_per_place=scan if spec.fine else NO_COST,
         scan_once=once,
-        encode_mb=encode_mb if peak_is_new else None,
         is_network=spec.model_sha256 is not None,
         sequence=bench.sequence,
-        waited=bench.waited,
     )
 
 
@@ -161,29 +150,21 @@ class _Bench:
     """A technique at work on the same pictures, again and again. `sequence`: number of queries that it matches
     together."""
 
-    def __init__(self, technique: Technique, pictures: Sequence[Image], meter: QueryMeter, tried_s: float) -> None:
+    def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
         self.sequence = length_of(technique.spec, None)
         self._technique, self._meter, self._tried_s = technique, meter, tried_s
-        self._frames = [Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(pictures)]
-        self._spent = NO_COST
+        self._frames = [
+            Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(noise(_PICTURES))
+        ]
 
-    @property
-    def waited(self) -> float:
-        """Share of the time of all tries, 0..1, in which other programs had the processor."""
-        return max(0.0, 1 - self._spent.cpu_s / self._spent.wall_s) if self._spent.wall_s else 0.0
-
-    def fill(self, trial_map: PlaceMap) -> float:
-        """Fill a map with copies of the first picture. Return the MB by which the peak of memory rose above what was
-        resident before the picture was encoded, with the threads and late imports that a first picture causes."""
-        before_mb = machine.rss_mb()
+    def fill(self, trial_map: PlaceMap) -> None:
+        """Fill a map with copies of the first picture."""
         alone = self._walk(trial_map, empty_index(self._technique.spec, 0, None), 1)
         first = _stepped(alone, self._frames[0])
-        rise_mb = machine.peak_mb() - before_mb
         if first.descriptor is None:
-            raise ModelError(f"{self._technique.spec.name} describes no picture: try it with --images.")
+            raise ModelError(f"{self._technique.spec.name} describes no picture of noise: it cannot be tried.")
         for _ in range(_PLACES):
             trial_map.add(self._frames[0], first.descriptor, landmarks=alone.landmarks(first))
-        return rise_mb
 
     def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> list[Steps]:
         """Let each picture be matched several times; return the least cost of every step, one `Steps` per picture."""
@@ -198,7 +179,6 @@ class _Bench:
         end_s, rounds = time.monotonic() + self._tried_s, [ask()]
         while len(rounds) < _TRIES and time.monotonic() < end_s:
             rounds.append(ask())
-        self._spent = sum((steps.encode + steps.match for tries in rounds for steps in tries), self._spent)
         return [
             Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
@@ -206,17 +186,9 @@ class _Bench:
 
     def _walk(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
-        return Recogniser(
-            Matcher(
-                technique,
-                index,
-                AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0),
-                search_of(self.sequence),
-            ),
-            place_map,
-            self._meter,
-            WalkSettings(candidates=candidates),
-        )
+        rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
+        matcher = Matcher(technique, index, rule, search_of(self.sequence))
+        return Recogniser(matcher, place_map, self._meter, WalkSettings(candidates=candidates))
 
 
 def _stepped(walk: Recogniser, frame: Frame) -> Recognition:
@@ -251,7 +223,3 @@ def _least(costs: list[StageCost]) -> StageCost:
     wall than CPU time cannot pass, so that waiting for other programs is left out; with several cores it can."""
     cpu_s = min(cost.cpu_s for cost in costs)
     return StageCost(min(cpu_s, *(cost.wall_s for cost in costs)), cpu_s)
-
-
-def _median(costs: list[StageCost]) -> StageCost:
-    return sorted(costs, key=lambda cost: cost.wall_s)[len(costs) // 2]

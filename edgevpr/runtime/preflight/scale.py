@@ -8,7 +8,7 @@ counted: these are of the board's own instruction set, and other programs cannot
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +66,10 @@ def ratios(here: Board, board: Board) -> Ratios | None:
     if is_same(here, board):
         return Ratios(1.0, 1.0)
     mine, other = here.benchmark_score, board.benchmark_score
-    products, passes = (_products(other), _products(mine)), (_passes(other), _passes(mine))
-    if not (products[0] and products[1] and passes[0] and passes[1]):
+    products, own_products, passes, own_passes = _products(other), _products(mine), _passes(other), _passes(mine)
+    if not (products and own_products and passes and own_passes):
         return None
-    return Ratios(products[0] / products[1], passes[0] / passes[1])
+    return Ratios(products / own_products, passes / own_passes)
 
 
 def on_board(costs: TechniqueCosts, here: Board, board: Board, work: CountedWork | None = None) -> TechniqueCosts:
@@ -85,34 +85,29 @@ def on_board(costs: TechniqueCosts, here: Board, board: Board, work: CountedWork
         return costs
     # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
     # rows of the index is passes.
-    encoding = (ratio.products, board, board.threads) if costs.is_network else (ratio.passes, board)
-    return replace(
-        costs,
-        encode=_scaled(costs.encode, *encoding),
-        match_per_place=_scaled(
-            costs.match_per_place, ratio.passes if costs.candidates is None else ratio.products, board
-        ),
-        compare_once=_scaled(costs.compare_once, ratio.products, board),
-        scan_per_place=_scaled(costs.scan_per_place, ratio.passes, board),
-        scan_once=_scaled(costs.scan_once, ratio.passes, board),
-    )
+    by = {
+        "encode": ratio.products if costs.is_network else ratio.passes,
+        "match_per_place": ratio.passes if costs.candidates is None else ratio.products,
+        "compare_once": ratio.products,
+        "scan_per_place": ratio.passes,
+        "scan_once": ratio.passes,
+    }
+    most_cores = {"encode": board.threads} if costs.is_network else {}
+    times = {
+        stage: _scaled(getattr(costs, stage), by_ratio, board, most_cores.get(stage)) for stage, by_ratio in by.items()
+    }
+    return replace(costs, **times)  # type: ignore[arg-type]  # they are fields of TechniqueCosts
 
 
 def _products(score: MachineSpeed) -> float | None:
-    if score.products is None and score.arm64_mips:
-        return _rounds_hz("products", score.arm64_mips) / REFERENCE_PRODUCTS_HZ
-    return score.products or (score.single and UNKNOWN_PRODUCTS * score.single)
+    counted_hz = score.arm64_mips and 1e6 * score.arm64_mips / float(_counted()["products"])
+    by_single = score.single and UNKNOWN_PRODUCTS * score.single
+    return score.products or (counted_hz / REFERENCE_PRODUCTS_HZ if counted_hz else by_single)
 
 
 def _passes(score: MachineSpeed) -> float | None:
-    if score.passes is None and score.arm64_mips:
-        return _rounds_hz("passes", score.arm64_mips) / REFERENCE_PASSES_HZ
-    return score.passes or score.single
-
-
-def _rounds_hz(kind: str, mips: float) -> float:
-    """Return the rounds per second of one part (`kind`) of the micro-benchmark on a core of `mips` million a second."""
-    return 1e6 * mips / float(_counted()[kind])
+    counted_hz = score.arm64_mips and 1e6 * score.arm64_mips / float(_counted()["passes"])
+    return score.passes or (counted_hz / REFERENCE_PASSES_HZ if counted_hz else score.single)
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
@@ -120,21 +115,17 @@ def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = N
     there (None: as many as it did)."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
-        return StageCost(cost.wall_s / ratio, cost.cpu_s / ratio)
+        return cost * (1 / ratio)
     busy_cores = min(busy_cores, board.cores, threads or board.cores)
-    wall_s = cost.cpu_s / ratio / (busy_cores * _kept(board.benchmark_score, busy_cores))
+    # Cores share memory and current, so that all together may be less than so many times a single one.
+    score, together = board.benchmark_score, busy_cores
+    if score.single and score.multi:
+        together = min(busy_cores, score.multi / score.single)
+    wall_s = cost.cpu_s / ratio / together
     return StageCost(wall_s, wall_s * busy_cores)
 
 
-def _kept(score: MachineSpeed, busy_cores: float) -> float:
-    """Return the share of a single core's speed that each of `busy_cores` keeps, since they share memory and
-    current."""
-    if score.single is None or score.multi is None:
-        return 1.0
-    return min(1.0, score.multi / (busy_cores * score.single))
-
-
-@lru_cache(maxsize=1)
+@cache
 def _counted() -> dict[str, Any]:
     """Return the counted instructions: of cohog by camera direction, and of a round of each micro-benchmark."""
     content: dict[str, Any] = json.loads(COUNTED_PATH.read_text("utf-8"))

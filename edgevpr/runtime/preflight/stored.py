@@ -10,11 +10,10 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from importlib import metadata
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +21,13 @@ from edgevpr import __version__, techniques
 from edgevpr.core.config import build
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.files import own_folder, read_file, require_folder, write_whole
-from edgevpr.frames.images import list_images, read_image
 from edgevpr.power import machine
 from edgevpr.power.boards import Board, MachineSpeed, own_profile, profile_text
 from edgevpr.power.speed import micro_benchmark
 from edgevpr.runtime.preflight.scale import is_same
-from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of, try_each
+from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of
 
-MEASURED_PICTURES = 8
-_FORMAT = 3  # format 1 had no `scan_once`; 2 had wall times, waiting for other programs included
+_FORMAT = 4  # another one for each change of `Trial` or `TechniqueCosts`
 _MAX_FILE_BYTES = 10_000_000
 _PACKAGES = {
     "numpy": ("numpy",),
@@ -42,11 +39,10 @@ _PACKAGES = {
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredFigures:
     """Figures of all techniques on one machine. `date`: local time of the measurement. `identity`: see `identity()`.
-    `pictures`: a description of those used. `threads`: of a network. `score`: speed by the micro-benchmark."""
+    `threads`: of a network. `score`: speed by the micro-benchmark."""
 
     date: str
     identity: dict[str, Any]
-    pictures: str
     threads: int
     score: MachineSpeed
     trials: tuple[Trial, ...]
@@ -56,10 +52,9 @@ class StoredFigures:
         network now."""
         for trial in self.trials:
             if trial.costs and trial.label == offer.label and _same_settings(trial, offer):
-                try:
-                    return trial if model_of(offer.name, offer.settings) == trial.model else None
-                except EdgevprError:
-                    return None
+                with contextlib.suppress(EdgevprError):
+                    if model_of(offer.name, offer.settings) == trial.model:
+                        return replace(trial, measured=True)
         return None
 
 
@@ -74,49 +69,26 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
         "machine": machine.title(root),
         "cores": os.cpu_count(),
         "usable cores": machine.cores(root),
-        "RAM in MB": round(machine.ram_mb(root)),
         "kernel": platform.release(),
         "edgevpr": __version__,
         **{name: _version(packages) for name, packages in _PACKAGES.items()},
     }
 
 
-def pictures_of(folder: str | None) -> tuple[list[Path], str]:
-    """Choose up to eight images, spread over a folder. Raises SourceError for a folder without images, ImageError for
-    an image that cannot be used. Returns two things:
-    - the paths (empty without a folder: pictures will be generated);
-    - a text that describes the pictures."""
-    if folder is None:
-        return [], f"{MEASURED_PICTURES} generated pictures"
-    images = list_images(folder)
-    count = min(len(images), MEASURED_PICTURES)
-    chosen = [images[i * len(images) // count] for i in range(count)]
-    for path in chosen:
-        read_image(path)
-    return chosen, f"{len(chosen)} pictures of {folder}"
-
-
-def gathered(trials: Iterable[Trial], pictures: str, threads: int, score: MachineSpeed) -> StoredFigures:
+def gathered(trials: Iterable[Trial], threads: int, score: MachineSpeed) -> StoredFigures:
     """Combine trials made just now with the date and the identity of this machine."""
     now = datetime.now(timezone.utc).astimezone().isoformat(timespec="minutes")
-    return StoredFigures(
-        date=now, identity=identity(), pictures=pictures, threads=threads, score=score, trials=tuple(trials)
-    )
+    return StoredFigures(date=now, identity=identity(), threads=threads, score=score, trials=tuple(trials))
 
 
-def require_room(path: Path, make: bool) -> None:
-    """Raise UsageError or EdgevprError if `save` could not write to `path`; for a check before the measurement. With
-    `make`, the folder is made if needed."""
+def require_room(path: Path) -> None:
+    """Raise UsageError, before the measurement, if `path` is no name of a file of figures in a folder that is there.
+    The folder of `default_path` is made."""
+    if path == default_path() and path.is_absolute():
+        path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix != ".json":
         raise UsageError(f"{path}: the name of a file of figures ends in .json: choose such a name.")
-    folder = path.resolve().parent
-    if make and str(path).startswith("~"):
-        raise UsageError(f"{path}: there is no home to keep figures in: set XDG_DATA_HOME, or give --out FILE.json.")
-    if make:
-        folder.mkdir(parents=True, exist_ok=True)
     require_folder(path)
-    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise EdgevprError(f"{path} cannot be written: give another --out, or correct the permissions.")
 
 
 def save(figures: StoredFigures, path: Path) -> None:
@@ -134,11 +106,10 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
         fields = json.loads(read_file(path, _MAX_FILE_BYTES))
         if fields.pop("format") != _FORMAT:
             return None, f"{path} is of another version of edgevpr: {again}"
-        score = build(MachineSpeed, fields["score"], "score")
-        trials = tuple(trial_of(trial) for trial in fields["trials"])
-        figures = StoredFigures(**{**fields, "score": score, "trials": trials})
-        # Kernels keep some RAM for themselves, every version another amount: that is no other machine.
-        there, here = figures.identity, identity() | {"RAM in MB": figures.identity["RAM in MB"]}
+        fields["score"] = build(MachineSpeed, fields["score"], "score")
+        fields["trials"] = tuple(map(trial_of, fields["trials"]))
+        figures, here = StoredFigures(**fields), identity()
+        there = figures.identity
         different = [f"{key}: {there.get(key)} there, {here[key]} here" for key in here if there.get(key) != here[key]]
     except FileNotFoundError:
         return None, None
@@ -147,21 +118,6 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
     if different:
         return None, f"The figures in {path} are of another machine or installation ({', '.join(different)}): {again}"
     return figures, None
-
-
-def known_and_tried(
-    wanted: Iterable[Offer], board: Board, stored: StoredFigures | None
-) -> Iterator[tuple[Trial, bool]]:
-    """Yield each offer's trial, in the order of `wanted`, with True if it was stored. Without a stored one, the offer
-    is tried now, quickly, and paired with False."""
-    for _, forms in groupby(wanted, key=lambda offer: offer.name):
-        known = [(offer, stored.of(offer) if stored else None) for offer in forms]
-        tried = try_each([offer for offer, trial in known if trial is None], board.threads)
-        for _, trial in known:
-            if trial:
-                yield trial, True
-            elif now := next(tried, None):  # there is no further trial of a technique that cannot be used
-                yield now, False
 
 
 def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Board:
@@ -176,21 +132,16 @@ def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Boar
     return replace(here, benchmark_score=stored.score if stored else micro_benchmark())
 
 
-def require_new_profile(path: Path) -> None:
-    """Raise UsageError if `write_profile` could not write to `path`."""
+def write_profile(path: Path, board: Board) -> None:
+    """Write a profile to a new file, completely or not at all. Raises UsageError for a name that does not end in .yaml,
+    a folder that is not there, and a file that is."""
     if path.suffix not in (".yaml", ".yml"):
         raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
     require_folder(path)
-    if path.exists():
-        raise UsageError(f"{path} is there already: move it away, or choose another name.")
-
-
-def write_profile(path: Path, board: Board) -> None:
-    """Write a profile to a new file, completely or not at all. Raises EdgevprError if the file exists by then."""
     try:
         write_whole(path, lambda unfinished: unfinished.write_text(profile_text(board), "utf-8"), instead=False)
     except FileExistsError:
-        raise EdgevprError(f"{path} is there already: move it away, or choose another name.") from None
+        raise UsageError(f"{path} is there already: move it away, or choose another name.") from None
 
 
 def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, str]:
@@ -198,23 +149,18 @@ def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, s
     `figures`. Raises MeterError. Returns two things:
     - the path of the profile (None: there is no meter);
     - a sentence for the user."""
-    from edgevpr.power.calibrate import LOADS, calibrate
+    from edgevpr.power.calibrate import calibrate
     from edgevpr.power.sensors import NO_METER, find_meters
 
     meter = next(iter(find_meters()), None)
     if meter is None:
         return None, NO_METER
-    title = meter.title
-    held = iter(range(1, len(LOADS) + 1))
-
-    def progress(share: float) -> None:
-        print(f"measuring power with the {title}  {next(held)}/{len(LOADS)}  load {share:.0%}", file=sys.stderr)
-
-    fit = calibrate(meter, progress=progress)
+    said = f"measuring power with the {meter.title}: load"
+    fit = calibrate(meter, progress=lambda share: print(f"{said} {share:.0%}", file=sys.stderr))
     path = figures.with_name(f"{figures.stem}-{datetime.now():%Y%m%d-%H%M%S}.yaml")
     write_profile(path, fit.applied_to(own_profile(score), meter))
     return path, (
-        f"Power: {fit.idle_w:.3g} W idle, {fit.full_w:.3g} W with every core busy, by the {title} "
+        f"Power: {fit.idle_w:.3g} W idle, {fit.full_w:.3g} W with every core busy, by the {meter.title} "
         f"(residual {fit.residual_w:.2g} W, R2 {fit.r2:.3f}); written to {path}: use it with --board {path}."
     )
 

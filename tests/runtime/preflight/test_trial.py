@@ -7,13 +7,13 @@ import sys
 from dataclasses import asdict
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
 from edgevpr.core import child
+from edgevpr.core.errors import ConfigError
 from edgevpr.runtime.preflight import trial as trying
-from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, offers, trial_of, try_each
+from edgevpr.runtime.preflight.trial import Trial, model_of, offers, trial_of, try_each
 
 
 @pytest.fixture(autouse=True)
@@ -29,16 +29,9 @@ def test_a_technique_is_tried_in_a_process_of_its_own_and_its_memory_is_its_own(
     assert 30 < found.costs.process_mb < 250
     assert found.costs.encode.wall_s > 0
     assert ballast.size
-
-
-@pytest.mark.slow
-def test_it_is_tried_on_pictures_of_a_folder(tmp_path):
-    path = tmp_path / "picture.png"
-    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8))
-    (found,) = try_each(offers(["seqslam"]), 1, [path])
-    assert found.costs.match_per_place.wall_s > 0
-    (broken,) = try_each(offers(["seqslam"]), 1, [tmp_path / "none.png"])
-    assert "none.png" in broken.problem
+    assert trial_of(json.loads(json.dumps(asdict(found)))) == found
+    with pytest.raises(ConfigError):
+        trial_of({"label": "x"})
 
 
 def test_a_network_that_is_not_there_is_one_row_and_needs_no_process(monkeypatch):
@@ -94,20 +87,25 @@ def test_ctrl_c_leaves_no_process_behind(monkeypatch):
         pipe.close()
 
 
-@pytest.mark.slow
-def test_a_trial_goes_through_json_and_back():
-    (found,) = try_each(offers(["seqslam"]), threads=1)
-    assert trial_of(json.loads(json.dumps(asdict(found)))) == found
-    broken = Trial(label="calc", name="calc", settings={"form": "1bit"}, problem="There is no model.")
-    assert trial_of(json.loads(json.dumps(asdict(broken)))) == broken
-    with pytest.raises((TypeError, KeyError)):
-        trial_of({"label": "x"})
-
-
 def test_a_technique_without_a_network_has_no_fingerprint_and_one_with_it_that_of_its_card(monkeypatch):
     assert model_of("hog", {"form": "1bit"}) is None
     monkeypatch.setattr(trying, "load_card", lambda name: SimpleNamespace(fingerprint=f"of {name}"))
     assert model_of("calc", {}) == "of calc"
     assert model_of("calc", {"model": "mine"}) == "of mine"
     assert [offer.name for offer in offers(["hog"])] == ["hog"] * 3
-    assert isinstance(offers(["hog"])[0], Offer)
+
+
+def test_what_is_known_is_not_tried_again_and_what_is_not_is(monkeypatch):
+    def answer(module, job, limit_s, what):
+        asked.append(job["label"])
+        return asdict(Trial(label=job["label"], name=job["name"], settings=job["settings"], problem=None))
+
+    asked = []
+    monkeypatch.setattr(trying, "ask_child", answer)
+    wanted = [*offers(["netvlad"], settings={"netvlad": {"model": "nowhere"}}), *offers(["hog"]), *offers(["cohog"])]
+    known = {"hog 1bit": Trial(label="hog 1bit", name="hog", settings={}, measured=True)}
+    found = list(try_each(wanted, 1, lambda offer: known.get(offer.label)))
+    assert asked == ["hog", "hog 8bit", "cohog"]
+    assert [(trial.label, trial.measured) for trial in found] == [
+        ("netvlad", False), ("hog", False), ("hog 8bit", False), ("hog 1bit", True), ("cohog", False),
+    ], "in the order of preference"  # fmt: skip
