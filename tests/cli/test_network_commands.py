@@ -14,7 +14,6 @@ from edgevpr.core.config import FORMS, load_config
 from edgevpr.core.errors import ConfigError, UsageError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight import stored
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
 from edgevpr.techniques import create, vectors
@@ -152,19 +151,6 @@ def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
     assert "`4bit`" in said
 
 
-def tried_once(try_each):
-    """The same trials for every command: each takes a process."""
-    trials = {}
-
-    def known(wanted, threads):
-        labels = tuple(offer.label for offer in wanted)
-        if labels not in trials:
-            trials[labels] = list(try_each(wanted, threads))
-        return iter(trials[labels])
-
-    return known
-
-
 @pytest.mark.process
 @pytest.mark.slow
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
@@ -172,21 +158,13 @@ def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(mod
     monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)
     for room in ("core.files", "techniques.card"):
         monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
-    monkeypatch.setattr(stored, "try_each", tried_once(stored.try_each))
     assert main(["profile", "--places", "100", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    names = [row["technique"] for row in said["techniques"] if not row["candidates"]]
-    assert names == ["cohog", "seqslam", "tiny", "tiny 8bit", "tiny 1bit"]
-    assert {row["technique"] for row in said["techniques"]} - set(names) == {
-        "cohog, 20 candidates",
-        "cohog, 10 candidates",
-    }
+    labels = [row["option"]["label"] for row in said["techniques"]]
+    fewer = ["cohog, 20 candidates", "cohog, 10 candidates"]
+    assert labels == ["cohog", *fewer, "seqslam", "tiny", "tiny 8bit", "tiny 1bit"]
     assert set(said["unusable"]) == {"calc", "rmac"}
-    assert said["weights"] == ["tiny: A tiny network (MIT; made by a test)"]
-    assert main(["profile", "--places", "100"]) == 0
-    out = capsys.readouterr().out
-    assert "calc, rmac" in out
-    assert "Weights of" in out
+    assert said["notes"][0] == "Weights of tiny: A tiny network (MIT; made by a test)."
 
 
 @pytest.mark.usefixtures("models")

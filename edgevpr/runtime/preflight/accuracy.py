@@ -32,15 +32,15 @@ class Accuracy:
     accepted_elsewhere: int
 
     @property
-    def wrong(self) -> str:
-        """How many accepted places were wrong, and how many more were neighbours of the right one, for people."""
-        beside = self.accepted_wrong - self.accepted_elsewhere
-        return f"{self.accepted_elsewhere}" + (f" (+{beside} beside)" if beside else "")
+    def beside(self) -> str:
+        """Number of accepted places that were wrong but neighbours of the right one, for people; empty for none."""
+        count = self.accepted_wrong - self.accepted_elsewhere
+        return f" (+{count} beside)" if count else ""
 
     def __str__(self) -> str:
         return (
             f"recall@1 {self.recall_at_1:.2f} on {self.sets} image sets, {self.accepted} of {self.asked} accepted, "
-            f"{self.wrong} wrong"
+            f"{self.accepted_elsewhere} wrong{self.beside}"
         )
 
 

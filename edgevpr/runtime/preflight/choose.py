@@ -50,7 +50,7 @@ class Fit:
 
     @property
     def misfit(self) -> str | None:
-        """Why it does not fit and what would make it fit, as words that follow a name; None if it fits."""
+        """Reason why it does not fit, and what would make it fit, as words that follow a name; None if it fits."""
         would = f"; it would fit {' or '.join(self.remedies)}" if self.remedies else ""
         return f"does not fit: {' and '.join(self.shortfalls)}{would}" if self.shortfalls else None
 

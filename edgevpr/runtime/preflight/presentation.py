@@ -20,8 +20,8 @@ _NAME = _NEEDS[:2]
 _FINDS = (
     *_NAME, ("recall@1", "{0.option.accuracy.recall_at_1:.2f}"),
     ("accepted", "{0.option.accuracy.accepted} of {0.option.accuracy.asked}"),
-    ("wrong", "{0.option.accuracy.wrong}"), ("sets", "{0.option.accuracy.sets}"),
-    ("queries", "{0.option.accuracy.queries}"), ("chosen by itself", "{chosen}"),
+    ("wrong", "{0.option.accuracy.accepted_elsewhere}{0.option.accuracy.beside}"),
+    ("sets", "{0.option.accuracy.sets}"), ("queries", "{0.option.accuracy.queries}"), ("chosen by itself", "{chosen}"),
 )  # fmt: skip
 _DRAWS = (
     _NAME[0], ("mAh/query", "{0.query.used_mah:.4f}"), ("marginal", "{0.query.marginal_mah:.4f}"),
