@@ -287,8 +287,9 @@ def write_network(
 ) -> tuple[ModelFile, float]:
     """Write a fitted network, `crops` (N, 1, 48, 64) in 0..1 -> `memorability` (N, 1), and its card; tried on a picture
     of `site`. Returns the file, and the largest difference to PyTorch; raises what `write_model` raises."""
-    file = ModelFile(path=out, title=title, input="crops", rule=INPUT, outputs={"memorability": "memorability"})
-    return file, write_model(file, network, [site.inputs(0).numpy()], source, "run the command again")
+    outputs = {"memorability": "memorability"}
+    file = ModelFile(path=out, title=title, source=source, input="crops", rule=INPUT, outputs=outputs)
+    return file, write_model(file, network, [site.inputs(0).numpy()])
 
 
 def main() -> None:

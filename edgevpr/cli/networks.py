@@ -26,7 +26,6 @@ def _add_train(trainings: Any) -> None:
     calc.add_argument("--out", required=True, metavar="FILE.onnx", help="the model to make; its card lies beside")
     calc.add_argument("--steps", type=int, default=4000, metavar="N", help="batches of 32 pictures (4000)")
     calc.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
-    calc.add_argument("--resume", action="store_true", help="go on with a training that was stopped")
     add_json(calc)
     words = command(trainings, "words", train_words, "learn the words that vlad, regions or bow count")
     _add_images(words)
@@ -68,7 +67,7 @@ def train_calc(args: Namespace) -> int:
     from edgevpr.lab.training import job
 
     unusable: list[ImageError] = []
-    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, args.resume, unusable)
+    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, unusable)
     said = (
         f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
         f"{result.largest_difference:.1e}"
@@ -97,8 +96,8 @@ def train_ground(args: Namespace) -> int:
     unusable: list[ImageError] = []
     result = train_ground(args.images, Path(args.out), args.seed, unusable)
     said = (
-        f"{result.file}: words of {result.regions} regions in {result.pictures} images, mean cosine of a region and "
-        f"its word {result.cosine:.3f}"
+        f"{result.file}: words of {result.descriptors} regions in {result.pictures} images, mean square distance "
+        f"{result.distance:.3f}"
     )
     return _learnt(args, result, said, unusable)
 

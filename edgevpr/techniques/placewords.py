@@ -2,17 +2,16 @@
 
 Of each place, 10x10 regions are named by the most similar of 1024 *words*, which are typical regions of the ground
 (`edgevpr train ground` learns them). A region or word is 20 numbers, its *patterns* (see `slow_patterns`). A place is
-found by the words that it shares with the query, wherever they lie and however the camera has turned. Ground without
-large structures, such as woods and roofs, has few shapes that a coarse picture would keep, and many words.
+found by the words that it shares with the query, wherever they lie and however the camera has turned.
 
 A query is looked up under 24 rotations, 15 degrees apart. Words come in fours, each the one before turned by 90
 degrees, so only six rotations are computed and the others follow. A word that is everywhere says little. It counts once
 in a place and at most four times in a query, or more where the query shows more ground than a place (see `views`).
 
-The scan has two steps. First, all places are scored by how many words they share with the query under each rotation,
-wherever the words are (a bag of words: Sivic and Zisserman 2003). Then, for the best pairs of a place and a rotation,
-the shared words vote for the shift of the picture, as all regions do in the full comparison (see `displacement`). The
-regions of a picture are numbered row by row.
+The scan has two steps. First, all places are scored by how many words they share with the query under each rotation
+(a bag of words: Sivic and Zisserman 2003). Then, for the best pairs of a place and a rotation, the shared words vote
+for the shift of the picture, as all regions do in the full comparison (see `displacement`). The regions of a picture
+are numbered row by row.
 """
 
 from dataclasses import dataclass
@@ -23,8 +22,8 @@ from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Array, Bools, Ints, Singles
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.gradients import slow_patterns
+from edgevpr.techniques.words import read_words
 
 DTYPE = "<u2"  # of a word
 SIDE = 10  # regions along one side
@@ -32,7 +31,6 @@ QUARTERS = 4
 BINS = 8  # orientations of the regions that the words are of
 COUNT = 256  # words in the file; each gives four, by quarter turns
 NONE = COUNT * QUARTERS  # the number of no word
-_MAX_FILE_BYTES = 1_000_000
 _ROUNDED = 0.01  # tolerance of a length of 1
 _AT_MOST = 4  # times that a word of a query counts, for as much ground as a place shows
 _VOTED_EACH = 125  # pairs of a place and a rotation that vote, for each possible rotation
@@ -132,21 +130,13 @@ def nearest(vocabulary: Singles, patterns: Singles) -> Ints:
 @lru_cache(maxsize=1)
 def load(name: str) -> Singles:
     """Load the words of the file NAME.npz in a folder of models, as `edgevpr train ground` writes it: float32 (1024,
-    20), of length 1. Word 4 k + q is word 4 k turned counter-clockwise by q quarter turns.
-
-    Raises ModelError, with the command that makes the file, if it is missing or damaged.
-    """
-    path = find_model(f"{name}.npz")
+    20), of length 1. Word 4 k + q is word 4 k turned counter-clockwise by q quarter turns. Raises ModelError as
+    `read_words` does."""
     command = f"make it with `edgevpr train ground --images DIR --out {name}.npz`"
-    if path is None:
-        raise ModelError(f"There are no words {name}.npz in the folders of models: {command}.")
-    try:
-        words = arrays_of(read_file(path, _MAX_FILE_BYTES), _MAX_FILE_BYTES)["words"].astype(np.float32)
-    except (OSError, ValueError, KeyError, MemoryError) as error:
-        raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
+    _, _, words = read_words(f"{name}.npz", command)
     length = np.linalg.norm(words, axis=-1)
     if words.shape != (COUNT, slow_patterns(BINS).shape[1]) or not (abs(length - 1) < _ROUNDED).all():
-        raise ModelError(f"{path} holds no {COUNT} words of the ground: {command}.")
+        raise ModelError(f"{name}.npz holds no {COUNT} words of the ground: {command}.")
     return turned_words(words)
 
 
@@ -177,23 +167,21 @@ def turned_numbers(side: int) -> Ints:
 
 
 def _turned_block(blocks: Singles) -> Singles:
-    """Turn each of the blocks (..., 4 L) counter-clockwise by a quarter turn. The cells of a block are top left, top
-    right, bottom left, bottom right; orientations are measured from x towards y, which points down."""
+    """Turn each of the blocks (..., 4 L) counter-clockwise by a quarter turn; orientations turn from x to y (down)."""
     cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
     return np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1).reshape(blocks.shape)
 
 
 @lru_cache
 def _quarter_turn() -> Singles:
-    """Return the matrix float32 (20, 20) that turns rows of patterns, multiplied from the right, by 90 degrees."""
+    """Return the matrix float32 (20, 20) that, multiplied from the right, turns rows of patterns by 90 degrees."""
     kept = slow_patterns(BINS)
     turn: Array = kept.T @ _turned_block(np.eye(len(kept), dtype=np.float32)) @ kept
     return turn
 
 
 def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
-    """Count the words that each place of `rows`, uint16 (N, 100), shares with the query under each rotation, from the
-    `counts` of `QueryWords`: uint16 (N, R)."""
+    """Count the words that each place of `rows` (N, 100) shares with the query under each rotation: uint16 (N, R)."""
     turns = counts.shape[1]
     # Four counts are one number of 64 bits: no sum of a hundred of at most four runs over into the next.
     padded = np.zeros((len(counts), turns + -turns % 4), np.uint16)
@@ -210,8 +198,7 @@ def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
 
 
 def _votes(asked: QueryWords, turn: int, rows: Array) -> Singles:
-    """Count the shared words that agree on one shift of the picture under the rotation `turn`, for each place of
-    `rows`, uint16 (P, 100): float32 (P,)."""
+    """Count, for each place of `rows` (P, 100), the shared words that agree on one shift under a rotation."""
     mine = asked.turn == turn
     order = np.argsort(asked.word[mine], kind="stable")
     region = asked.region[mine][order]
@@ -243,18 +230,14 @@ def named(side: int) -> Ints:
 
 @lru_cache
 def _shuffled(side: int) -> Ints:
-    """Return a fixed random rank of each region, int (side * side,). If a word occurs too often in a query, the regions
-    of lowest rank keep it, and so are spread over the picture."""
+    """Return a fixed random rank of each region: those of lowest rank keep a word that occurs too often in a query."""
     return np.random.default_rng(0).permutation(side * side)
 
 
 @lru_cache
 def _bins(side: int, of_place: int) -> tuple[Ints, int]:
-    """Sort the shifts from a region of the query to a region of a place with a word into bins. Returns
-
-    * the bin of each shift, int (100, side * side),
-    * the number of bins along one side.
-    """
+    """Return the bin of the shift from each region of a query to each named region of a place, int (100, side * side),
+    and the number of bins along one side."""
     y, x = np.divmod(named(of_place)[:, None], of_place)
     query_y, query_x = np.divmod(np.arange(side * side), side)
     along = (side + of_place - 2) // _BIN_REGIONS + 1

@@ -5,12 +5,9 @@ of the pairs of regions that are each other's best match.
 
 Cross-Region-BoW (Chen, Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019; see `network`) find
 regions in the same way. In each channel, activations above zero that touch one another, corners included, make a
-region. Its energy is their mean. The regions of the highest energy over all channels are kept.
-
-Both describe a region by the activations of all channels under it, summed or averaged. Here the activations in the box
-around the region are summed, as in the public code of Region-VLAD. The result is scaled to length 1, which makes sum
-and mean equal. Without this scaling a large region outweighs all others, and both techniques find fewer places on
-corridor and aerial_caliterra, the data sets used for tuning. The pixels of a region without its box find fewer, too.
+region. Its energy is their mean. The regions of the highest energy over all channels are kept. Each is described by the
+sum of all channels' activations in the box around it, as in the public code of Region-VLAD, scaled to length 1. Without
+this scaling, or without the box, both techniques find fewer places on the data sets used for tuning.
 """
 
 from collections.abc import Callable
@@ -36,8 +33,7 @@ Describe = Callable[[Singles], tuple[Singles, Singles]]
 class RegionTechnique(VectorTechnique):
     """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` turns a
     feature map float32 (C, H, W) into the vector float32 (D,) and the regions float32 (N, C), each of length 1 (zeros
-    where fewer are found). The fine part is the regions as int8 (N, C). `quality` computes the quality, 0 to 1, from
-    bool (N,), True for each region that was found."""
+    where fewer are found). `quality` computes the quality, 0 to 1, from bool (N,), True for each region found."""
 
     candidates = 40
 
@@ -138,8 +134,7 @@ def find_regions(features: Singles, count: int) -> Ints:
     """Find the `count` regions of the highest energy in a feature map float32 (C, H, W), or all if there are fewer.
 
     Returns boxes int (N, 4) in cells of the feature map, highest energy first: (top, left, bottom, right), bottom and
-    right excluded. Regions of equal energy are ordered by channel, then from the top, then from the left, so that the
-    result does not depend on the order in which OpenCV finds them.
+    right excluded. Regions of equal energy are ordered by channel, from the top, then from the left.
     """
     channels, height, width = features.shape
     # All channels in one tall picture, an empty row between them: one search instead of one per channel.
@@ -174,9 +169,8 @@ def mutual_score(query: Singles, place: Singles) -> float:
     is the other's best match. The score is the sum of the cosines of the mutual pairs (negative ones count 0), divided
     by the larger number of regions. All-zero rows are not regions.
 
-    Both papers sum over mutual pairs. Dividing by the number of regions keeps pictures with few regions from scoring
-    low, and the score in 0..1. Several channels often mark the same box. Only one of such equal regions finds a
-    partner, so a picture may score below 1 against itself.
+    Both papers sum over mutual pairs; the division keeps pictures with few regions from scoring low. Several channels
+    often mark the same box, of which only one finds a partner: a picture may score below 1 against itself.
     """
     regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not regions_of_query or not regions_of_place:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edgevpr.core.arrays import Ints, Singles
+from edgevpr.core.arrays import Array, Ints, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.card import load_card
@@ -50,48 +50,51 @@ class Words:
     whitening: Whitening | None = None
 
 
-def load_words(model: str, kind: str, count: int) -> Words:
-    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-
-    Raises ModelError, with the command that makes the file, if it is missing, damaged or learned on another network.
-    Networks are told apart by `Card.fingerprint`: weights, preparation of the picture, and outputs.
-    """
-    name = f"{model}_{kind}{count}.npz"
-    command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
+def read_words(name: str, command: str) -> tuple[bytes, dict[str, Array], Singles]:
+    """Read the file of words `name` in a folder of models. Returns its content, its arrays and its words, float32.
+    Raises ModelError, which ends with the `command` that makes the file, if it is missing or damaged."""
     path = find_model(name)
     if path is None:
-        raise ModelError(f"There are no words {name} for the model `{model}`: {command}.")
-    wanted = load_card(model).fingerprint
+        raise ModelError(f"There are no words {name} in the folders of models: {command}.")
     try:
         content = read_file(path, _MAX_FILE_BYTES)
         arrays = arrays_of(content, _MAX_FILE_BYTES)
-        learned_on = str(arrays["model_sha256"])
-        words = arrays["words"].astype(np.float32)
+        return content, arrays, arrays["words"].astype(np.float32)
     except (OSError, ValueError, KeyError, MemoryError) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
+
+
+def load_words(model: str, kind: str, count: int) -> Words:
+    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
+
+    Raises ModelError as `read_words` does, and if they were learned on another network. Networks are told apart by
+    `Card.fingerprint`: weights, preparation of the picture, and outputs.
+    """
+    name = f"{model}_{kind}{count}.npz"
+    command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
+    content, arrays, words = read_words(name, command)
+    learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != wanted:
         raise ModelError(
-            f"{path} was learned on another network ({learned_on[:12]}...) than `{model}` is now ({wanted[:12]}...): "
+            f"{name} was learned on another network ({learned_on[:12]}...) than `{model}` is now ({wanted[:12]}...): "
             f"{command}."
         )
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
-        raise ModelError(f"{path} must hold {count} words, and holds an array {words.shape}: {command}.")
+        raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     if "whitening" not in arrays:
         return Words(words, sha256)
     nothing = np.empty(0, np.float32)
     mean, matrix, scale = (arrays.get(key, nothing) for key in ("mean", "whitening", "whitening_scale"))
     if mean.shape != (words.size,) or matrix.shape != (scale.size, words.size):
-        raise ModelError(f"{path} holds a whitening that does not fit its words: {command}.")
+        raise ModelError(f"{name} holds a whitening that does not fit its words: {command}.")
     mean, scale = mean.astype(np.float32), scale.astype(np.float32).ravel()
     return Words(words, sha256, Whitening(mean=mean, matrix=matrix, scale=scale))
 
 
 def local_descriptors(features: Singles) -> Singles:
-    """Return the activations at each position, row by row, as descriptors of length 1: (C, H, W) to float32 (H * W, C).
-
-    NetVLAD takes the same descriptors (Arandjelović et al. 2016, section 3.1).
-    """
+    """Return the activations at each position, row by row, as descriptors of length 1 (Arandjelović et al. 2016,
+    section 3.1): (C, H, W) to float32 (H * W, C)."""
     return unit(features.reshape(len(features), -1).T)
 
 
@@ -122,11 +125,7 @@ def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
 
 def sharpness_of(words: Singles) -> float:
     """Compute a sharpness for `soft_weights`: a descriptor equal to a word then gives it, on average, 100 times the
-    weight of the next word.
-
-    NetVLAD asks for that ratio over the training descriptors (section 5, "Training"). Only the words are kept here, so
-    the ratio is taken over the words.
-    """
+    weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors, not of the words."""
     squares = np.einsum("kd,kd->k", words, words)
     apart = squares[:, None] + squares - 2 * words @ words.T
     np.fill_diagonal(apart, np.inf)
@@ -137,9 +136,8 @@ def bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
     L2-normalised: float32 (K,).
 
-    A word counts once, however often it occurs. Many channels mark the same part of a picture, so counts say little; on
-    corridor and aerial_caliterra, the data sets used for tuning, they find fewer places. The inverse document frequency
-    is left out too, since it would weigh words by a map that is still being made.
+    A word counts once, however often it occurs: many channels mark the same part of a picture, and counts find fewer
+    places. No inverse document frequency: it would weigh words by a map that is still being made.
     """
     present = np.zeros(len(words), np.float32)
     present[nearest(local, words)] = 1

@@ -23,11 +23,13 @@ _OPSET, _IR_VERSION = 18, 8  # that every onnxruntime since 1.17 reads
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelFile:
-    """An ONNX file to be made, and its card. `input` is the name of the network's input and `rule` the preparation of a
-    picture. `outputs` are the names of the network's outputs by the key of the card, such as "descriptor"."""
+    """An ONNX file to be made, and its card, which has `title` and `source`. `input` is the name of the network's input
+    and `rule` the preparation of a picture. `outputs` are the names of the network's outputs by the key of the card,
+    such as "descriptor"."""
 
     path: Path
     title: str
+    source: str
     input: str
     rule: InputRule
     outputs: dict[str, str]
@@ -37,31 +39,27 @@ class ModelFile:
         return self.path.with_suffix(".yaml")
 
 
-def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles], source: str, then: str) -> float:
+def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles]) -> float:
     """Write a network and its card. Each of `samples` is an input to compare with, float32 (N, ...). If N > 1 in the
-    first, the file takes any number of pictures. `source` is written into the card.
+    first, the file takes any number of pictures.
 
     Returns the largest difference between the outputs of the file and of PyTorch, as a share of the largest value (of
-    1, if that is larger). If it is more than 1e-4, writes no file and raises EdgevprError, which ends with the advice
-    `then`.
+    1, if that is larger). If it is more than 1e-4, deletes the file and raises EdgevprError.
     """
     _write_onnx(file, network, samples[0])
-    try:
-        largest = _largest_difference(file, network, samples)
-        if not largest <= LARGEST_DIFFERENCE:
-            raise EdgevprError(
-                f"{file.path} gives other values than PyTorch (they differ by {largest:.2g}): install another version "
-                f"of onnx or torch and {then}."
-            )
-    except EdgevprError:
+    largest = _largest_difference(file, network, samples)
+    if not largest <= LARGEST_DIFFERENCE:
         file.path.unlink()  # a wrong file must not be taken for a model, nor be in the way of another try
-        raise
+        raise EdgevprError(
+            f"{file.path} gives other values than PyTorch (they differ by {largest:.2g}): install another version of "
+            "onnx or torch and run the command again."
+        )
     values = {
         "title": file.title,
         "file": file.path.name,
         "sha256": file_sha256(file.path),
         "licence": "MIT",
-        "source": source,
+        "source": file.source,
         "input": {key: value for key, value in asdict(file.rule).items() if value is not None},
         "outputs": file.outputs,
     }
@@ -83,8 +81,7 @@ def _write_onnx(file: ModelFile, network: torch.nn.Module, sample: Singles) -> N
             dynamic_shapes=({0: torch.export.Dim("n")},) if len(sample) > 1 else None,
             opset_version=_OPSET,
         )
-    if program is None:
-        raise EdgevprError(f"PyTorch made no ONNX of {file.path}: install another version of torch.")
+    assert program is not None  # with dynamo
     model = program.model_proto
     model.ir_version, model.producer_name = _IR_VERSION, "edgevpr"
     onnx.checker.check_model(model, full_check=True)
@@ -93,11 +90,11 @@ def _write_onnx(file: ModelFile, network: torch.nn.Module, sample: Singles) -> N
 
 def _largest_difference(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles]) -> float:
     session = onnxruntime.InferenceSession(str(file.path), providers=["CPUExecutionProvider"])
-    largest = 0.0
+    differences = []
     for sample in samples:
         with torch.no_grad():
             result = network(torch.from_numpy(sample))
-        expected = [value.numpy() for value in (result if isinstance(result, tuple) else (result,))]
-        for found, wanted in zip(session.run(list(file.outputs.values()), {file.input: sample}), expected, strict=True):
-            largest = max(largest, float(np.abs(found - wanted).max() / max(1.0, np.abs(wanted).max())))
-    return largest
+        wanted = [value.numpy() for value in (result if isinstance(result, tuple) else (result,))]
+        found = session.run(list(file.outputs.values()), {file.input: sample})
+        differences += [np.abs(a - b).max() / max(1, np.abs(b).max()) for a, b in zip(found, wanted, strict=True)]
+    return float(np.max(differences))

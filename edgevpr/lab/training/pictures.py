@@ -1,13 +1,9 @@
 """Training pairs of CALC: a changed view of a picture as input, the gradients of the unchanged view as target. Also the
 reading of pictures, for all kinds of training.
 
-The pairs follow Merrill and Huang 2018, section III. In the paper the corners of a view are moved at random. Here more
-is random, because a flight has thousands of pictures and not millions. The view itself is a random part of the picture,
-mirrored half of the time. Corners move outwards as well as inwards, so that the changed view is not always zoomed. The
-light is uneven, which histogram equalisation (part of the network's input here as in flight) cannot undo.
+The pairs follow Merrill and Huang 2018, section III; models/README.md says what differs, and why.
 """
 
-import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,18 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Image, Singles
-from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.files import require_folder
+from edgevpr.core.errors import ImageError
 from edgevpr.core.text import progress, shown
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 HEIGHT, WIDTH = 120, 160  # of the network's input
-MIN_PICTURES = 16
 _CELL_PX = 8
 _ORIENTATIONS = 9
-# 14 x 19 blocks of 2x2 cells. The paper's 3648 values are OpenCV's HOG of 2 orientations in windows of two blocks that
-# overlap, so that most blocks are in it twice. Here each block is in once, with the 9 orientations of Dalal and Triggs.
+# 14 x 19 blocks of 2x2 cells.
 TARGET_LENGTH = (HEIGHT // _CELL_PX - 1) * (WIDTH // _CELL_PX - 1) * 4 * _ORIENTATIONS
 _LONGEST_READ_PX = 640  # larger pictures only fill memory: no network here uses more
 _LONGEST_LEARNT_PX = 320  # twice the network's input: enough for a part of a picture
@@ -67,36 +60,6 @@ def _at_most(image: Array, longest_px: int) -> Image:
     return small
 
 
-def require_enough(pictures: Sequence[Image]) -> None:
-    """Raise UsageError for fewer than 16 pictures, too few to learn from."""
-    if len(pictures) < MIN_PICTURES:
-        raise UsageError(
-            f"{len(pictures)} usable images are too few to learn from: give folders with {MIN_PICTURES} at the very "
-            "least, better thousands, of the kind of ground that will be flown over."
-        )
-
-
-def require_new(out: Path) -> None:
-    """Raise UsageError unless `out` ends in .onnx and neither it nor a card beside it exists yet."""
-    if out.suffix != ".onnx":
-        raise UsageError(f"--out {out}: give a name that ends in .onnx.")
-    for path in (out, out.with_suffix(".yaml")):
-        if path.exists():
-            raise UsageError(f"{path} is there already: give another --out, or delete it.")
-    require_folder(out)
-
-
-def require_packages() -> None:
-    """Raise EdgevprError if the packages of the extra `train` cannot be imported."""
-    for package in ("torch", "onnx", "onnxscript"):
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise EdgevprError(
-                f"Training needs {package}, which cannot be imported ({error}): pip install 'edgevpr[train]'."
-            ) from error
-
-
 def batch(pictures: Sequence[Image], size: int, rng: np.random.Generator) -> tuple[Singles, Singles]:
     """Make a random batch: inputs float32 (size, 1, 120, 160) in 0..1, and targets float32 (size, TARGET_LENGTH)."""
     inputs = np.empty((size, 1, HEIGHT, WIDTH), np.float32)
@@ -116,11 +79,8 @@ def gradients_of(sight: Image) -> Singles:
 
 
 def two_sights(picture: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """Return two views of a grey picture, uint8 (120, 160) each. Returns
-
-    * a random part of it,
-    * about the same ground, seen from elsewhere in other light.
-    """
+    """Return two views of a grey picture, uint8 (120, 160) each: a random part of it, and about the same ground, seen
+    from elsewhere in other light."""
     height, width = picture.shape
     largest = min(width / WIDTH, height / HEIGHT)
     scale = largest * rng.uniform(_SMALLEST_PART, 1)
@@ -143,8 +103,7 @@ def _seen(picture: Image, corners: Doubles) -> Image:
 
 
 def _relit(sight: Image, rng: np.random.Generator) -> Image:
-    """Change the light of a view: its gamma, its brightness (mostly darker), light that varies over the view like
-    shadows of clouds, and noise of the sensor."""
+    """Change gamma, brightness (mostly darker) and light (uneven, as under clouds), and add noise of the sensor."""
     light: Array = rng.normal(0, _LIGHT_VARIES * rng.random(), (3, 4)).astype(np.float32)
     light = np.exp(cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
     changed = (sight / np.float32(255)) ** np.float32(rng.uniform(0.6, 1.6))

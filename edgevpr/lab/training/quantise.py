@@ -5,7 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from edgevpr.core.errors import ModelError, SourceError
+from edgevpr.core.errors import ModelError
 from edgevpr.core.files import own_models
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.frames.images import list_images, read_image
@@ -37,10 +37,7 @@ def quantise(name: str, calibration: Path, threads: int = 1) -> Quantised:
     before = verify(card, threads)
     backbone = backbone_of(card, "descriptor" if card.outputs.descriptor else "features", threads)
     paths = list_images(calibration)
-    if not paths:
-        raise SourceError(f"{calibration} holds no images: name a folder of pictures like those of the flight.")
-    step = -(-len(paths) // _MOST_IMAGES)
-    chosen = paths[::step]
+    chosen = paths[:: -(-len(paths) // _MOST_IMAGES)]
     picture = backbone.session.get_inputs()[0].name
     values = read_yaml(card.path)
     values["title"], values["file"] = f"{card.title}; INT8 by edgevpr models quantise", f"{name}_int8.onnx"

@@ -1,13 +1,11 @@
 """`edgevpr train words` and `train ground`: visual words, learned by k-means from one's own pictures.
 
-The words of VLAD and bag-of-words are typical activations of a network, or regions of it. `techniques.words.load_words`
-reads their file. It holds `words` float16 (K, D), rounded to steps of 1/256 so that ten thousand of them take little
-room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If asked for, it also holds the
-whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
+The file that `techniques.words.load_words` reads holds `words` float16 (K, D), rounded to steps of 1/256 so that ten
+thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If
+asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
 
-The words of the ground are those by which `cohog` names places with a nadir camera (see `techniques.placewords`). The
-regions of the pictures, under several headings, are turned by quarter turns until their main directions agree. So a
-word stands for four: itself, and itself turned.
+For words of the ground (see `techniques.placewords`) the regions of the pictures, under several headings, are turned by
+quarter turns until their main directions agree. So a word stands for four: itself, and itself turned.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -56,24 +54,14 @@ class WordsWanted:
 
 @dataclass(frozen=True, slots=True)
 class WordsResult:
-    """Result of a training of words: the file, the numbers of pictures and local descriptors it was learned from, and
-    the mean square distance of a descriptor to its nearest word (2: nothing in common)."""
+    """Result of a training of words: the file, the numbers of pictures and of descriptors (of regions, for words of the
+    ground) it was learned from, and the mean square distance of a descriptor to its nearest word (2: nothing in
+    common)."""
 
     file: str
     pictures: int
     descriptors: int
     distance: float
-
-
-@dataclass(frozen=True, slots=True)
-class GroundResult:
-    """Result of a training of words of the ground: the file, the numbers of pictures and regions it was learned from,
-    and the mean cosine of a region and its most similar word."""
-
-    file: str
-    pictures: int
-    regions: int
-    cosine: float
 
 
 def train_words(
@@ -95,12 +83,16 @@ def train_words(
     if path.exists():
         raise UsageError(f"{path} is there already: delete it, or give another --out.")
     backbone = open_backbone(wanted.model, "features")
+
+    def described(picture: Image) -> Iterator[Singles]:
+        features = backbone.run(picture)
+        if wanted.kind == "vlad":
+            yield local_descriptors(features)
+        else:
+            yield describe(features, find_regions(features, REGIONS[wanted.kind]))
+
     rng = np.random.default_rng(seed)
-    per_picture = _share(max(_POINTS, _POINTS_PER_WORD * count), folders)
-    local = _locals(backbone, wanted.kind)
-    points_of = [_some(local(picture), per_picture, rng) for picture in read_pictures(folders, "describing", unusable)]
-    pictures = len(points_of)
-    points = np.concatenate(points_of or [np.empty((0, backbone.shape[0]), np.float32)])
+    points, pictures = _gathered(folders, described, max(_POINTS, _POINTS_PER_WORD * count), rng, unusable)
     if whiten is not None and whiten >= pictures:
         raise UsageError(
             f"--whiten {whiten} needs more than {whiten} usable images, and there are {pictures}: give more, or a "
@@ -117,13 +109,10 @@ def train_words(
     arrays = {"words": stored, "model_sha256": np.array(backbone.sha256)}
     if whiten is not None:
         arrays |= _whitening(backbone, folders, pictures, words, whiten)
-    _write(path, arrays)
-    some = points[:: max(1, len(points) // _JUDGED)]
-    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
-    return WordsResult(str(path), pictures, len(points), float(distance))
+    return _written(path, arrays, points, words, pictures)
 
 
-def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[ImageError]) -> GroundResult:
+def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[ImageError]) -> WordsResult:
     """Learn 256 words of the ground and write them to `out` (.npz). Each stands for four, itself and its quarter turns.
 
     Raises UsageError for a file that exists already or too few regions, SourceError for a folder without images.
@@ -131,23 +120,48 @@ def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[Im
     if out.suffix != ".npz" or out.exists():
         raise UsageError(f"--out {out}: give a name that ends in .npz, of a file that is not there.")
     require_folder(out)
-    rng = np.random.default_rng(seed)
     technique = CoHog(camera="nadir")
-    per_view = _share(_GROUND_POINTS / len(_HEADINGS), folders)
-    pictures, regions = 0, []
-    for pictures, picture in enumerate(read_pictures(folders, "describing", unusable), start=1):  # noqa: B007
+
+    def described(picture: Image) -> Iterator[Singles]:
         query = technique.encode(picture)
-        regions += [_some(technique.good_patterns(query, turn)[0], per_view, rng) for turn in _HEADINGS]
-    points = np.concatenate(regions) if regions else np.empty((0, 1), np.float32)
+        for turn in _HEADINGS:
+            yield technique.good_patterns(query, turn)[0]
+
+    rng = np.random.default_rng(seed)
+    points, pictures = _gathered(folders, described, _GROUND_POINTS / len(_HEADINGS), rng, unusable)
     if len(points) < 2 * placewords.COUNT:
         raise UsageError(f"{pictures} usable images give {len(points)} regions, too few to learn from: give more.")
     learning = kmeans(aligned(points), placewords.COUNT, _GROUND_ROUNDS, rng)
     *_, centres = progress(learning, _GROUND_ROUNDS, "learning")
     words = (centres / np.linalg.norm(centres, axis=1, keepdims=True)).astype(np.float16)
-    _write(out, {"words": words})
+    turned = placewords.turned_words(words.astype(np.float32))
+    return _written(out, {"words": words}, points, turned, pictures)
+
+
+def _gathered(
+    folders: Sequence[str],
+    described: Callable[[Image], Iterator[Singles]],
+    wanted: float,
+    rng: np.random.Generator,
+    unusable: list[ImageError],
+) -> tuple[Singles, int]:
+    """Collect about `wanted` of the rows that `described` yields, and count the pictures."""
+    share = int(-(-wanted // sum(len(list_images(name)) for name in folders)))
+    pictures, points = 0, [np.empty((0, 1), np.float32)]
+    for pictures, picture in enumerate(read_pictures(folders, "describing", unusable), start=1):  # noqa: B007
+        points += [found[rng.permutation(len(found))[:share]] for found in described(picture)]
+    return np.concatenate(points[1:] or points), pictures
+
+
+def _written(path: Path, arrays: dict[str, Array], points: Singles, words: Singles, pictures: int) -> WordsResult:
+    def write(unfinished: Path) -> None:
+        with open(unfinished, "wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's third parameter is a bool
+
+    write_whole(path, write)
     some = points[:: max(1, len(points) // _JUDGED)]
-    cosine = (some @ placewords.turned_words(words.astype(np.float32)).T).max(axis=1).mean()
-    return GroundResult(str(out), pictures, len(points), float(cosine))
+    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
+    return WordsResult(str(path), pictures, len(points), float(distance))
 
 
 def aligned(patterns: Singles) -> Singles:
@@ -180,11 +194,7 @@ def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -
 
 
 def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
-    """Find, for each point,
-
-    * the number of its nearest centre, int (N,),
-    * the square of the distance from it, float32 (N,).
-    """
+    """Find, for each point, the number of its nearest centre, int (N,), and the square of its distance, float32."""
     numbers = np.empty(len(points), np.intp)
     distance = np.empty(len(points), np.float32)
     half_squares = 0.5 * np.einsum("kd,kd->k", centres, centres)
@@ -200,42 +210,10 @@ def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
     return numbers, distance
 
 
-def _share(points: float, folders: Sequence[str]) -> int:
-    """Return the number of points to take from each picture of `folders` to have `points` in total, rounded up."""
-    return int(-(-points // sum(len(list_images(name)) for name in folders)))
-
-
-def _some(points: Singles, count: int, rng: np.random.Generator) -> Singles:
-    return points[rng.permutation(len(points))[:count]]
-
-
-def _locals(backbone: Backbone, kind: str) -> Callable[[Image], Singles]:
-    """Make the function from a picture to its local descriptors, float32 (N, C), each of length 1: for the kind "vlad"
-    one per position, else one per region."""
-    if kind == "vlad":
-        return lambda picture: local_descriptors(backbone.run(picture))
-
-    def regions(picture: Image) -> Singles:
-        features = backbone.run(picture)
-        return describe(features, find_regions(features, REGIONS[kind]))
-
-    return regions
-
-
-def _write(path: Path, arrays: dict[str, Array]) -> None:
-    def write(unfinished: Path) -> None:
-        with open(unfinished, "wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's third parameter is a bool
-
-    write_whole(path, write)
-
-
 def _whitening(
     backbone: Backbone, folders: Sequence[str], pictures: int, words: Singles, length: int
 ) -> dict[str, Array]:
-    """Learn the whitening of `length` values: the principal components of the pictures' VLAD vectors, each over the
-    root of its variance. Returns the arrays `mean` float32 (K D,), `whitening` int8 (length, K D) and `whitening_scale`
-    float32 (length,)."""
+    """Learn a whitening: the principal components of the pictures' VLAD vectors, each over the root of its variance."""
     sharpness = sharpness_of(words)
     vectors = np.empty((pictures, words.size), np.float32)
     for row, picture in enumerate(read_pictures(folders, "whitening")):

@@ -1,7 +1,6 @@
 """The training itself: needs PyTorch and onnx, which are not among the development tools because of their size."""
 
 import json
-import os
 from importlib import import_module
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from pictures_on_disk import write_pictures
 
 from edgevpr.cli.main import main
-from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.training import job
 from edgevpr.lab.training.pictures import read_pictures, small_grey
 from edgevpr.techniques.card import read_card
@@ -57,48 +56,11 @@ def pictures(folder):
     return [small_grey(picture) for picture in read_pictures([folder], "reading")]
 
 
-def finished(training, checkpoint):
-    for _ in training.run(checkpoint):
-        pass
-    return training
-
-
-def weights(training):
-    return {name: value.numpy() for name, value in training.encoder().state_dict().items()}
-
-
-def test_a_stopped_training_ends_as_one_that_was_not(calc, pictures, tmp_path, monkeypatch):
-    whole = finished(calc.Training(pictures, 6, seed=1), tmp_path / "whole")
-    monkeypatch.setattr(calc, "_STEPS_BETWEEN_CHECKPOINTS", 3)
-    stopped = calc.Training(pictures, 6, seed=1)
-    for step in stopped.run(tmp_path / "c"):
-        if step == 4:  # one step after the checkpoint: it is lost, and done again
-            break
-    resumed = calc.Training(pictures, 6, seed=1)
-    resumed.load(tmp_path / "c")
-    assert resumed.step == 3
-    finished(resumed, tmp_path / "c")
-    np.testing.assert_allclose(resumed.losses, whole.losses[3:], rtol=1e-4)
-    for name, value in weights(whole).items():
-        np.testing.assert_allclose(weights(resumed)[name], value, atol=1e-4)
-
-
-def test_a_checkpoint_of_other_settings_is_refused(calc, pictures, tmp_path):
-    training = calc.Training(pictures, 4, seed=1)
-    training.save(tmp_path / "c")
-    for other in (calc.Training(pictures, 5, 1), calc.Training(pictures, 4, 2), calc.Training(pictures[1:], 4, 1)):
-        with pytest.raises(UsageError, match="--steps"):
-            other.load(tmp_path / "c")
-
-
-def test_a_damaged_or_missing_checkpoint_is_refused(calc, pictures, tmp_path):
-    training = calc.Training(pictures, 4, seed=1)
-    training.save(tmp_path / "c")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes()[:1000])
-    with pytest.raises(UsageError, match="checkpoint"):
-        training.load(tmp_path / "c")
-    with pytest.raises(UsageError, match="none"):
-        training.load(tmp_path / "none")
+def test_the_same_seed_gives_the_same_network(calc, pictures):
+    (first, losses), (again, others) = (calc.fitted(pictures, 6, seed=1) for _ in range(2))
+    np.testing.assert_allclose(losses, others, rtol=1e-4)
+    for one, other in zip(first.parameters(), again.parameters(), strict=True):
+        np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4)
 
 
 def test_folding_changes_nothing(torch, calc):
@@ -127,9 +89,11 @@ def test_the_file_equals_pytorch_and_a_difference_is_found(torch, calc, onnxfile
     torch.manual_seed(0)
     encoder = calc.Encoder().eval().requires_grad_(False)
     outputs = {"descriptor": "descriptor", "features": "features"}
-    file = onnxfile.ModelFile(path=tmp_path / "m.onnx", title="", input="image", rule=job._INPUT, outputs=outputs)
+    file = onnxfile.ModelFile(
+        path=tmp_path / "m.onnx", title="", source="", input="image", rule=job._INPUT, outputs=outputs
+    )
     inputs = list(np.random.default_rng(0).random((3, 1, 1, 120, 160), np.float32))
-    assert onnxfile.write_model(file, encoder, inputs, "", "") <= 1e-4
+    assert onnxfile.write_model(file, encoder, inputs) <= 1e-4
     assert read_card(file.card).outputs.features == "features"
     write = onnxfile._write_onnx
 
@@ -139,16 +103,13 @@ def test_the_file_equals_pytorch_and_a_difference_is_found(torch, calc, onnxfile
 
     monkeypatch.setattr(onnxfile, "_write_onnx", write_another)
     with pytest.raises(EdgevprError, match="PyTorch"):
-        onnxfile.write_model(file, encoder, inputs, "", "")
+        onnxfile.write_model(file, encoder, inputs)
     assert not file.path.exists()
 
 
-def train(folder, out, *more):
-    return main(["train", "calc", "--images", str(folder), "--out", str(out), "--steps", "3", "--json", *more])
-
-
 def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, monkeypatch):
-    assert train(folder, tmp_path / "mine.onnx") == 0
+    out = tmp_path / "mine.onnx"
+    assert main(["train", "calc", "--images", str(folder), "--out", str(out), "--steps", "3", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["pictures"] == 20
     assert said["largest_difference"] <= 1e-4
@@ -161,44 +122,3 @@ def test_the_command_makes_a_model_that_edgevpr_opens(folder, tmp_path, capsys, 
 
     assert open_backbone("mine", "descriptor").shape == (1064,)
     assert open_backbone("mine", "features").shape == (128, 16, 21)
-
-
-def test_a_file_that_differs_is_not_left_and_another_try_goes_on(onnxfile, folder, tmp_path, capsys, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setattr(onnxfile, "LARGEST_DIFFERENCE", -1.0)
-        assert train(folder, tmp_path / "mine.onnx") == 1
-    assert "--resume" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.checkpoint"]
-    assert train(folder, tmp_path / "mine.onnx", "--resume") == 0
-
-
-def test_interrupted_the_command_keeps_what_was_done(calc, onnx, folder, tmp_path, capsys, monkeypatch):
-    one_step = calc.Training._one_step
-
-    def interrupted(training):
-        if training.step == 2:
-            raise KeyboardInterrupt
-        one_step(training)
-
-    out = tmp_path / "m.onnx"
-    monkeypatch.setattr(calc.Training, "_one_step", interrupted)
-    assert train(folder, out) == 130
-    assert not out.exists()
-    monkeypatch.setattr(calc.Training, "_one_step", one_step)
-    assert train(folder, out) == 2
-    assert "add --resume" in capsys.readouterr().err
-    assert train(folder, out, "--resume") == 0
-    assert train(folder, tmp_path / "whole.onnx") == 0
-    resumed, whole = (onnx.load(path).graph.initializer for path in (out, tmp_path / "whole.onnx"))
-    for got, wanted in zip(resumed, whole, strict=True):
-        np.testing.assert_allclose(onnx.numpy_helper.to_array(got), onnx.numpy_helper.to_array(wanted), atol=1e-4)
-    assert not (tmp_path / "m.checkpoint").exists()
-
-
-def test_a_full_disk_is_one_sentence(folder, tmp_path, capsys):
-    out = tmp_path / "m.onnx"
-    (tmp_path / f".m.checkpoint.{os.getpid()}").symlink_to("/dev/full")
-    assert train(folder, out) == 1
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "No space left on device" in said
-    assert not out.exists()
