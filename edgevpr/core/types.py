@@ -207,14 +207,14 @@ class QueryCost:
     `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not be drawn without the query.
     """
 
-    t_encode_s: float
-    t_match_s: float
-    u_encode: float
-    u_match: float
-    cpu_s: float
-    rss_mb: float
-    used_mah: float
-    marginal_mah: float
+    t_encode_s: float = 0.0
+    t_match_s: float = 0.0
+    u_encode: float = 0.0
+    u_match: float = 0.0
+    cpu_s: float = 0.0
+    rss_mb: float = 0.0
+    used_mah: float = 0.0
+    marginal_mah: float = 0.0
     pss_mb: float | None = None
 
     @property

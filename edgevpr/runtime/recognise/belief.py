@@ -19,19 +19,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.runtime.recognise.hypotheses import (
-    Hypotheses,
-    MapScale,
-    Proposals,
-    Way,
-    apart,
-    density,
-    fused,
-    joined,
-    mean_of,
-    no_hypotheses,
-    usable,
-)  # fmt: skip
+from edgevpr.runtime.recognise import hypotheses
+from edgevpr.runtime.recognise.hypotheses import Hypotheses, MapScale, Proposals, Way, apart, mean_of
 
 MOST = 64  # hypotheses kept
 PRIOR_LOST = 0.5  # the prior with which the probabilities of a query are made
@@ -66,7 +55,7 @@ class Moved:
     covariance: Doubles = field(default_factory=lambda: np.zeros((2, 2)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PlaneEstimate:
     """Position `at` (2,) in the plane of the map, its `covariance` (2, 2), and the heading (degrees, None: unknown)."""
 
@@ -75,7 +64,7 @@ class PlaneEstimate:
     heading_deg: float | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
     and the `estimate` of the position (None: no hypothesis). `mass` is the probability of all hypotheses near it."""
@@ -89,12 +78,10 @@ class Posterior:
 def moved(
     elapsed_s: float | None, usual_s: float, speed_max: float, velocity: tuple[float, float] | None = None
 ) -> Moved:
-    """Return the motion in `elapsed_s` seconds (None: unknown; then `usual_s` is taken).
-
-    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown). If `elapsed_s` is not above 0, because the clock stood still or was set back, the time counts as unknown.
-    If the time is unknown, or the velocity is too high to be true, odometry is not used.
-    """
+    """Return the motion in `elapsed_s` seconds; `usual_s` is taken if they are unknown (None) or not above 0, because
+    the clock stood still or was set back. `speed_max` is the highest speed, in units of the map a second, and
+    `velocity` (east, north) that of odometry (None: unknown), which is not used without a time or if it is too high to
+    be true."""
     if elapsed_s is None or not elapsed_s > 0:
         return Moved(reach=speed_max * usual_s, elapsed_s=usual_s)
     elapsed_s = min(elapsed_s, _LONGEST_S)
@@ -111,7 +98,7 @@ class Belief:
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
         self._lost, self._enters = 1.0, 1 - PRIOR_LOST
-        self._now, self._strongest = no_hypotheses(), 0.0
+        self._now, self._strongest = hypotheses.NOWHERE, 0.0
 
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little), the motion
@@ -130,13 +117,13 @@ class Belief:
             after = _unseen(now, ways, 1.0)
         else:
             self._enters = _ENTERS
-            numbers, proposed = usable(proposed, self._scale, MOST)
+            numbers, proposed = hypotheses.usable(proposed, self._scale, MOST)
             there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
             unseen = _unseen(now, ways, _MISSED)
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
-            after = joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
+            after = hypotheses.joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
         share = after.w / (lost + float(after.w.sum()))
         p[numbers] = share[: len(numbers)]
         strongest = np.argsort(-share, kind="stable")[:MOST]
@@ -205,7 +192,7 @@ class Belief:
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
         fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
-        led = [way.share[:, None] * evidence * density(way, at, of_step, scale.is_ordinal) for way in ways]
+        led = [way.share[:, None] * evidence * hypotheses.density(way, at, of_step, scale.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
@@ -220,18 +207,18 @@ class Belief:
             np.concatenate([way.at for way in ways]),
             np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = fused(at, of_step, at_before, of_before)
+        at_both, of_both = hypotheses.fused(at, of_step, at_before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
-        is_led = (weight > born)[:, None]
+        is_led, heading = (weight > born)[:, None], np.radians(proposed.heading_deg)
         there = Hypotheses(
             w=math.exp(-staleness * same) * (weight + born),
             at=np.where(is_led, at_both, at),
             covariance=np.where(is_led[..., None], of_both, of_step),
             velocity=np.where(is_led, velocity, np.nan),
-            heading=_vector(proposed.heading_deg),
+            heading=np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)),
             credited=np.maximum(ratio, 0),
             anchor=np.where(is_led, anchor, at),
         )
@@ -241,17 +228,15 @@ class Belief:
         """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
         now = self._now
         if not len(now.w):
-            return Posterior(lost=self._lost, p=p, mass=0.0, estimate=None)
+            return Posterior(self._lost, p, 0.0, None)
         is_near = apart(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
         (at,), (covariance,) = mean_of(share[None], now.at[there], now.covariance[there])
         north, east = (share @ now.heading[there]).tolist()
-        is_known = math.hypot(north, east) > 0.5
-        heading_deg = math.degrees(math.atan2(east, north)) % 360 if is_known else None
-        estimate = PlaneEstimate(at=at, covariance=covariance, heading_deg=heading_deg)
-        return Posterior(lost=self._lost, p=p, mass=mass, estimate=estimate)
+        heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
+        return Posterior(self._lost, p, mass, PlaneEstimate(at, covariance, heading_deg))
 
 
 def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
@@ -263,9 +248,3 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
     off = at - mean[:, None]
     spread = (share[..., None] * (covariance + off[..., :, None] * off[..., None, :])).sum(1)
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
-
-
-def _vector(heading_deg: Doubles) -> Doubles:
-    """Return headings (K,) in degrees as unit vectors (K, 2), north and east; zeros where the heading is NaN."""
-    heading = np.radians(heading_deg)
-    return np.asarray(np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)))

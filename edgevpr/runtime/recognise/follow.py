@@ -5,12 +5,11 @@ query shows ground of the map at all is spread over the other places compared. T
 """
 
 import copy
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Covariance, Doubles, Ints
+from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.core.geodesy import moved as moved_by
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
@@ -35,32 +34,18 @@ _FASTEST_M_S = 30.0  # unless the configuration says another speed
 _LEAST_SPACING_M = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class FollowedPosition:
-    """Position of the aircraft by the flight so far, with `covariance_m2` (variance east, covariance, variance north)
-    in square metres, and the heading of the top of its pictures, degrees (None: unknown)."""
-
-    position: Position
-    covariance_m2: Covariance
-    heading_deg: float | None
-
-    @property
-    def sd_m(self) -> float:
-        """Standard deviation along one axis, metres."""
-        return math.sqrt((self.covariance_m2[0] + self.covariance_m2[2]) / 2)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Followed:
     """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
     (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
-    at no position of the belief, `mass` that of the `estimate` (None: unknown, or the map has no positions)."""
+    at no position of the belief, `mass` that of the `estimate` of its position (None: unknown, or the map has no
+    positions)."""
 
     slot: int | None
     confidence: float
     lost: float
     mass: float
-    estimate: FollowedPosition | None
+    estimate: Located | None
 
     def leads_from(self, slot: int) -> bool:
         """Return True if a place other than `slot` is more likely than not."""
@@ -152,13 +137,8 @@ class Follower:
             if confidence > _HALF and off <= near:
                 confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this look
             confidence = self._not_by_repetition(at, confidence, float(proposed.p[is_near].sum()))
-        return Followed(
-            slot=slot,
-            confidence=confidence,
-            lost=posterior.lost,
-            mass=posterior.mass,
-            estimate=_on_earth(posterior.estimate, survey.origin),
-        )
+        estimate = _on_earth(posterior.estimate, survey.origin)
+        return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)
 
     def saw_nothing(self, index: PlaceIndex) -> None:
         """Note a picture that shows too little: it does not tell whether the aircraft is over the map."""
@@ -188,12 +168,12 @@ class Follower:
         return min(confidence, max(arrived[1], by_itself))
 
 
-def _on_earth(estimate: PlaneEstimate | None, origin: Position | None) -> FollowedPosition | None:
+def _on_earth(estimate: PlaneEstimate | None, origin: Position | None) -> Located | None:
     if estimate is None or origin is None:
         return None
     lat_deg, lon_deg = moved_by(origin.lat_deg, origin.lon_deg, *estimate.at.tolist())
     (var_east, cov), (_, var_north) = estimate.covariance.tolist()
-    return FollowedPosition(Position(lat_deg, lon_deg), (var_east, cov, var_north), estimate.heading_deg)
+    return Located(Position(lat_deg, lon_deg), (var_east, cov, var_north), estimate.heading_deg)
 
 
 def _proposals(

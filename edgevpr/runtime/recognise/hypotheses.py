@@ -17,7 +17,7 @@ _LEAST_SD = 0.25  # least standard deviation of a position, in spacings of the m
 _FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Hypotheses:
     """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
     `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
@@ -32,7 +32,10 @@ class Hypotheses:
     anchor: Doubles
 
     def __getitem__(self, index: Ints) -> "Hypotheses":
-        return Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
+        return Hypotheses(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+NOWHERE = Hypotheses(*(np.zeros((0, *rest)) for rest in ((), (2,), (2, 2), (2,), (2,), (), (2,))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,17 +76,10 @@ class Proposals:
     heading_deg: Doubles
 
 
-def no_hypotheses() -> Hypotheses:
-    """Return an empty set of hypotheses."""
-    one, pairs, covariance = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2))
-    return Hypotheses(w=one, at=pairs, covariance=covariance, velocity=pairs, heading=pairs, credited=one, anchor=pairs)
-
-
 def joined(one: Hypotheses, other: Hypotheses) -> Hypotheses:
     """Return the hypotheses of `one`, then those of `other`."""
-    return Hypotheses(
-        **{name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in Hypotheses.__slots__}
-    )
+    pairs = ((getattr(one, name), getattr(other, name)) for name in Hypotheses.__slots__)
+    return Hypotheses(*map(np.concatenate, pairs))
 
 
 def apart(one: Doubles, other: Doubles) -> Doubles:
@@ -136,28 +132,18 @@ def mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, 
 
 
 def usable(proposed: Proposals, scale: MapScale, most: int) -> tuple[Ints, Proposals]:
-    """Keep at most the `most` likeliest valid proposals of a query. Returns
+    """Keep at most the `most` likeliest proposals of a query, without those that are not finite. Returns
 
     * their indices, int (n,),
-    * these proposals, with valid covariances and probabilities that sum to 1 at most.
+    * these proposals, with covariances that can be inverted and probabilities that sum to 1 at most.
     """
-    numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & (np.abs(proposed.at) < _FARTHEST).all(1))
+    is_near = (np.abs(proposed.at) < _FARTHEST).all(1) & (np.abs(proposed.covariance) < _FARTHEST**2).all((1, 2))
+    numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & is_near)
     numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:most]]
-    p = proposed.p[numbers].astype(float)
-    heading_deg = proposed.heading_deg[numbers].astype(float)
+    p = proposed.p[numbers]
     return numbers, Proposals(
         p=p / max(1.0, float(p.sum())),
-        at=proposed.at[numbers].astype(float),
-        covariance=_sound(proposed.covariance[numbers].astype(float), _LEAST_SD * scale.spacing),
-        heading_deg=np.where(np.isfinite(heading_deg), heading_deg, np.nan),
+        at=proposed.at[numbers],
+        covariance=firm(proposed.covariance[numbers], (_LEAST_SD * scale.spacing) ** 2),
+        heading_deg=proposed.heading_deg[numbers],
     )
-
-
-def _sound(covariance: Doubles, least_sd: float) -> Doubles:
-    """Return covariances (K, 2, 2) with the variance of `least_sd` added; an invalid one becomes just that variance."""
-    is_near = np.asarray((np.abs(covariance) < _FARTHEST**2).all(axis=(1, 2)))
-    covariance = np.where(is_near[:, None, None], covariance, 0.0)
-    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
-    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    is_sound = (xx >= 0) & (yy >= 0) & (xy * xy <= xx * yy)
-    return firm(np.where(is_sound[:, None, None], covariance, 0.0), least_sd**2)

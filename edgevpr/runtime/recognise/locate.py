@@ -31,7 +31,7 @@ HEARD = 12  # places looked at; in a dense map so many show the same ground
 _SAYING = 5  # of these determine the position
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
@@ -52,6 +52,11 @@ class Located:
         var_east, cov, var_north = self.covariance_m2
         middle, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
         return math.sqrt(middle + half)
+
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation along one axis, as a mean of all directions, metres."""
+        return math.sqrt((self.covariance_m2[0] + self.covariance_m2[2]) / 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

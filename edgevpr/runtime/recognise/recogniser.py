@@ -5,7 +5,7 @@ search of the map for the query of a frame. A query may take several looks, at d
 """
 
 import logging
-from collections import deque
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -22,7 +22,7 @@ from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import evidence_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
-from edgevpr.runtime.recognise.hints import Hints, Prior, expected_of, other_heights
+from edgevpr.runtime.recognise.hints import Prior, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
     NEW_FOR_S,
     AcceptRule,
@@ -33,12 +33,13 @@ from edgevpr.runtime.recognise.judge import (
     says_nothing,
 )
 from edgevpr.runtime.recognise.levelling import AnyLevelling, seen_as
-from edgevpr.runtime.recognise.locate import HEARD, at_place, located
+from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import Gate, Worth
+from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 
 _log = logging.getLogger(__name__)
+_Judged = tuple[Verdict, Candidate, Located | None]  # with the best place, and the position of the aircraft
 _OF_CANDIDATES = 0.4  # share of the candidates that is compared at each height but the first
 
 
@@ -66,11 +67,9 @@ class Preparation:
     def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
         """Return the levelled picture of a frame, with its mask and view."""
         mask = self.mask.fitted(frame.image) if self.mask else None
-        return (
-            self.levelling.prepare(frame, vehicle, mask)
-            if self.levelling
-            else Levelled(frame.image, mask, UNKNOWN_VIEW)
-        )
+        if self.levelling is None:
+            return Levelled(frame.image, mask, UNKNOWN_VIEW)
+        return self.levelling.prepare(frame, vehicle, mask)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,25 +80,6 @@ class WalkSettings:
     candidates: int | None = None
     verify: bool = True
     min_accuracy_m: float = 1.0
-
-
-@dataclass(slots=True, kw_only=True)
-class _Walk:
-    """State of one frame on its way through the steps; None for what is not reached yet. `nothing` is the reason why
-    its picture shows too little, `objection` that one or why it is not memorable. `findings`, `best` and `followed`
-    belong to the last look that was judged."""
-
-    frame: Frame
-    vehicle: Vehicle | None
-    picture: Levelled | None = None
-    worth: Worth | None = None
-    descriptor: Descriptor | None = None
-    nothing: str | None = None
-    objection: str | None = None
-    hints: Hints | None = None
-    findings: Findings | None = None
-    best: Candidate | None = None
-    followed: Followed | None = None
 
 
 class Recogniser:
@@ -116,15 +96,14 @@ class Recogniser:
         meter: QueryMeter,
         settings: WalkSettings = WalkSettings(),
         *,
-        preparation: Preparation | None = None,
+        preparation: Preparation = Preparation(),
         prior: Prior | None = None,
         follower: Follower | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
-        self._settings, self._preparation = settings, preparation or Preparation()
-        self._prior, self._follower = prior, follower
+        self._settings, self._preparation, self._prior, self._follower = settings, preparation, prior, follower
         self._told = 0  # number of left out places that events have reported
-        self._new: deque[tuple[int, float]] = deque()  # number of a place, and the time it was learnt
+        self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
@@ -146,7 +125,8 @@ class Recogniser:
 
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
         """Use an index that has one more place, `place_id`, learnt from the frame taken at `t_mono_s`."""
-        self._new.append((place_id, t_mono_s))
+        self._new = {new: t_s for new, t_s in self._new.items() if t_mono_s - t_s <= NEW_FOR_S}
+        self._new[place_id] = t_mono_s
         self.take(Matcher(self.technique, index, self.rule, self.search))
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
@@ -155,70 +135,90 @@ class Recogniser:
         Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason.
         """
         self.meter.begin()
-        walk, failure = _Walk(frame=frame, vehicle=vehicle), None
+        event = Recognition(frame=frame, vehicle=vehicle)
         try:
-            picture, descriptor = self._encode(walk)
-            verdict = self._recognise(walk, picture, descriptor)
+            picture, descriptor = self._encode(event, frame)
+            verdict, where = self._recognise(event, frame, picture, descriptor)
+            event.accepted, event.reason = verdict.accepted, verdict.reason
+            if event.accepted and where:
+                event.located, event.accuracy_m = where, max(self._settings.min_accuracy_m, where.accuracy_m)
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
-            verdict, failure = Verdict(False, _sentence(error)), error
-        return self._event(walk, verdict, failure)
+            event.failed, event.reason = True, _sentence(error)
+            event.map_lost = isinstance(error, MapError) and not isinstance(error, PlaceError)
+        event.left_out = tuple(islice(self.place_map.left_out.items(), self._told, None))
+        self._told += len(event.left_out)
+        event.steps, event.cost = self.meter.steps(), self.meter.cost()
+        return event
 
-    def _encode(self, walk: _Walk) -> tuple[Levelled, Descriptor]:
+    def unread(self, error: Exception) -> Recognition:
+        """Return the event of a frame that could not even be read."""
+        self.meter.begin()
+        steps, cost = self.meter.steps(), self.meter.cost()
+        return Recognition(frame=None, reason=_sentence(error), failed=True, steps=steps, cost=cost)
+
+    def landmarks(self, event: Recognition) -> bytes | None:
+        """Return the landmarks to store for a frame that becomes a place; None if the technique does not look straight
+        down."""
+        return landmarks_of(self.technique, event.picture) if event.picture else None
+
+    def _encode(self, event: Recognition, frame: Frame) -> tuple[Levelled, Descriptor]:
         """Prepare the picture of a frame, judge its worth by the gate, and encode it."""
-        frame, gate = walk.frame, self._preparation.gate
+        gate = self._preparation.gate
         with self.meter.step("prepare"):
-            walk.picture = picture = self._preparation.picture(frame, walk.vehicle)
+            event.picture = picture = self._preparation.picture(frame, event.vehicle)
         with self.meter.step("gate"):
-            walk.worth = gate.look(frame.image) if gate else None
+            event.worth = gate.look(frame.image) if gate else None
         with self.meter.step("encode"):
-            walk.descriptor = descriptor = encoded(self.technique, picture.image, picture.mask)
+            event.descriptor = descriptor = encoded(self.technique, picture.image, picture.mask)
         return picture, descriptor
 
-    def _recognise(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> Verdict:
-        """Search the map for an encoded frame, and judge the result."""
+    def _recognise(
+        self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor
+    ) -> tuple[Verdict, Located | None]:
+        """Search the map for an encoded frame. Returns the verdict and the aircraft's position (None: unknown)."""
         follower = self._follower
-        walk.nothing = says_nothing(descriptor, self.rule.min_quality)
-        walk.objection = walk.nothing or (walk.worth.reason if walk.worth else None)
+        nothing = says_nothing(descriptor, self.rule.min_quality)
+        event.says_nothing = nothing is not None
+        objection = nothing or (event.worth.reason if event.worth else None)
         if follower:
-            follower.went_on(walk.frame, walk.vehicle)
+            follower.went_on(frame, event.vehicle)
         if not len(self.index):
-            return Verdict(False, "the map has no place yet")
-        if walk.objection and self.search is None:  # a sequence needs every query
+            return Verdict(False, "the map has no place yet"), None
+        if objection and self.search is None:  # a sequence needs every query
             if follower:
                 follower.saw_nothing(self.index)
-            return Verdict(False, walk.objection)
-        verdict, best = self._found(walk, picture, descriptor)
+            return Verdict(False, objection), None
+        verdict, best, where = self._found(event, frame, picture, descriptor)
         if follower:
             follower.settle()
-        if walk.objection:
-            verdict = Verdict(False, walk.objection)
+        if objection:
+            verdict = Verdict(False, objection)
         if self._prior:
-            self._prior.learn(best, verdict.accepted, walk.frame.t_mono_s)
-        return verdict
+            self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+        return verdict, where
 
-    def _found(self, walk: _Walk, picture: Levelled, descriptor: Descriptor) -> tuple[Verdict, Candidate]:
-        """Search for a query as expected and, if nothing is accepted, at all other heights as well. Returns the verdict
-        and the best place."""
-        frame, prior, spec, search = walk.frame, self._prior, self.technique.spec, self.search
+    def _found(self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor) -> _Judged:
+        """Search for a query as expected and, if nothing is accepted, at all other heights as well."""
+        prior, spec, search = self._prior, self.technique.spec, self.search
         height_ratio = prior.height_ratio if prior else 1.0
         if prior:
             margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-            walk.hints = prior.hints(seen_as(frame, picture.view), walk.vehicle, self.index, margin_m)
-        expected = expected_of(walk.hints, height_ratio, self.index)
+            event.hints = prior.hints(seen_as(frame, picture.view), event.vehicle, self.index, margin_m)
+        expected = expected_of(event.hints, height_ratio, self.index)
         ranking = self._look(descriptor, expected)
         if search:
             ranking = search.follow(ranking, self.index, frame.t_mono_s)
         looked = Verification(spec, picture, self.index, self.place_map)
-        verdict, best = self._judged(walk, ranking, looked)
+        judged = self._judged(event, ranking, looked)
         others = other_heights(spec.height_ratios, height_ratio)
-        if verdict.accepted or search or not others or (prior and not prior.looks_again):
-            return verdict, best
+        if judged[0].accepted or search or not others or (prior and not prior.looks_again):
+            return judged
         for ratio in others:
             # Matches of all looks are judged together: each can speak against the best one.
             look = self._look(descriptor, replace(expected, height_ratio=ratio), _OF_CANDIDATES)
             ranking = together(ranking, look)
-        return self._judged(walk, ranking, looked)
+        return self._judged(event, ranking, looked)
 
     def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
         """Search the map once for a query, with the share `part` of the candidates. Raises as `compare` does."""
@@ -232,15 +232,14 @@ class Recogniser:
             return compare(query, scanned, candidates, self.rule.neighbour_m)
 
     def _judged(
-        self, walk: _Walk, ranking: Ranking, looked: Verification, followed: Followed | None = None
-    ) -> tuple[Verdict, Candidate]:
+        self, event: Recognition, ranking: Ranking, looked: Verification, followed: Followed | None = None
+    ) -> _Judged:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
         flight makes another place more likely, judge that one (`followed`: the flight's result is known already)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
-            is_new = self._is_new(best.place.place_id, walk.frame.t_mono_s)
-        where = proof = None
+        where = proof = evidence = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
         if verifies := is_worth_it and self._settings.verify and self.search is None and cells is not None:
@@ -256,79 +255,31 @@ class Recogniser:
         if verifies and proof and not same:
             with self.meter.step("verify"):
                 same = looked.same_ground(ranking)
-        evidence = None
         if rule.sure:
             evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, cells is not None)
         if self._follower and followed is None and rule.sure and evidence is not None:
             with self.meter.step("locate"):
                 followed = self._follower.heard(ranking, index, evidence, rule.sure, where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
-                return self._judged(walk, ranking.led_by(followed.slot), looked, followed)
+                return self._judged(event, ranking.led_by(followed.slot), looked, followed)
         rival = 0
         if verifies and proof and is_hardly_ahead(evidence):
             with self.meter.step("verify"):
                 rival = looked.rival(ranking, rule.neighbour_m, same)
-        by_flight = followed.confidence if followed else None
-        walk.best, walk.followed = best, followed
-        walk.findings = findings = Findings(
-            ranking, is_new=is_new, proof=proof, rival=rival, where=where, evidence=evidence, by_flight=by_flight
-        )
-        return judge(findings, index, rule, self.search), best
-
-    def _event(self, walk: _Walk, verdict: Verdict, failure: Exception | None) -> Recognition:
-        """Return the event of a frame, with all that happened to it."""
-        findings, sure = walk.findings, self.rule.sure
-        where = findings.where if findings and verdict.accepted else None
-        evidence = findings.evidence if findings else None
-        return Recognition(
-            frame=walk.frame,
-            vehicle=walk.vehicle,
-            picture=walk.picture,
-            worth=walk.worth,
-            descriptor=walk.descriptor,
-            hints=walk.hints,
-            ranking=findings.ranking if findings else None,
-            best=walk.best,
-            proof=findings.proof if findings else None,
+        event.ranking, event.best, event.followed = ranking, best, followed
+        event.proof, event.evidence = proof, evidence
+        event.confidence = rule.sure.confidence(evidence) if rule.sure and evidence else None
+        age_s = (event.frame.t_mono_s if event.frame else 0.0) - self._new.get(best.place.place_id, -math.inf)
+        findings = Findings(
+            ranking,
+            is_new=age_s <= NEW_FOR_S,
+            proof=proof,
+            rival=rival,
+            where=where,
             evidence=evidence,
-            followed=walk.followed,
-            confidence=sure.confidence(evidence) if sure and evidence else None,
-            accepted=verdict.accepted,
-            reason=verdict.reason,
-            says_nothing=walk.nothing is not None,
-            failed=failure is not None,
-            map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
-            left_out=self._newly_left_out(),
-            located=where,
-            accuracy_m=max(self._settings.min_accuracy_m, where.accuracy_m) if where else None,
-            steps=self.meter.steps(),
-            cost=self.meter.cost(),
+            by_flight=followed.confidence if followed else None,
         )
-
-    def landmarks(self, event: Recognition) -> bytes | None:
-        """Return the landmarks to store for a frame that becomes a place; None if the technique does not look straight
-        down."""
-        return landmarks_of(self.technique, event.picture) if event.picture else None
-
-    def unread(self, error: Exception) -> Recognition:
-        """Return the event of a frame that could not even be read."""
-        self.meter.begin()
-        return Recognition(
-            frame=None, reason=_sentence(error), failed=True, steps=self.meter.steps(), cost=self.meter.cost()
-        )
-
-    def _newly_left_out(self) -> tuple[tuple[int, str], ...]:
-        """Return number and problem of the places left out since the last event."""
-        left_out = self.place_map.left_out
-        newly = tuple(islice(left_out.items(), self._told, None))
-        self._told = len(left_out)
-        return newly
-
-    def _is_new(self, place_id: int, t_mono_s: float) -> bool:
-        """Return True if a place was learnt within the last `NEW_FOR_S` seconds before `t_mono_s`."""
-        while self._new and t_mono_s - self._new[0][1] > NEW_FOR_S:
-            self._new.popleft()
-        return any(place_id == new for new, _ in self._new)
+        return judge(findings, index, rule, self.search), best, where
 
 
 def _sentence(error: Exception) -> str:

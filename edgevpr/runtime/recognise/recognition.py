@@ -1,7 +1,7 @@
 """The event of one frame: everything that happened to it, in one value. Made by the recogniser, written to the log."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from edgevpr.core.contract import Descriptor
@@ -17,9 +17,9 @@ from edgevpr.runtime.recognise.salience_gate import Worth
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Recognition:
-    """Result of one frame. A field is None if its step was not reached.
+    """Result of one frame, which the recogniser fills in on the way. A field is None if its step was not reached.
 
     * `frame`, and `vehicle`, the autopilot's report when the frame was taken (None: no report)
     * `picture`: the picture that was encoded, and how it lies on the ground; `descriptor`: the encoded picture
@@ -52,15 +52,15 @@ class Recognition:
     confidence: float | None = None
     followed: Followed | None = None
     accepted: bool = False
-    reason: str
+    reason: str = ""
     says_nothing: bool = False
     failed: bool = False
     map_lost: bool = False
     left_out: tuple[tuple[int, str], ...] = ()
     located: Located | None = None
     accuracy_m: float | None = None
-    steps: Steps
-    cost: QueryCost
+    steps: Steps = field(default_factory=Steps)
+    cost: QueryCost = field(default_factory=QueryCost)
     fix: FixReport | None = None
     last_fix: FixReport | None = None
 
@@ -113,42 +113,6 @@ def fields_of(event: Recognition) -> dict[str, Any]:
     }
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)
-
-
-def _where(position: Position, covariance_m2: Sequence[float], heading_deg: float | None) -> dict[str, Any]:
-    return {
-        "lat_deg": round(position.lat_deg, 8),
-        "lon_deg": round(position.lon_deg, 8),
-        "covariance_m2": [round(value, 3) for value in covariance_m2],
-        "heading_deg": _rounded(heading_deg, 1),
-    }
-
-
-def _followed(followed: Followed) -> dict[str, Any]:
-    fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
-    if (estimate := followed.estimate) is None:
-        return fields
-    return fields | _where(estimate.position, estimate.covariance_m2, estimate.heading_deg)
-
-
-def _landmarks(proof: Agreement) -> dict[str, Any]:
-    fields = {"inliers": proof.inliers, "matched": proof.matched}
-    if proof.shift_share is None:
-        return fields
-    return fields | {
-        "shift_share": [round(share, 4) for share in proof.shift_share],
-        "rotation_deg": _rounded(proof.rotation_deg, 1),
-        "scale": _rounded(proof.scale, 3),
-    }
-
-
-def _located(where: Located) -> dict[str, Any]:
-    fields = _where(where.position, where.covariance_m2, where.heading_deg)
-    return fields | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
-
-
 def _best(candidate: Candidate | None) -> dict[str, Any]:
     if candidate is None:
         return dict.fromkeys(_OF_THE_BEST)
@@ -157,3 +121,33 @@ def _best(candidate: Candidate | None) -> dict[str, Any]:
     named = (place.place_id, place.source_image, round(match.score, 5), position)
     step = (match.shift_cells, match.covariance_cells2, match.rotation_deg)
     return dict(zip(_OF_THE_BEST, (*named, *step), strict=True))
+
+
+def _landmarks(proof: Agreement) -> dict[str, Any]:
+    fields: dict[str, Any] = {"inliers": proof.inliers, "matched": proof.matched}
+    if proof.shift_share is not None:
+        fields["shift_share"] = [round(share, 4) for share in proof.shift_share]
+        fields |= {"rotation_deg": _rounded(proof.rotation_deg, 1), "scale": _rounded(proof.scale, 3)}
+    return fields
+
+
+def _followed(followed: Followed) -> dict[str, Any]:
+    fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
+    return fields | (_where(followed.estimate) if followed.estimate else {})
+
+
+def _located(where: Located) -> dict[str, Any]:
+    return _where(where) | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
+
+
+def _where(where: Located) -> dict[str, Any]:
+    return {
+        "lat_deg": round(where.position.lat_deg, 8),
+        "lon_deg": round(where.position.lon_deg, 8),
+        "covariance_m2": [round(value, 3) for value in where.covariance_m2],
+        "heading_deg": _rounded(where.heading_deg, 1),
+    }
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
