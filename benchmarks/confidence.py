@@ -11,11 +11,12 @@ models that edgevpr has.
 """
 
 import argparse
+import json
 import os
 import pickle
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from shipped_model import FittedSite, shipped_model
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
-from edgevpr.runtime.recognise.confidence import Model, as_json
+from edgevpr.runtime.recognise.confidence import Model
 from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, FEWEST_PLACES, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
@@ -82,7 +83,7 @@ def ship(folder: Path, rows: Rows) -> None:
         for kind in kinds:
             made_of = f"{count} matches in the maps of {len(of)} sets"
             model = shipped_model(kind, [site(rows[name], kind) for name in of], made_of)
-            (folder / f"confidence_{kind}.json").write_text(as_json(model) + "\n")
+            (folder / f"confidence_{kind}.json").write_text(json.dumps(asdict(model)) + "\n")
 
 
 def _read(path: Path) -> list[Row]:

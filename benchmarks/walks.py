@@ -22,7 +22,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
-from edgevpr.runtime.recognise.levelling import AnyLevelling
+from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -78,7 +78,7 @@ def walk(
     search: SequenceSearch | None = None,
     verify: bool = True,
     min_accuracy_m: float = 1.0,
-    levelling: AnyLevelling | None = None,
+    levelling: Levelling | None = None,
     **more: Any,
 ) -> Recogniser:
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is

@@ -179,11 +179,12 @@ def run_salience(args: Namespace) -> int:
     """Run `salience`: print the salience scores of a picture (see the glossary), and draw the maps of them (--out)."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.frames.images import read_image
-    from edgevpr.runtime.recognise.opening import gate_with
+    from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.runtime.recognise.salience_gate import drawn_as_png, scores_of, worth_of
 
     asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
-    gate = gate_with(config_of(args, args.config, **asked).salience)
+    gate = gate_of(config_of(args, args.config, **asked).salience)
+    assert gate is not None  # salience.use is set
     if args.out:
         require_folder(Path(args.out))
     image = read_image(Path(args.image))

@@ -249,8 +249,8 @@ def _settings(order: MapOrder, name: str, camera: str | None) -> dict[str, str]:
 
 
 def _new_technique(order: MapOrder, camera: str | None, places: int) -> Technique:
-    here = load_board("this")
+    threads = load_board("this").threads
     if name := order.technique or (_OF_ORTHOPHOTOS if isinstance(order.pictures, Cuttings) else None):
-        return made_for(here, name, _settings(order, name, camera))
+        return made_for(threads, name, _settings(order, name, camera))
     name = picked_technique(order.board, places or 1, camera)
-    return made_for(here, name, order.parameters | camera_setting(name, camera))
+    return made_for(threads, name, order.parameters | camera_setting(name, camera))

@@ -172,9 +172,9 @@ def test_a_network_takes_as_many_threads_as_the_board_spares(monkeypatch, flight
     asked = []
     monkeypatch.setattr("edgevpr.techniques.create", lambda name, settings: asked.append((name, settings)))
     board = replace(load_board("rpi-4b"), threads=3)
-    made_for(board, "calc", {"model": "tiny"})
-    made_for(board, "calc", {"model": "tiny", "threads": 1})
-    made_for(board, "hog")
+    made_for(board.threads, "calc", {"model": "tiny"})
+    made_for(board.threads, "calc", {"model": "tiny", "threads": 1})
+    made_for(board.threads, "hog")
     assert asked == [
         ("calc", {"threads": 3, "model": "tiny"}),
         ("calc", {"threads": 1, "model": "tiny"}),

@@ -138,6 +138,6 @@ def _usable(board: Board, names: tuple[str, ...], camera: str | None) -> Iterato
     """Create and yield each technique. If its network cannot be used here, it is left out and logged."""
     for name in names:
         try:
-            yield made_for(board, name, camera_setting(name, camera))
+            yield made_for(board.threads, name, camera_setting(name, camera))
         except ModelError as error:
             _log.warning("technique %s is passed over: %s", name, error)

@@ -13,7 +13,7 @@ from edgevpr.core.child import ask_child, serve_parent
 from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
-from edgevpr.runtime.recognise.opening import made_with
+from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import load_card, weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long; the check before a flight has no time for that
@@ -99,7 +99,7 @@ def trial_of(fields: dict[str, Any]) -> Trial:
 
 def _try_here(job: dict[str, Any]) -> dict[str, Any]:
     offer = Offer(job["label"], job["name"], job["settings"])
-    technique = made_with(job["threads"], offer.name, offer.settings)
+    technique = made_for(job["threads"], offer.name, offer.settings)
     costs = probe(technique, tried_s=_TRIED_S)
     model, spec = model_of(offer.name, offer.settings), technique.spec
     return asdict(

@@ -14,7 +14,7 @@ logistic function of the logarithm of the chance (Platt 1999).
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -41,12 +41,6 @@ class Logistic:
     scales: tuple[float, ...]
     bias: float
 
-    def __post_init__(self) -> None:
-        if not len(self.names) == len(self.weights) == len(self.scales):
-            raise ValueError("as many names as weights and scales are needed")
-        if not all(map(math.isfinite, (*self.weights, *self.scales, self.bias))):
-            raise ValueError("a weight is not finite")
-
     def logit(self, evidence: Evidence) -> float:
         """Return the logit of a match with this evidence."""
         return self.bias + sum(w * evidence[name] for w, name in zip(self.weights, self.names, strict=True))
@@ -60,10 +54,6 @@ class Tail:
     start: float
     share: float
     scale: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.start) and 0 < self.scale < math.inf and 0 < self.share <= 1):
-            raise ValueError("a tail needs a scale above 0, and a share above 0")
 
     def beyond(self, logit: float) -> float:
         """Return the share of all matches that are wrong and have a logit above this one; 1 at most."""
@@ -80,13 +70,10 @@ class Scale:
     slope: float
     offset: float
 
-    def __post_init__(self) -> None:
-        if not (0 < self.slope < math.inf and math.isfinite(self.offset)):
-            raise ValueError("more evidence must not make a match less probable")
-
     def confidence(self, chance: float) -> float:
         """Return the probability that a match is right, given the chance that a wrong match offers as much evidence."""
-        return probability(self.offset - self.slope * math.log(max(chance, _LEAST)))
+        logit = self.offset - self.slope * math.log(max(chance, _LEAST))
+        return 1 / (1 + math.exp(-max(-_MOST, min(_MOST, logit))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,35 +113,12 @@ class Model:
         return self.scale.confidence(wrong if self.adapted_scale is None else _NOT_ADAPTED * wrong)
 
 
-def probability(logit: float) -> float:
-    """Return the probability that belongs to a logit."""
-    return 1 / (1 + math.exp(-max(-_MOST, min(_MOST, logit))))
-
-
-def as_json(model: Model) -> str:
-    """Write a model as JSON, as `from_json` reads it."""
-    return json.dumps(asdict(model))
-
-
-def from_json(text: str) -> Model:
-    """Read a model from JSON text. Raises ValueError for a text that is no model."""
-    try:
-        return model_of(json.loads(text))
-    except (KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"no model of confidence ({error!r:.80})") from error
-
-
 def model_of(stored: Mapping[str, Any]) -> Model:
-    """Make a model from decoded JSON. Raises ValueError, KeyError or TypeError for invalid contents."""
+    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
     adapted = stored["adapted_scale"]
-    return Model(
-        of_map=_logistic(**stored["of_map"]),
-        of_place=_logistic(**stored["of_place"]),
-        scale=_scale(**stored["scale"]),
-        adapted_scale=adapted and _scale(**adapted),
-        made=str(stored["made"]),
-        made_of=str(stored["made_of"]),
-    )
+    scales = {"scale": _scale(**stored["scale"]), "adapted_scale": adapted and _scale(**adapted)}
+    regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
+    return Model(**{**stored, **regressions, **scales})
 
 
 @lru_cache
@@ -162,13 +126,13 @@ def prior(kind: str) -> Model:
     """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = shipped("models") / f"confidence_{kind}.json"
     try:
-        return from_json(read_file(path, _MAX_FILE_BYTES).decode())
-    except (OSError, ValueError) as error:
+        return model_of(json.loads(read_file(path, _MAX_FILE_BYTES)))
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} cannot be used ({error}): install edgevpr again.") from error
 
 
 def _logistic(names: list[str], weights: list[float], scales: list[float], bias: float) -> Logistic:
-    return Logistic(tuple(map(str, names)), tuple(weights), tuple(scales), bias)
+    return Logistic(tuple(names), tuple(weights), tuple(scales), bias)
 
 
 def _scale(off_map: dict[str, float], off_place: dict[str, float], slope: float, offset: float) -> Scale:

@@ -12,6 +12,7 @@ in the order of the card and the input's (height, width) in pixels, and returns
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 
@@ -25,18 +26,16 @@ _CAR_PX = 24  # least length of a car on the input: small detectors find little 
 _LARGEST_M = 25.0  # no vehicle or boat that moves about is longer
 _MOST_TILES = 4  # along each side; each tile is a run of the network
 _OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
-_CLASS_AXIS = 1
 _SEED = 7
-_YOLOX_STRIDES_PX = (8, 16, 32)
-_NANODET_STRIDES_PX = (8, 16, 32)
+_STRIDES_PX = (8, 16, 32)  # of the grids of yolox and nanodet
 _LARGEST_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
 
 Decoded = tuple[Floats, Floats]
 
 
 class Detector:
-    """The detector that a card describes; the constructor runs it once as a test. Raises ModelError, in one sentence,
-    for a card without a section `detector` and for anything that makes the network unusable."""
+    """The detector that a card describes; the constructor runs it once as a test. Raises ModelError for a card without
+    a section `detector`, and for an unusable network."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.detector is None or card.outputs.boxes is None:
@@ -56,11 +55,11 @@ class Detector:
         height, width = image.shape[:2]
         static = np.ones((height, width), bool)
         largest_px = math.inf if footprint_m is None else _LARGEST_M / footprint_m * width
-        for top, bottom, left, right in _tiles(height, width, self.tiles(footprint_m)):
-            part = static[top:bottom, left:right]
-            for x1, y1, x2, y2 in self._boxes_px(image[top:bottom, left:right]):
-                if max(x2 - x1, y2 - y1) <= largest_px:
-                    part[y1:y2, x1:x2] = False
+        count = self.tiles(footprint_m)
+        for rows, columns in product(_cuts(height, count), _cuts(width, count)):
+            for left, top, right, bottom in self._boxes_px(image[rows, columns]):
+                if max(right - left, bottom - top) <= largest_px:
+                    static[rows, columns][top:bottom, left:right] = False
         return static
 
     def tiles(self, footprint_m: float | None) -> int:
@@ -76,7 +75,7 @@ class Detector:
         outputs = run_outputs(self.card, self._session, self._outputs, prepare(image, rule))
         try:
             boxes, scores = _DECODERS[self._rule.family](outputs, (rule.height, rule.width))
-            scores = scores[:, sorted(self._rule.dynamic.values())].max(_CLASS_AXIS)
+            scores = scores[:, sorted(self._rule.dynamic.values())].max(axis=1)
         except (IndexError, ValueError) as error:
             raise ModelError(
                 f"{self.card.path}: the outputs are not those of a `{self._rule.family}` detector with these "
@@ -90,24 +89,18 @@ class Detector:
         return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)
 
 
-def _tiles(height: int, width: int, count: int) -> list[tuple[int, int, int, int]]:
-    """Return (top, bottom, left, right) in pixels of each of `count` x `count` tiles of a picture."""
-    downs, acrosses = (_cuts(side, count) for side in (height, width))
-    return [(top, bottom, left, right) for top, bottom in downs for left, right in acrosses]
-
-
-def _cuts(side: int, count: int) -> list[tuple[int, int]]:
-    """Cut a side into `count` overlapping parts; returns (start, end) of each, in pixels."""
+def _cuts(side: int, count: int) -> list[slice]:
+    """Cut a side of so many pixels into `count` overlapping parts."""
     part = side / (count - (count - 1) * _OVERLAP)
     starts = [part * (1 - _OVERLAP) * number for number in range(count)]
-    return [(round(start), min(side, round(start + part))) for start in starts]
+    return [slice(round(start), min(side, round(start + part))) for start in starts]
 
 
 def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode (1, N, 5 + C), the cells of three grids in turn (Ge et al. 2021, arXiv 2107.08430). Each has the offset of
     the centre in cells, the logarithms of the sides in cells, the score of an object, and the scores of the classes."""
     values = outputs[0][0]
-    cells, stride_px = _grids(size_px, _YOLOX_STRIDES_PX)
+    cells, stride_px = _grids(size_px)
     centre_px = (values[:, :2] + cells) * stride_px
     side_px = np.exp(np.minimum(values[:, 2:4], _LARGEST_LOG)) * stride_px
     return _boxes(centre_px - side_px / 2, centre_px + side_px / 2, size_px), values[:, 4:5] * values[:, 5:]
@@ -129,10 +122,10 @@ def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
 def nanodet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode scores (1, N, C) for each of the strides 8, 16 and 32, then distances (1, N, 4 x bins) for each (Li et al.
     2020, arXiv 2006.04388). A distance from the cell's middle to a side is a distribution over whole strides."""
-    levels = len(_NANODET_STRIDES_PX)
+    levels = len(_STRIDES_PX)
     scores = np.concatenate([part[0] for part in outputs[:levels]])
     said = np.concatenate([part[0] for part in outputs[levels:]])
-    cells, stride_px = _grids(size_px, _NANODET_STRIDES_PX)
+    cells, stride_px = _grids(size_px)
     logits = said.reshape(len(said), 4, -1)
     shares = np.exp(logits - logits.max(-1, keepdims=True))
     distance_px = (shares @ np.arange(shares.shape[-1])) / shares.sum(-1) * stride_px
@@ -147,14 +140,10 @@ _DECODERS: dict[str, Callable[[Sequence[Floats], tuple[int, int]], Decoded]] = {
 }
 
 
-def _grids(size_px: tuple[int, int], strides_px: Sequence[int]) -> tuple[Floats, Floats]:
-    """Return for all cells of the grids with these strides
-
-    * column and row, float32 (N, 2),
-    * the stride in pixels, float32 (N, 1).
-    """
+def _grids(size_px: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Return for all cells of the three grids column and row, float32 (N, 2), and the stride in pixels, (N, 1)."""
     cells, strides = [], []
-    for stride in strides_px:
+    for stride in _STRIDES_PX:
         rows, columns = (-(-side // stride) for side in size_px)
         grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
         cells.append(grid)

@@ -76,23 +76,17 @@ class MapCalibration:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures as a dict for JSON."""
-        return {
-            "made": self.made,
+        kept = ("made", "asked", "precision", "accepted_wrong", "looks_alike")
+        return {name: getattr(self, name) for name in kept} | {
             "made_of": [model.made_of for model in self.models.values()],
-            "asked": self.asked,
             "places_asked": len(self.recognisable),
-            "precision": self.precision,
             "accepted": round(self.accepted, 4),
-            "accepted_wrong": self.accepted_wrong,
             "hardly_recognisable": round(self.hardly_recognisable, 4),
-            "looks_alike": self.looks_alike,
         }
 
     def described(self) -> str:
         """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
-        wrong = {0: "no wrong match was", 1: "1 wrong match was"}.get(
-            self.accepted_wrong, f"{self.accepted_wrong} wrong matches were"
-        )
+        wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'}"
         alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
             f"of {self.asked} changed pictures of its own places {100 * self.accepted:.0f} % were accepted, at a "
@@ -118,14 +112,12 @@ def kind_of(evidence: Evidence) -> str:
 def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
-    if kind not in OF_MAP:
-        raise ValueError(f"there is no evidence of kind {kind!r:.40}")
-    for name in (*model.of_map.names, *model.of_place.names):
-        if name not in OF_MAP[kind] + OF_PLACE[kind]:
-            raise ValueError(f"there is no evidence {name!r:.40} of kind {kind}")
+    known = OF_MAP.get(kind, ()) + OF_PLACE.get(kind, ())
+    if unknown := {*model.of_map.names, *model.of_place.names}.difference(known):
+        raise ValueError(f"there is no evidence {min(unknown)!r:.40} of kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
-        model.confidence(dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], value))
-    model.threshold(0.5), model.threshold(0.999999)
+        model.confidence(dict.fromkeys(known, value))
+    model.threshold(0.999999)
 
 
 def described(evidence: Evidence) -> str:
@@ -201,7 +193,7 @@ def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
         found = read_calibration(text)
         for kind, model in found.models.items():
             require_usable(kind, model)
-    except (ValueError, ArithmeticError, MapError) as error:
+    except (ValueError, ArithmeticError, KeyError, TypeError, AttributeError, MapError) as error:
         _log.warning(
             "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
             place_map.path,
@@ -225,28 +217,15 @@ def calibration_text(calibration: MapCalibration) -> str:
 
 
 def read_calibration(text: str) -> MapCalibration:
-    """Read a calibration from the text in a map. Raises ValueError if it is damaged or invalid."""
-    checksum, body = text[:_CHECKSUM_DIGITS], text[_CHECKSUM_DIGITS:]
-    if checksum != _checksum(body):
+    """Read a calibration from the text in a map. Raises ValueError if it is damaged, KeyError, TypeError or
+    AttributeError if another version has written it in another form."""
+    body = text[_CHECKSUM_DIGITS:]
+    if text != _checksum(body) + body:
         raise ValueError("its checksum is wrong")
-    try:
-        found = json.loads(body)
-        recognisable = {int(place_id): float(each) for place_id, each in found["recognisable"].items()}
-        calibration = MapCalibration(
-            models={str(kind): model_of(each) for kind, each in found["models"].items()},
-            made=str(found["made"]),
-            asked=int(found["asked"]),
-            precision=float(found["precision"]),
-            accepted=float(found["accepted"]),
-            accepted_wrong=int(found["accepted_wrong"]),
-            recognisable=recognisable,
-        )
-    except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise ValueError(f"no calibration ({error!r:.80})") from error
-    shares = (calibration.precision, calibration.accepted, *recognisable.values())
-    if not all(math.isfinite(each) and 0 <= each <= 1 for each in shares):
-        raise ValueError("a share is not within 0 and 1")
-    return calibration
+    found = json.loads(body)
+    found["models"] = {kind: model_of(model) for kind, model in found["models"].items()}
+    found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
+    return MapCalibration(**found)
 
 
 def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:

@@ -18,14 +18,6 @@ _FIX_GOOD_FOR_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class KnownPosition:
-    """A position of the aircraft and the time it was there, seconds on the clock of the frames."""
-
-    position: Position
-    t_mono_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class Reach:
     """Area in which the aircraft is: within `radius_m` metres of `position`."""
 
@@ -71,26 +63,37 @@ class Prior:
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
-        self._last_fix: KnownPosition | None = None
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
-        self.looks_again = True
+        self.looks_again = self._are_believed = True
+        self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
         self._known: Hints | None = None
-        self._are_believed = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame; None if there are none, or if they are not trusted now.
+        """Return the hints for a frame that exclude any place of the index; None if there are none, or if they are not
+        trusted now.
 
         `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
-        around = heading_deg = None
-        if self._reach_m_s:
-            around = reach_of(frame.t_mono_s, vehicle, self._last_fix, self._reach_m_s, margin_m)
-        if self._heading_within_deg is not None:
-            heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
-        self._known = hints_of(index, around, heading_deg)
+        reach = self._reach(frame.t_mono_s, vehicle, margin_m)
+        if reach and not 0 < index.within(reach.position, reach.radius_m).sum() < len(index):
+            reach = None
+        heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
+        if self._heading_within_deg is None or not index.knows_headings:
+            heading_deg = None
+        self._known = None if reach is None and heading_deg is None else Hints(reach, heading_deg)
         return self._known if self._are_believed else None
+
+    def _reach(self, now_s: float, vehicle: Vehicle | None, margin_m: float) -> Reach | None:
+        """Return the area where the aircraft must be by its last known position: that of the autopilot, if it has GPS
+        (without, it drifts, and our own fix is better), else our fix, if that is at most a minute old."""
+        known = self._last_fix if self._last_fix and now_s - self._last_fix[1] <= _FIX_GOOD_FOR_S else None
+        if vehicle and vehicle.has_gps:
+            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s
+        if not known or not self._reach_m_s:
+            return None
+        return Reach(known[0], margin_m + self._reach_m_s * abs(now_s - known[1]))
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
         """Decide from the result of a query whether the next one uses hints. Keep position and height of an accepted
@@ -110,32 +113,7 @@ class Prior:
         if accepted and found.match.height_ratio:
             self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
-            self._last_fix = KnownPosition(found.place.position, t_mono_s)
-
-
-def hints_of(index: PlaceIndex, around: Reach | None, heading_deg: float | None) -> Hints | None:
-    """Return those hints, of the area `around` and `heading_deg`, that exclude any place of the index; None if neither
-    does. An area that holds no place at all is not used."""
-    if around and not 0 < index.within(around.position, around.radius_m).sum() < len(index):
-        around = None
-    if heading_deg is not None and not index.knows_headings:
-        heading_deg = None
-    return None if around is None and heading_deg is None else Hints(around, heading_deg)
-
-
-def reach_of(
-    now_s: float, vehicle: Vehicle | None, own_fix: KnownPosition | None, reach_m_s: float, margin_m: float
-) -> Reach | None:
-    """Return the area where the aircraft must be at `now_s` by its last known position, its highest speed `reach_m_s`
-    and a margin; None if no position is known.
-
-    The position is the autopilot's, if it has GPS and is at most a second old, else our own fix (`own_fix`), if that is
-    at most a minute old.
-    """
-    seen = own_fix if own_fix and now_s - own_fix.t_mono_s <= _FIX_GOOD_FOR_S else None
-    if vehicle and vehicle.has_gps and vehicle.is_fresh_at(now_s):  # without GPS its position drifts: our fix is better
-        seen = KnownPosition(Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s)
-    return Reach(seen.position, margin_m + reach_m_s * abs(now_s - seen.t_mono_s)) if seen else None
+            self._last_fix = found.place.position, t_mono_s
 
 
 def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
@@ -150,7 +128,4 @@ def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> 
 
 def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
     """Return the height ratios to search at after `first`: all but the one nearest to it."""
-    if not height_ratios:
-        return []
-    tried = nearest_height(height_ratios, first)
-    return [ratio for ratio in height_ratios if ratio != tried]
+    return [ratio for ratio in height_ratios if ratio != nearest_height(height_ratios, first)]

@@ -23,20 +23,9 @@ UNTOLD_TILT = 0.04
 _log = logging.getLogger(__name__)
 
 
-class Leaning:
-    """Leaves pictures of a camera that looks straight down as they are, because its lens is unknown, and computes by
-    how much they look aside. `is_live` is as in `Levelling`."""
-
-    def __init__(self, is_live: bool) -> None:
-        self._is_live = is_live
-
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
-        """Return the picture unchanged, with its `overlay` mask, and its view."""
-        return Levelled(frame.image, overlay, leaning(frame, _now(vehicle, frame) if self._is_live else None))
-
-
 class Levelling:
-    """Levels the pictures of a camera that looks straight down, see `frames.level`.
+    """Levels the pictures of a camera that looks straight down, see `frames.level`; without a `lens`, they stay as they
+    are, and it is only computed by how much they look aside.
 
     `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
     (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
@@ -45,7 +34,7 @@ class Levelling:
 
     def __init__(
         self,
-        lens: Lens,
+        lens: Lens | None,
         *,
         footprint_m: float | None = None,
         below: bool = False,
@@ -59,7 +48,10 @@ class Levelling:
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
         """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
         False where the picture shows no ground (None: nowhere)."""
-        vehicle = _now(vehicle, frame) if self._is_live else None
+        if vehicle and not (self._is_live and vehicle.is_fresh_at(frame.t_mono_s)):
+            vehicle = None
+        if self.lens is None:
+            return Levelled(frame.image, overlay, leaning(frame, vehicle))
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
@@ -69,27 +61,20 @@ class Levelling:
         return picture
 
 
-AnyLevelling = Leaning | Levelling
-
-
 def levelling_of(
     config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
-) -> AnyLevelling | None:
+) -> Levelling | None:
     """Make the levelling for a configuration; None if pictures are left as they are: the camera looks ahead, or its
     lens is unknown and it is on a gimbal."""
     if technique.spec.parameters.get("camera") != "nadir":
         return None
-    live = config.uri is not None and is_live(config.uri)
     if config.fov_deg is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
-        return None if config.gimbal else Leaning(live)
-    return Levelling(
-        Lens(config.fov_deg, config.up_deg),
-        footprint_m=footprint_m,
-        below=below,
-        on_gimbal=config.gimbal,
-        is_live=live,
-    )
+        if config.gimbal:
+            return None
+    lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
+    is_now = config.uri is not None and is_live(config.uri)
+    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now)
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
@@ -118,8 +103,3 @@ def laid(frame: Frame, view: View) -> Frame:
         position = Position(lat_deg, lon_deg, position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)
-
-
-def _now(vehicle: Vehicle | None, frame: Frame) -> Vehicle | None:
-    """Return the autopilot's report if it is fresh at the time of the frame, else None."""
-    return vehicle if vehicle and vehicle.is_fresh_at(frame.t_mono_s) else None

@@ -18,8 +18,8 @@ _SEED = 7
 
 
 class Memorability:
-    """The network of memorability that a card describes; the constructor runs it once as a test. Raises ModelError, in
-    one sentence, for a card without memorability and for anything that makes the network unusable."""
+    """The network of memorability that a card describes; the constructor runs it once as a test. Raises ModelError for
+    a card without memorability, and for an unusable network."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.outputs.memorability is None:
@@ -34,8 +34,7 @@ class Memorability:
 
         Raises ModelError for numbers that are not finite, or are outside 0..1.
         """
-        rule, name = self.card.input, self._output
-        crops = prepared_crops(image, rule)
+        name, crops = self._output, prepared_crops(image, self.card.input)
         batches = [crops] if self._takes_many else np.split(crops, len(crops))
         said = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
         if any(part.size != len(batch) for part, batch in zip(said, batches, strict=True)):

@@ -1,8 +1,8 @@
 """Makes a recogniser from a map, the technique it was made with, and its index in RAM. All programs start here."""
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 from edgevpr import techniques
@@ -54,10 +54,14 @@ def open_recogniser(
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
     place_map = PlaceMap.open(config.map)
-    with _closed_on_error(place_map):
+    with ExitStack() as on_error:
+        on_error.callback(place_map.close)
         technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
-        index = _loaded(config, board, technique, place_map)
-        return _recogniser(config, board, _matcher(config, technique, place_map, index), place_map, narrowed, follows)
+        beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
+        index = load_index(place_map, technique, _budget_bytes(config, board), beside_bytes=beside_bytes)
+        recogniser = _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
+        on_error.pop_all()
+    return recogniser
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
@@ -72,23 +76,21 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
     path = map_path(config.map)
     require_regular(path)
-    technique = None
     if new_technique and not has_map(path):
-        technique = made_for(board, new_technique, _wanted(config))
-        _make_map(path, technique, mask_of(config.source.mask))
+        _make_map(path, made_for(board.threads, new_technique, _wanted(config)), mask_of(config.source.mask))
     place_map = PlaceMap.open_for_adding(path)
-    with _closed_on_error(place_map):
-        technique = technique or technique_of(place_map, config.technique, _wanted(config), board)
+    with ExitStack() as on_error:
+        on_error.callback(place_map.close)
+        technique = technique_of(place_map, config.technique, _wanted(config), board)
         index_positions(place_map)
+        beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
         growing = GrowingIndex(
-            place_map,
-            technique,
-            budget_bytes=_budget_bytes(config, board),
-            room=_ROOM,
-            beside_bytes=bytes_beside_place(length_of(technique.spec, config.match.sequence)),
+            place_map, technique, budget_bytes=_budget_bytes(config, board), room=_ROOM, beside_bytes=beside_bytes
         )
-        matcher = _matcher(config, technique, place_map, growing.index)
-        return _recogniser(config, board, matcher, place_map, True, config.match.follow), growing
+        follows = config.match.follow
+        recogniser = _recogniser(config, board, technique, place_map, growing.index, narrowed=True, follows=follows)
+        on_error.pop_all()
+    return recogniser, growing
 
 
 def has_map(path: Path) -> bool:
@@ -102,15 +104,13 @@ def budget_mb(config: Config, board: Board) -> float:
 
 
 def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
-    """Make the salience gate if the configuration asks for one, else return None. Raises as `gate_with`."""
-    return gate_with(config, threads) if config.use else None
-
-
-def gate_with(config: SalienceConfig, threads: int = 1) -> Gate:
-    """Make a salience gate. A criterion whose network is not named is off, with a warning.
+    """Make the salience gate, None if the configuration asks for none. A criterion whose network is not named is off,
+    with a warning.
 
     Raises ConfigError if no picture can reach a threshold or all criteria are off, ModelError for an unusable network.
     """
+    if not config.use:
+        return None
     if config.entropy > MOST_ENTROPY:
         raise ConfigError(
             f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MOST_ENTROPY:.3f}: lower it."
@@ -143,12 +143,7 @@ def meter_of(config: Config, board: Board) -> QueryMeter:
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 
-def made_for(board: Board | None, name: str, settings: Settings | None = None) -> Technique:
-    """Make the technique `name`; its network gets as many threads as the board allows (no board: one)."""
-    return made_with(board.threads if board else None, name, settings)
-
-
-def made_with(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
+def made_for(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; its network gets `threads` (None: one) unless `settings` give a number."""
     own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
@@ -162,7 +157,7 @@ def technique_of(
     Raises MapError if `name` or `settings` belong to another technique, UsageError for a setting that it does not have,
     and ModelError for an unusable network.
     """
-    built_with = place_map.spec
+    built_with, settings, threads = place_map.spec, settings or {}, board.threads if board else None
     if not techniques.is_known(built_with.name):
         raise MapError(
             f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
@@ -171,7 +166,7 @@ def technique_of(
         )
     if name in (None, built_with.name):
         try:
-            technique = made_for(board, built_with.name, {**built_with.parameters, **(settings or {})})
+            technique = made_for(threads, built_with.name, {**built_with.parameters, **settings})
         except (UsageError, TypeError, OverflowError) as error:
             if settings and isinstance(error, UsageError):
                 raise
@@ -179,22 +174,34 @@ def technique_of(
                 f"{place_map.path}: its parameters cannot be used ({error}): restore a copy or build the map again."
             ) from error
     else:
-        technique = made_for(board, name, settings)
+        technique = made_for(threads, name, settings)
     place_map.require(technique.spec)
     return technique
 
 
-def _matcher(config: Config, technique: Technique, place_map: PlaceMap | None, index: PlaceIndex) -> Matcher:
-    """Return all that frames are recognised with. The calibration of `place_map` is used (None: the shipped one)."""
-    length = length_of(technique.spec, config.match.sequence)
-    rule = accept_rule(technique, config.match, length, calibration_of(place_map) if place_map else None)
-    return Matcher(technique, index, rule, search_of(length))
+def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
+    """Warn if the places of a map were made with another mask than `mask`. They remain usable: a display in them is
+    just ground that is never seen."""
+    built_with = place_map.mask_sha256
+    if len(place_map) and built_with != mask.sha256:
+        how = "without a mask" if built_with is None else "with another mask"
+        _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
 def _recogniser(
-    config: Config, board: Board, matcher: Matcher, place_map: PlaceMap, narrowed: bool, follows: bool
+    config: Config,
+    board: Board,
+    technique: Technique,
+    place_map: PlaceMap,
+    index: PlaceIndex,
+    *,
+    narrowed: bool,
+    follows: bool,
 ) -> Recogniser:
-    technique, match = matcher.technique, config.match
+    """Make a recogniser from all that is open."""
+    match, length = config.match, length_of(technique.spec, config.match.sequence)
+    rule = accept_rule(technique, match, length, calibration_of(place_map))
+    matcher = Matcher(technique, index, rule, search_of(length))
     if narrowed:
         place_map.wait_at_most(_WAIT_S)
     mask = mask_of(config.source.mask)
@@ -207,41 +214,17 @@ def _recogniser(
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and kinds_of(technique.spec):
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_now)
+    candidates = match.candidates or technique.candidates
+    levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
     return Recogniser(
         matcher,
         place_map,
         meter_of(config, board),
-        WalkSettings(
-            candidates=match.candidates or technique.candidates,
-            verify=match.verify,
-            min_accuracy_m=config.mavlink.min_accuracy_m,
-        ),
-        preparation=Preparation(
-            levelling=levelling_of(config.source, technique, footprint_m=place_map.footprint_m()),
-            mask=mask,
-            gate=gate_of(config.salience, board.threads),
-        ),
+        WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=config.mavlink.min_accuracy_m),
+        preparation=Preparation(levelling=levelling, mask=mask, gate=gate_of(config.salience, board.threads)),
         prior=prior,
         follower=follower,
     )
-
-
-def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
-    """Warn if the places of a map were made with another mask than `mask`. They remain usable: a display in them is
-    just ground that is never seen."""
-    built_with = place_map.mask_sha256
-    if len(place_map) and built_with != mask.sha256:
-        how = "without a mask" if built_with is None else "with another mask"
-        _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
-
-
-@contextmanager
-def _closed_on_error(place_map: PlaceMap) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        place_map.close()
-        raise
 
 
 def _make_map(path: Path, technique: Technique, mask: AnyMask) -> None:
@@ -261,8 +244,3 @@ def _wanted(config: Config) -> dict[str, str]:
 
 def _budget_bytes(config: Config, board: Board) -> int:
     return int(budget_mb(config, board) * 1e6)
-
-
-def _loaded(config: Config, board: Board, technique: Technique, place_map: PlaceMap) -> PlaceIndex:
-    beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
-    return load_index(place_map, technique, _budget_bytes(config, board), beside_bytes=beside_bytes)

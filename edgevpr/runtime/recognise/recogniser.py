@@ -32,7 +32,7 @@ from edgevpr.runtime.recognise.judge import (
     judge,
     says_nothing,
 )
-from edgevpr.runtime.recognise.levelling import AnyLevelling, seen_as
+from edgevpr.runtime.recognise.levelling import Levelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
@@ -60,7 +60,7 @@ class Preparation:
     """Preparation of a frame before it is encoded. `levelling` levels its picture (None: it is used as it is), `mask`
     excludes parts of it (None: no part), and `gate` rejects frames that are not memorable (None: no frame)."""
 
-    levelling: AnyLevelling | None = None
+    levelling: Levelling | None = None
     mask: AnyMask | None = None
     gate: Gate | None = None
 

@@ -9,8 +9,7 @@ If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
 """
 
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
@@ -82,58 +81,39 @@ class Gate:
     ) -> None:
         self.thresholds, self._memorability, self._detector = thresholds, memorability, detector
         self._detect_every, self._footprint_m = detect_every, footprint_m
+        self.forget()
+
+    def forget(self) -> None:
+        """Prepare for another flight: forget the usual entropy and the last result of the detector."""
         self._entropies: deque[float] = deque(maxlen=_REMEMBERED)
         self._until_detection = 0
         self._static: Mask | None = None
 
     def look(self, image: Image) -> Worth:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
-        return self.worth(self.maps(image))
+        scores = scores_of(self.maps(image))
+        self._entropies.append(scores.entropy or 0.0)
+        # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
+        usual = self.thresholds.entropy / 2
+        if len(self._entropies) >= _TO_KNOW:
+            middle, high = np.percentile(self._entropies, (75, 90))
+            usual = float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
+        return worth_of(scores, self.thresholds, usual)
 
     def maps(self, image: Image) -> Maps:
         """Compute the maps of a frame. Raises ModelError as `look` does."""
-        return maps_of(image, self._memorability, self._is_static(image))
-
-    def worth(self, maps: Maps) -> Worth:
-        """Judge the frame that has these maps."""
-        scores = scores_of(maps)
-        self._entropies.append(scores.entropy or 0.0)
-        usual = usual_entropy(self._entropies)
-        # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
-        return worth_of(scores, self.thresholds, self.thresholds.entropy / 2 if usual is None else usual)
-
-    def forget(self) -> None:
-        """Prepare for another flight: forget the usual entropy and the last result of the detector."""
-        self._entropies.clear()
-        self._until_detection, self._static = 0, None
-
-    def _is_static(self, image: Image) -> Mask | None:
-        if self._detector is None:
-            return None
-        if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
-            self._static, self._until_detection = None, self._detect_every
-            self._static = self._detector.is_static(image, self._footprint_m)
-        self._until_detection -= 1
-        return self._static
-
-
-def usual_entropy(entropies: Iterable[float]) -> float | None:
-    """Return the least usual entropy of these frames: a tenth of similar frames have less. None for fewer than 8."""
-    entropies = list(entropies)
-    if len(entropies) < _TO_KNOW:
-        return None
-    middle, high = np.percentile(entropies, (75, 90))
-    return float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
+        if self._detector:
+            if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
+                self._static, self._until_detection = None, self._detect_every  # None, if the detector fails
+                self._static = self._detector.is_static(image, self._footprint_m)
+            self._until_detection -= 1
+        return maps_of(image, self._memorability, self._static)
 
 
 def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> Worth:
     """Compare the scores of a frame with the thresholds; entropy only needs to reach `usual` if that is lower. A score
     that is None is not compared."""
-    least = {
-        "memorability": thresholds.memorability,
-        "staticity": thresholds.staticity,
-        "entropy": min(thresholds.entropy, usual),
-    }
+    least = asdict(thresholds) | {"entropy": min(thresholds.entropy, usual)}
     known = salience.scores
     short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
     worst = max(short, key=lambda name: short[name], default=None)
@@ -155,7 +135,12 @@ def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | N
 
     `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
     """
-    grey = _small_grey(image)
+    shrink, grey = _LONGEST_PX / max(image.shape[:2]), image
+    if shrink < 1:
+        size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
+        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if image.ndim == 3:
+        grey = np.asarray(cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY), np.uint8)
     if is_static is not None:
         covered = cv2.resize((~is_static).astype(np.float32), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         is_static = covered < 0.5
@@ -177,36 +162,20 @@ def scores_of(maps: Maps) -> Salience:
     )
 
 
-def _small_grey(image: Image) -> Image:
-    """Return the picture as uint8 grey, its longer side scaled down to 320 pixels if it is longer."""
-    shrink = _LONGEST_PX / max(image.shape[:2])
-    if shrink < 1:
-        size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
 def drawn_as_png(image: Image, maps: Maps, salience: Salience) -> bytes:
     """Draw a picture, and its three maps over it, as four panels in a PNG file. Blue is low, red is high."""
     size = _WIDTH_PX, round(_WIDTH_PX * image.shape[0] / image.shape[1])
     colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    ground = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-    panels = {"picture": ground}
-    for (name, score), values, full in zip(
-        salience.scores.items(),
-        (maps.memorability, maps.is_static, maps.entropy),
-        (1.0, 1.0, MOST_ENTROPY),
-        strict=True,
-    ):
-        drawn = ground
+    ground = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
+    scores = [f"{name} {'off' if score is None else f'{score:.2f}'}" for name, score in salience.scores.items()]
+    layers = (None, maps.memorability, maps.is_static, maps.entropy / MOST_ENTROPY)
+    panels = []
+    for caption, values in zip(["picture", *scores], layers, strict=True):
+        panel = ground
         if values is not None:
-            levels = cv2.resize(np.clip(values / full * 255, 0, 255).astype(np.uint8), size)
-            coloured = cv2.applyColorMap(np.asarray(levels, np.uint8), cv2.COLORMAP_TURBO)
-            drawn = np.asarray(cv2.addWeighted(coloured, _WEIGHT, ground, 1 - _WEIGHT, 0), np.uint8)
-        panels[f"{name} {'off' if score is None else f'{score:.2f}'}"] = drawn
-    framed = []
-    for caption, drawn in panels.items():
-        panel = cv2.copyMakeBorder(drawn, _CAPTION_PX, 6, 6, 6, cv2.BORDER_CONSTANT, value=(255,) * 3)
+            levels = cv2.resize(np.clip(values * 255.0, 0, 255).astype(np.uint8), size)
+            panel = cv2.addWeighted(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), _WEIGHT, ground, 1 - _WEIGHT, 0)
+        panel = cv2.copyMakeBorder(panel, _CAPTION_PX, 6, 6, 6, cv2.BORDER_CONSTANT, value=(255,) * 3)
         cv2.putText(panel, caption, (10, _CAPTION_PX - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (40,) * 3, 1, cv2.LINE_AA)
-        framed.append(panel)
-    return cv2.imencode(".png", np.vstack([np.hstack(framed[:2]), np.hstack(framed[2:])]))[1].tobytes()
+        panels.append(panel)
+    return cv2.imencode(".png", np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])]))[1].tobytes()

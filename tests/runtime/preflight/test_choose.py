@@ -296,10 +296,10 @@ def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(mon
     accuracies["cohog"] = found(0.9)
     really = pick.made_for
 
-    def made_for(board, name, settings=None):
+    def made_for(threads, name, settings=None):
         if name == "netvlad":
             raise ModelError("There is no model.")
-        return really(board, name, settings)
+        return really(threads, name, settings)
 
     monkeypatch.setattr(pick, "made_for", made_for)
     own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)

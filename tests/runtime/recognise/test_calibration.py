@@ -8,7 +8,7 @@ import math
 import shutil
 import sqlite3
 import zlib
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from fakes import FakeClock
@@ -21,7 +21,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.confidence import as_json, from_json, prior, probability
+from edgevpr.runtime.recognise.confidence import model_of, prior
 from edgevpr.runtime.recognise.evidence import (
     OF_MAP,
     OF_PLACE,
@@ -29,7 +29,6 @@ from edgevpr.runtime.recognise.evidence import (
     calibration_of,
     calibration_text,
     not_calibrated,
-    read_calibration,
     require_usable,
 )
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -105,28 +104,14 @@ DAMAGED = {
     "changed": calibration_text(FOUND).replace("2026", "2025"),
     "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
     "a kind that there is not": calibration_text(replace(FOUND, models={"sideways": OWN})),
-    "not a number": changed(bias=math.nan),
     "a weight too few": changed(weights=OWN.of_map.weights[1:]),
-    "a share of more than all": calibration_text(replace(FOUND, accepted=1.5)),
-    "a share that is no number": calibration_text(replace(FOUND, precision=math.inf)),
     "a place that is no number": calibration_text(replace(FOUND, recognisable={"x": 0.5})),
     "no places": calibration_text(replace(FOUND, recognisable=None)),
-    "nothing asked": calibration_text(replace(FOUND, asked=None)),
     "a wrong surrogate": "\ud800" * 9,
 }
 
 
 @pytest.mark.parametrize("text", DAMAGED.values(), ids=DAMAGED)
-def test_a_damaged_calibration_is_refused(text):
-    def use():
-        for kind, model in read_calibration(text).models.items():
-            require_usable(kind, model)
-
-    with pytest.raises(ValueError, match=r"."):
-        use()
-
-
-@pytest.mark.parametrize("text", [DAMAGED["changed"], DAMAGED["not a number"]])
 def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path, text, caplog):
     keep(path, text)
     with caplog.at_level(logging.WARNING):
@@ -160,7 +145,7 @@ def test_what_to_expect_is_said_in_words_and_figures():
 def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     model = prior(kind)
     require_usable(kind, model)
-    assert from_json(as_json(model)) == model
+    assert model_of(json.loads(json.dumps(asdict(model)))) == model
     evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 0.0)
     for value in (-3.0, -1.0, 0.0, 1.0, 3.0):
         assert 0 <= model.confidence(dict.fromkeys(evidence, value)) <= 1
@@ -169,13 +154,3 @@ def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     needed = [model.threshold(precision) for precision in (0.5, 0.9, 0.99, 0.999, 0.999999)]
     assert needed == sorted(needed)
     assert needed[0] < needed[-1]
-
-
-@pytest.mark.parametrize("text", ["", "[]", "7", "{}", '{"of_map": 1}', "[" * 100_000, '{"of_map": NaN}'])
-def test_a_text_that_is_no_model_is_refused(text):
-    with pytest.raises(ValueError, match=r"."):
-        from_json(text)
-
-
-def test_a_probability_never_overflows():
-    assert (probability(-1e308), probability(0.0), probability(1e308)) == (pytest.approx(0), 0.5, pytest.approx(1))

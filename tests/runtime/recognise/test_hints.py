@@ -6,7 +6,7 @@ import pytest
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, KnownPosition, Prior, Reach, expected_of, hints_of, reach_of
+from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, expected_of
 
 HOME = Position(50.0, 8.0)
 WITHIN_DEG = 22.5
@@ -51,46 +51,46 @@ def found(metres=0.0, heading_deg=None, rotation_deg=None):
     )
 
 
-def test_reach_grows_with_the_time_since_the_position_was_known():
-    assert reach_of(10.0, None, KnownPosition(HOME, 8.0), 15.0, 50.0) == Reach(HOME, 80.0)
-    assert reach_of(10.0, None, KnownPosition(HOME, 10.0), 15.0, 50.0) == Reach(HOME, 50.0)
+def hints_at(now_s, index, autopilot=None, fix=None, reach_m_s=10.0, heading_deg=None):
+    """The hints for a frame at this time, `fix` being our own position and its time (None: there is none)."""
+    prior = Prior(reach_m_s, None if heading_deg is None else WITHIN_DEG, is_live=True)
+    if fix:
+        prior.learn(found(fix[0]), True, fix[1])
+    frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=now_s, heading_deg=heading_deg)
+    return prior.hints(frame, autopilot, index, 50.0)
 
 
-def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old():
-    autopilot, fix = vehicle(north(500), 9.5), KnownPosition(HOME, 0.0)
-    assert reach_of(10.0, autopilot, fix, 10.0, 50.0) == Reach(north(500), 55.0)
-    assert reach_of(10.6, autopilot, fix, 10.0, 50.0) == Reach(HOME, pytest.approx(156.0))
-    assert reach_of(60.1, None, fix, 10.0, 50.0) is None
-    assert reach_of(10.0, None, None, 10.0, 50.0) is None
+def test_reach_grows_with_the_time_since_the_position_was_known(index):
+    assert hints_at(10.0, index, fix=(0, 8.0), reach_m_s=15.0) == Hints(Reach(HOME, 80.0))
+    assert hints_at(10.0, index, fix=(0, 10.0), reach_m_s=15.0) == Hints(Reach(HOME, 50.0))
+    heard_after_the_frame = vehicle(HOME, 10.5)
+    assert hints_at(10.0, index, heard_after_the_frame) == Hints(Reach(HOME, 55.0))
 
 
-def test_a_position_heard_after_the_frame_was_taken_is_as_far_off_in_time():
-    assert reach_of(10.0, vehicle(HOME, 10.5), None, 10.0, 50.0) == Reach(HOME, 55.0)
+def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old(index):
+    autopilot, fix = vehicle(north(200), 9.5), (0, 0.0)
+    assert hints_at(10.0, index, autopilot, fix) == Hints(Reach(north(200), 55.0))
+    assert hints_at(10.6, index, autopilot, fix) == Hints(Reach(HOME, pytest.approx(156.0)))
+    assert hints_at(60.1, index, None, fix) is None
+    assert hints_at(10.0, index) is None
 
 
 def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
-    hints = hints_of(index, Reach(north(120), 90.0), None)
-    assert hints == Hints(Reach(north(120), 90.0))
-    assert expected_of(hints, 1.0, index).in_reach.tolist() == [False, True, True, False, False]
-    assert expected_of(hints, 1.0, index).turned_deg is None
+    expected = expected_of(Hints(Reach(north(120), 90.0)), 1.0, index)
+    assert expected.in_reach.tolist() == [False, True, True, False, False]
+    assert expected.turned_deg is None
+    assert hints_at(10.0, index, vehicle(north(5000), 10.0)) is None, "no place is in reach: all are searched"
+    everywhere = expected_of(None, 1.0, index)
+    assert (everywhere.in_reach, everywhere.turned_deg) == (None, None)
 
 
-def test_where_no_place_is_in_reach_all_are_searched(index):
-    assert hints_of(index, Reach(north(5000), 100.0), None) is None
-    assert expected_of(None, 1.0, index).in_reach is None
-    assert expected_of(None, 1.0, index).turned_deg is None
-
-
-def test_a_heading_says_how_far_each_place_is_turned(index):
-    hints = hints_of(index, None, 5.0)
+def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
+    hints = hints_at(10.0, index, heading_deg=5.0)
     assert expected_of(hints, 1.0, index).in_reach is None
     np.testing.assert_array_equal(expected_of(hints, 1.0, index).turned_deg, [5, 355, 345, np.nan, 15])
-
-
-def test_a_heading_is_no_hint_where_no_place_has_one(index):
     index.heading_deg[:] = np.nan
-    assert hints_of(index, None, 5.0) is None
-    assert hints_of(index, Reach(HOME, 50.0), 5.0) == Hints(Reach(HOME, 50.0))
+    assert hints_at(10.0, index, heading_deg=5.0) is None
+    assert hints_at(10.0, index, vehicle(HOME, 10.0), heading_deg=5.0) == Hints(Reach(HOME, 50.0))
 
 
 def test_what_the_log_says():

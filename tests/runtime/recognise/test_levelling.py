@@ -21,7 +21,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import Leaning, Levelling, laid, levelling_of
+from edgevpr.runtime.recognise.levelling import Levelling, laid, levelling_of
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser
 from edgevpr.techniques import create
@@ -223,7 +223,7 @@ def test_a_place_without_a_position_has_no_pose():
     ("camera", "settings", "kind"),
     [
         ("nadir", {"source.fov_deg": 66.0}, Levelling),
-        ("nadir", {}, Leaning),
+        ("nadir", {}, Levelling),
         ("nadir", {"source.gimbal": True}, type(None)),
         ("forward", {"source.fov_deg": 66.0}, type(None)),
     ],
@@ -247,17 +247,17 @@ def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitc
     told = how | {"height_m": 80.0}
     vehicle = vehicle_at(50.0, 8.0, 5.0, **told)
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0)
-    view = Leaning(is_live=True).prepare(frame, vehicle, None).view
+    view = Levelling(None, is_live=True).prepare(frame, vehicle, None).view
     assert view.lean_m == pytest.approx((-east / scale, -north / scale), abs=0.15)
-    assert Leaning(is_live=False).prepare(frame, vehicle, None).view == UNKNOWN_VIEW, "it is of another time"
-    assert Leaning(is_live=True).prepare(replace(frame, t_mono_s=7.0), vehicle, None).view == UNKNOWN_VIEW
-    assert Leaning(is_live=False).prepare(replace(frame, **told), None, None).view == view, "a recording's own"
+    assert Levelling(None, is_live=False).prepare(frame, vehicle, None).view == UNKNOWN_VIEW, "it is of another time"
+    assert Levelling(None, is_live=True).prepare(replace(frame, t_mono_s=7.0), vehicle, None).view == UNKNOWN_VIEW
+    assert Levelling(None, is_live=False).prepare(replace(frame, **told), None, None).view == view, "a recording's own"
 
 
 def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_nothing_is_known():
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
-    assert Leaning(is_live=False).prepare(frame, None, None).view.reason.split()[-2:] == ["50", "degrees"]
-    assert Leaning(is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
+    assert Levelling(None, is_live=False).prepare(frame, None, None).view.reason.split()[-2:] == ["50", "degrees"]
+    assert Levelling(None, is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
 
 
 def test_a_place_of_an_unknown_lens_lies_where_the_picture_looks():
