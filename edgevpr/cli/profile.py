@@ -135,13 +135,13 @@ def _detect(args: Namespace) -> int:
 
     found = detect()
     if args.json:
-        print_json(asdict(found))
+        print_json(found)
     else:
         print(describe(found))
     if args.out:
         write_profile(Path(args.out), own_profile(micro_benchmark()))
         print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)
-    elif found.board is None and not args.json:
+    elif found["board"] is None and not args.json:
         print("--out FILE.yaml writes a profile of it.")
     return 0
 

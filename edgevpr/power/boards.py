@@ -7,6 +7,7 @@ module also detects the machine that it runs on. The flight, `edgevpr profile` a
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
 from edgevpr.core.errors import ConfigError
@@ -16,7 +17,6 @@ from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal
 
 _ANY_MACHINE = "generic-x86"
-_SAME_RAM = 1.02  # a factor, since each version of the kernel reserves a different amount of RAM
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +49,8 @@ class Board:
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
     `technique`: used if the user names none, provided that it fits (None: the best that fits).
     `threads`: number of threads that a network may use.
-    `recognised_by`, `machine`: a machine is this board if the model in its device tree contains the first text, or if
-    its `machine.title` is the second (None: this test does not apply).
+    `recognised_by`, `machine`: a machine is this board if the model in its device tree contains the first text; the
+    profile was written on the machine whose `machine.title` is the second (None: neither is known).
     """
 
     name: str
@@ -81,90 +81,53 @@ def board_names() -> tuple[str, ...]:
 def load_board(name: str, root: Path = Path("/")) -> Board:
     """Load the profile called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
 
-    Raises ConfigError if there is no such board, if the file is incomplete or invalid, or if it is a profile of this
-    machine with more memory than the machine has.
+    Raises ConfigError if there is no such board, or if the file is incomplete or invalid.
     """
     if name == "this":
         return _this_machine(root)
-    if name in board_names():
-        return _read(shipped("profiles") / f"{name}.yaml")
     if name.endswith((".yaml", ".yml")) or "/" in name:
-        board, there_mb = _read(Path(name)), machine.ram_mb(root)
-        if is_this_machine(board, root) and board.ram_mb > _SAME_RAM * there_mb:
-            raise ConfigError(
-                f"{name}: `ram_mb` is {board.ram_mb:g}, and this machine, whose profile it is, has {there_mb:.0f}: "
-                "correct it."
-            )
-        return board
+        return _read(Path(name))
+    if name in board_names():
+        return _shipped(name)
     names = ["this", *board_names()]
     hint = meant(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
 
-def is_this_machine(board: Board, root: Path = Path("/")) -> bool:
-    """Tell whether `board` is a profile of the machine that this process runs on."""
-    return _is_called(board, machine.model(root)) or (
-        board.machine is not None and board.machine == machine.title(root)
-    )
+def detect(root: Path = Path("/")) -> dict[str, Any]:
+    """Describe this machine: its `title`, `cpu`, `cores`, `ram_mb`, and `thermal_limit_c`, the degrees Celsius at which
+    it begins to slow down; `usable_cores` and `ram_limit_mb`, what CPU affinity and control groups leave of them to
+    this process; `board`, the name of its profile, and `model`, its name by its maker (None: unknown)."""
+    cores, recognised = machine.cores_online(root), _recognised(root)
+    return {
+        "board": recognised.name if recognised else None,
+        "model": machine.model(root) or machine.dmi_model(root),
+        "cpu": machine.cpu(root),
+        "cores": cores,
+        "usable_cores": min(float(cores), machine.cores(root)),
+        "ram_mb": machine.ram_mb(root),
+        "ram_limit_mb": machine.ram_limit_mb(root),
+        "thermal_limit_c": thermal.limit_c(root),
+        "title": machine.title(root),
+    }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Detected:
-    """Description of this machine.
-
-    `board`: name of its profile in `profiles/` (None: it has none).
-    `model`: its name in the device tree, or else in the firmware's DMI table (None: in neither).
-    `usable_cores`, `ram_limit_mb`: what CPU affinity and control groups leave of `cores` and `ram_mb` to this process.
-    `thermal_limit_c`: degrees Celsius at which it begins to slow down. `title`: see `machine.title`.
-    """
-
-    board: str | None
-    model: str | None
-    from_device_tree: bool
-    cpu: str
-    cores: int
-    usable_cores: float
-    ram_mb: float
-    ram_limit_mb: float
-    thermal_limit_c: float
-    title: str
-
-
-def detect(root: Path = Path("/")) -> Detected:
-    """Describe this machine. No name is guessed: an unknown `model` is None, an unknown `cpu` begins with "unknown"."""
-    model, cores = machine.model(root), machine.cores_online(root)
-    recognised = _recognised(model)
-    return Detected(
-        board=recognised.name if recognised else None,
-        model=model or machine.dmi_model(root),
-        from_device_tree=model is not None,
-        cpu=machine.cpu(root),
-        cores=cores,
-        usable_cores=min(float(cores), machine.cores(root)),
-        ram_mb=machine.ram_mb(root),
-        ram_limit_mb=machine.ram_limit_mb(root),
-        thermal_limit_c=thermal.limit_c(root),
-        title=machine.title(root),
-    )
-
-
-def describe(found: Detected) -> str:
-    """Return two sentences about the machine: its profile, and its cores, memory and thermal limit."""
-    known = f"the board {found.board}" if found.board else f"no board of edgevpr's: {_ANY_MACHINE} stands in"
+def describe(found: dict[str, Any]) -> str:
+    """Return two sentences about the machine that was detected: its profile, and its cores, memory and thermal
+    limit."""
+    known = f"the board {found['board']}" if found["board"] else f"no board of edgevpr's: {_ANY_MACHINE} stands in"
     return (
-        f"`{found.title}` is {known}. It has {found.cores} cores and {found.ram_mb:.0f} MB of RAM, of which this "
-        f"process may use {found.usable_cores:.3g} and {found.ram_limit_mb:.0f}, and begins to slow down at "
-        f"{found.thermal_limit_c:g} degrees Celsius."
-    )
+        "`{title}` is {known}. It has {cores} cores and {ram_mb:.0f} MB of RAM, of which this process may use "
+        "{usable_cores:.3g} and {ram_limit_mb:.0f}, and begins to slow down at {thermal_limit_c:g} degrees Celsius."
+    ).format(known=known, **found)
 
 
 def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
-    """Return a profile of this machine with the score `speed`, which `load_board` recognises as this machine's own. Its
-    power is that of the shipped profile of its board, else relative (idle 0 W, full load 1 W). Memory and shares are
-    those of `load_board("this")`."""
+    """Return a profile of this machine with the score `speed`. Its power is that of the shipped profile of its board,
+    else relative (idle 0 W, full load 1 W). Memory and shares are those of `load_board("this")`."""
     board, model = _this_machine(root), machine.model(root)
     source = board.source
-    if not _is_called(board, model):
+    if not _recognised(root):
         unknown = model or machine.dmi_model(root) or "machine like this"
         source = f"nobody has measured a {unknown}: relative figures (idle 0, full load 1 W)"
     return replace(board, title=machine.title(root), recognised_by=model, source=source, benchmark_score=speed)
@@ -172,28 +135,21 @@ def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
 
 def profile_text(board: Board) -> str:
     """Return a profile as YAML text, which `load_board` can read."""
-    values = asdict(board)
-    del values["name"]  # it is the name of the file
-    # JSON values are valid YAML, whatever characters they contain.
-    texts = {key: json.dumps(_printable(value), ensure_ascii=False) for key, value in values.items()}
-    lines = "".join(f"{key}: {text}\n" for key, text in texts.items())
-    return f"# Written by edgevpr for the machine it ran on; profiles/{_ANY_MACHINE}.yaml explains it.\n\n{lines}"
+    # The name is that of the file. JSON values are valid YAML, whatever characters they contain.
+    lines = [f"{key}: {json.dumps(value)}\n" for key, value in asdict(board).items() if key != "name"]
+    about = f"# Written by edgevpr for the machine it ran on; profiles/{_ANY_MACHINE}.yaml explains it.\n\n"
+    return about + "".join(lines)
 
 
-def _is_called(board: Board, model: str | None) -> bool:
-    """Tell whether `model`, from a device tree (None: there is none), names a board of this profile."""
-    return bool(board.recognised_by and model) and str(board.recognised_by).lower() in str(model).lower()
+def _recognised(root: Path) -> Board | None:
+    """Return the shipped profile of the board whose device tree is below `root`; None if there is none."""
+    model = (machine.model(root) or "").lower()
+    known = map(_shipped, board_names() if model else ())
+    return next((board for board in known if board.recognised_by and board.recognised_by.lower() in model), None)
 
 
-def _recognised(model: str | None) -> Board | None:
-    """Return the shipped profile of the board with this model in its device tree; None if there is none."""
-    known = (_read(shipped("profiles") / f"{name}.yaml") for name in board_names() if model)
-    return next((board for board in known if _is_called(board, model)), None)
-
-
-def _printable(value: object) -> object:
-    is_odd = isinstance(value, str) and not value.isprintable()
-    return "".join(c if c.isprintable() else " " for c in str(value)) if is_odd else value
+def _shipped(name: str) -> Board:
+    return _read(shipped("profiles") / f"{name}.yaml")
 
 
 def _read(path: Path) -> Board:
@@ -213,9 +169,8 @@ def _read(path: Path) -> Board:
 def _this_machine(root: Path) -> Board:
     """Return the shipped profile of this machine's board (generic-x86 if it has none), with the cores and memory that
     the machine really has."""
-    model = machine.model(root)
-    recognised = _recognised(model)
-    profile = recognised or _read(shipped("profiles") / f"{_ANY_MACHINE}.yaml")
+    model, recognised = machine.model(root), _recognised(root)
+    profile = recognised or _shipped(_ANY_MACHINE)
     title, speed = profile.title, profile.benchmark_score
     if model and not recognised:
         title = f"{model}, which has no profile: the figures of {_ANY_MACHINE}"

@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -63,11 +64,8 @@ def measure_at(
     meter: Meter, share: float, settle_s: float = _SETTLE_S, window_s: float = _WINDOW_S
 ) -> tuple[float, float]:
     """Hold the load `share` (0..1), let the meter settle for `settle_s` seconds, and measure for `window_s` seconds.
-
-    Returns two numbers (raises MeterError):
-    - the utilisation of the whole machine, 0..1, including other programs, since the meter measures them too;
-    - the mean power in watts.
-    """
+    Returns the utilisation of the whole machine, 0..1, including other programs, since the meter measures them too, and
+    the mean power in watts. Raises MeterError."""
     with hold_load(share):
         time.sleep(settle_s)
         psutil.cpu_percent()  # starts the interval of the next call
@@ -79,8 +77,6 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
     """Fit W = a + s U by least squares to `samples` (U, W), U in 0..1. Raises MeterError if no board can have this
     line."""
     u, watts = np.array(samples, np.float64).reshape(-1, 2).T
-    if not (np.isfinite(u).all() and np.isfinite(watts).all()):
-        raise MeterError("A power measurement is not a number: measure again.")
     distinct = len(set(np.round(u / _SAME_LOAD)))
     if distinct < _LEAST_LOADS:
         raise MeterError(
@@ -88,18 +84,13 @@ def fit_power(samples: Sequence[tuple[float, float]]) -> PowerFit:
             "let this one use all cores."
         )
     (idle_w, span_w), *_ = np.linalg.lstsq(np.column_stack([np.ones_like(u), u]), watts, rcond=None)
-    if idle_w < -1e-9:
-        raise MeterError(
-            f"The measured power would be {idle_w:.3g} W at idle, which cannot be: check the meter's wiring, and "
-            "measure for longer."
-        )
     residuals = watts - (idle_w + span_w * u)
     spread = float(((watts - watts.mean()) ** 2).sum())
     r2 = 1.0 - float((residuals**2).sum()) / spread if spread > 0 else 0.0
-    if span_w <= 0 or r2 < _LEAST_R2:
+    if idle_w < -1e-9 or span_w <= 0 or r2 < _LEAST_R2:
         raise MeterError(
-            f"The measured power does not follow the load ({span_w:.3g} W from idle to full, R2 {r2:.2f}): see that "
-            "the meter is wired to what feeds the CPU, and measure for longer."
+            f"The measured power is of no board: {idle_w:.3g} W idle, {span_w:.3g} W more at full load, R2 {r2:.2f}: "
+            "see that the meter is wired to what feeds the CPU, and measure again."
         )
     return PowerFit(
         idle_w=max(0.0, float(idle_w)),
@@ -128,15 +119,13 @@ def hold_load(share: float) -> Iterator[None]:
         while not stop.is_set():
             stop.wait(work_a_period(share, lambda: np.matmul(left, right, out=product)))
 
-    workers = [threading.Thread(target=run, args=(DUTY_PERIOD_S * n / count,), daemon=True) for n in range(count)]
-    for worker in workers:
-        worker.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        for worker in workers:
-            worker.join()
+    with ThreadPoolExecutor(max(1, count)) as pool:
+        for number in range(count):
+            pool.submit(run, DUTY_PERIOD_S * number / count)
+        try:
+            yield
+        finally:
+            stop.set()
 
 
 def work_a_period(share: float, work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:

@@ -9,6 +9,7 @@ import platform
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
@@ -63,13 +64,6 @@ def cores_online(root: Path = _ROOT) -> int:
     return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
 
 
-def vcgencmd(root: Path = _ROOT) -> Path | None:
-    """Return the path of the program that asks a Raspberry Pi's firmware (older systems: /opt/vc); None on other
-    boards."""
-    places = (root / "usr/bin/vcgencmd", root / "opt/vc/bin/vcgencmd")
-    return next((place for place in places if place.exists()), None)
-
-
 def cores(root: Path = _ROOT) -> float:
     """Return how many cores this process may use, by CPU affinity and the quotas (cpu.max) of its control groups."""
     usable = float(len(os.sched_getaffinity(0)))
@@ -99,11 +93,9 @@ def rss_mb(root: Path = _ROOT) -> float:
 
 def forget_peak(root: Path = _ROOT) -> bool:
     """Reset the peak that `peak_mb` returns to what is resident now. Returns False if the kernel does not allow it."""
-    try:
-        (root / "proc/self/clear_refs").write_text("5")
-    except OSError:
-        return False
-    return True
+    with suppress(OSError):
+        return bool((root / "proc/self/clear_refs").write_text("5"))
+    return False
 
 
 def peak_mb(root: Path = _ROOT) -> float:
@@ -113,10 +105,9 @@ def peak_mb(root: Path = _ROOT) -> float:
 
 def pss_mb(root: Path = _ROOT) -> float | None:
     """Return the memory of this process in MB, with shared pages in proportion (PSS); None if the kernel gives none."""
-    try:
+    with suppress(OSError):
         return _kib_line(root / "proc/self/smaps_rollup", "Pss:")
-    except OSError:
-        return None
+    return None
 
 
 def text(path: Path) -> str | None:

@@ -1,4 +1,5 @@
-"""Metering of queries: wall and CPU seconds, utilisation and charge of each, and the totals of a flight.
+"""Metering of queries: wall and CPU seconds, utilisation and charge of each, and the totals of a flight. Also the CPU
+load and memory of the machine, for flight controller and ground station.
 
 Energies add up, powers do not (see `equations`, which explains a, s and U). The idle energy a T of a flight of T
 seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, in whatever order the stages run.
@@ -10,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import psutil
+
 from edgevpr.core.types import NO_COST, QueryCost, StageCost, Steps
 from edgevpr.power import machine
 from edgevpr.power.boards import Board
@@ -17,6 +20,7 @@ from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_ener
 
 Clock = Callable[[], float]
 _PSS_EVERY_S = 20.0
+_KEPT_WAITING = 0.15  # of busy time; a thread off the CPU for more was kept waiting by other programs
 
 
 @dataclass(slots=True)
@@ -48,9 +52,7 @@ class OwnMemory:
         self._pss_mb: float | None = None
 
     def look(self) -> tuple[float, float | None]:
-        """Return two numbers in MB:
-        - the RSS now;
-        - the PSS that was read last; None if the kernel does not report it."""
+        """Return the RSS now, and the PSS that was read last (None: the kernel does not report it), MB."""
         now_s = self._clock()
         if now_s - self._read_s >= _PSS_EVERY_S:
             self._read_s, self._pss_mb = now_s, self._read()
@@ -98,15 +100,8 @@ class QueryMeter:
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""
         steps, (rss_mb, pss_mb) = self.steps(), self._memory_mb()
-        return query_cost(
-            steps.encoding,
-            steps.match,
-            self.board,
-            self._pack,
-            self._regulator_efficiency,
-            rss_mb=rss_mb,
-            pss_mb=pss_mb,
-        )
+        stages, efficiency = (steps.encoding, steps.match), self._regulator_efficiency
+        return query_cost(*stages, self.board, self._pack, efficiency, rss_mb=rss_mb, pss_mb=pss_mb)
 
 
 def query_cost(
@@ -139,46 +134,75 @@ def query_cost(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EnergySoFar:
-    """Totals since the start: wall seconds; energy in joules at the board's input (`idle_j`: of the idle board,
-    `marginal_j`: what the stages add); CPU-seconds of the stages and of the whole process."""
-
-    elapsed_s: float
-    idle_j: float
-    marginal_j: float
-    stages_cpu_s: float
-    process_cpu_s: float
-
-
 class RunningEnergy:
-    """Sum of the energy of stages, in flight. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads."""
+    """Sum of the stages of a flight since it was made: `marginal_j`, joules at the board's input that they added, and
+    `stages_cpu_s`. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads."""
 
-    def __init__(
-        self,
-        board: Board,
-        clock: Clock = time.monotonic,
-        cpu_clock: Clock = time.process_time,
-    ) -> None:
+    def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
         self._start_s, self._cpu_start_s = clock(), cpu_clock()
-        self._marginal_j = self._stages_cpu_s = 0.0
+        self.marginal_j = self.stages_cpu_s = 0.0
 
     def add(self, *stages: StageCost) -> None:
-        """Add stages that have ended. The time between stages costs idle power only; `so_far` adds it from the
-        clock."""
+        """Add stages that have ended."""
         for stage in stages:
             u = stage.utilisation(self._board.cores)
-            self._marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
-            self._stages_cpu_s += stage.cpu_s
+            self.marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
+            self.stages_cpu_s += stage.cpu_s
 
-    def so_far(self) -> EnergySoFar:
-        """Return the totals until now."""
-        elapsed_s = self._clock() - self._start_s
-        return EnergySoFar(
-            elapsed_s=elapsed_s,
-            idle_j=self._board.idle_w * elapsed_s,
-            marginal_j=self._marginal_j,
-            stages_cpu_s=self._stages_cpu_s,
-            process_cpu_s=self._cpu_clock() - self._cpu_start_s,
-        )
+    def process(self) -> StageCost:
+        """Return the time since the start, and the CPU time of the whole process in it."""
+        return StageCost(self._clock() - self._start_s, self._cpu_clock() - self._cpu_start_s)
+
+
+@dataclass(frozen=True, slots=True)
+class MachineLoad:
+    """Load of the machine: the busy share of each core, 0..1, since the last call of `machine_load`, and RAM in
+    bytes."""
+
+    core_shares: tuple[float, ...]
+    ram_used_bytes: int
+    ram_total_bytes: int
+
+
+def machine_load() -> MachineLoad:
+    """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
+    memory = psutil.virtual_memory()
+    return MachineLoad(
+        tuple(percent / 100 for percent in psutil.cpu_percent(percpu=True)),
+        memory.total - memory.available,
+        memory.total,
+    )
+
+
+class OwnLoad:
+    """Share of all `cores` that this process uses, and of its time in which other programs keep it waiting, between two
+    calls of `look`. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads of this process."""
+
+    def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
+        self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
+        self._busy_s = self._ran_s = 0.0
+        self._looked_s, self._cpu_s = clock(), cpu_clock()
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the last call of `look`."""
+        return self._clock() - self._looked_s
+
+    def busy(self, work: StageCost) -> None:
+        """Record a piece of work. Its `cpu_s` is that of the thread that did it or waited for it
+        (`time.thread_time`)."""
+        self._busy_s += work.wall_s
+        self._ran_s += work.cpu_s
+
+    def look(self) -> tuple[float, float]:
+        """Return two shares since the last call, 0..1:
+        - the share of all cores that this process used;
+        - the share of the time that its recorded work took; 0 if other programs did not keep it waiting."""
+        now_s, cpu_s = self._clock(), self._cpu_clock()
+        span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
+        waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s
+        late_share = min(1.0, self._busy_s / span.wall_s) if waited and span.wall_s > 0 else 0.0
+        self._looked_s, self._cpu_s = now_s, cpu_s
+        self._busy_s = self._ran_s = 0.0
+        return span.utilisation(self._cores), late_share

@@ -1,15 +1,15 @@
 """Temperature and CPU frequency of the machine, and signs that it slows itself down, for the flight.
 
-A reading opens two or three files of /sys: microseconds. The Raspberry Pi's firmware is slower and is asked once in
-`SLOW_S` seconds.
+A reading opens two or three files of /sys. The Raspberry Pi's firmware is slower and is asked once in `SLOW_S` seconds.
 """
 
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from edgevpr.power import machine
 
 SLOW_S = 5.0
 _UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
@@ -40,8 +40,8 @@ class ThermalWatch:
         self._limit_c = limit_c(root)
         policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
         self._policy = max(policies, key=lambda policy: _number(policy / "cpuinfo_max_freq") or 0, default=None)
-        self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0.0
-        self._allowed_khz = 0.0
+        self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0
+        self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
         self._bits: int | None = None
         self._slow_at_s = float("-inf")
@@ -51,7 +51,7 @@ class ThermalWatch:
         None."""
         now_s = self._clock()
         if self._firmware and now_s - self._slow_at_s >= SLOW_S:
-            self._slow_at_s, self._bits = now_s, _hexadecimal(_content(self._firmware))
+            self._slow_at_s, self._bits = now_s, _number(self._firmware, 16)
         degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
         khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
@@ -61,7 +61,7 @@ class ThermalWatch:
         throttled = any(slows for slows, _ in reasons) if can_tell else None
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
 
-    def _reasons(self, temperature_c: float | None, khz: float | None) -> Iterator[tuple[bool, str]]:
+    def _reasons(self, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
         """Yield (slows, what) for everything seen: True if it slows the machine down now, and a text about it."""
         bits = self._bits or 0
         if now := [word for bit, word in _BITS if bits & bit]:
@@ -70,7 +70,7 @@ class ThermalWatch:
             yield False, f"{', '.join(before)} since start"
         if self._policy:
             # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest seen is normal.
-            allowed_khz = _number(self._policy / "scaling_max_freq") or 0.0
+            allowed_khz = _number(self._policy / "scaling_max_freq") or 0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
             hot = temperature_c is not None and temperature_c >= self._limit_c
@@ -93,7 +93,7 @@ def limit_c(root: Path = Path("/")) -> float:
         for path in zone.glob("trip_point_*_type"):
             value = _number(path.with_name(path.name.replace("_type", "_temp")))
             if value is not None and 40_000 <= value <= 125_000:
-                trips.setdefault((_content(path) or "").strip(), []).append(value / 1000)
+                trips.setdefault(machine.text(path) or "", []).append(value / 1000)
     if "passive" in trips:
         return min(trips["passive"])
     return min([_UNKNOWN_LIMIT_C, *(value - 10 for value in trips.get("critical", []))])
@@ -101,32 +101,11 @@ def limit_c(root: Path = Path("/")) -> float:
 
 def _cpu_zones(root: Path) -> list[Path]:
     zones = sorted((root / "sys/class/thermal").glob("thermal_zone*"))
-    return [zone for zone in zones if _CPU_ZONE.search(_content(zone / "type") or "")] or zones
+    return [zone for zone in zones if _CPU_ZONE.search(machine.text(zone / "type") or "")] or zones
 
 
-def _content(path: Path) -> str | None:
-    """Return the first 64 bytes of a small file as text, None if that fails. `os.open`: a third of the time of
-    `read_text`."""
+def _number(path: Path, base: int = 10) -> int | None:
     try:
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            return os.read(handle, 64).decode("ascii", errors="replace")
-        finally:
-            os.close(handle)
-    except OSError:
-        return None
-
-
-def _number(path: Path) -> float | None:
-    try:
-        value = float(_content(path) or "")
-    except ValueError:
-        return None
-    return value if abs(value) < float("inf") else None
-
-
-def _hexadecimal(text: str | None) -> int | None:
-    try:
-        return int((text or "").strip(), 16)
+        return int(machine.text(path) or "", base)
     except ValueError:
         return None

@@ -56,14 +56,9 @@ def test_a_profile_of_ones_own_is_named_by_its_path(tmp_path):
     [
         ({"full_w": 1.5}, "`full_w` is 1.5, below `idle_w`, 2.29: correct one of them."),
         ({"idle_w": -1}, "`idle_w` is -1; it must be between 0 and 1000."),
-        ({"ram_mb": 0}, "`ram_mb` is 0; it must be between 64 and 4e+06."),
-        ({"cpu_share": 1.5}, "`cpu_share` is 1.5; it must be between 0.01 and 1."),
-        ({"cores": "four"}, "`cores` must be a whole number, not 'four'."),
-        ({"verified": "maybe"}, "`verified` must be true or false, not 'maybe'."),
         ({"wats": 3}, "unknown key `wats`"),
-        ({"thermal_limit_c": 200}, "`thermal_limit_c` is 200; it must be between 30 and 125."),
-        ({"technique": 5}, "`technique` must be a text, not 5."),
         ({"source": None}, "the key `source` is missing: add it."),
+        ({"  single": 0}, "`benchmark_score.single` is 0; it must be between 0.0001 and 100."),
         (
             {"budget_mb": 600},
             "`budget_mb` (600) must fit in `memory_max_mb` (512), and that in `ram_mb` (1024): correct them.",
@@ -152,8 +147,6 @@ def test_a_network_gets_no_more_threads_than_the_board_spares_cores(tmp_path):
         board = load_board(name)
         assert 1 <= board.threads <= max(1, round(board.cores * board.cpu_share))
     assert load_board(own_profile(tmp_path, threads=None)).threads == 1
-    with pytest.raises(ConfigError, match="`threads` is 0"):
-        load_board(own_profile(tmp_path, threads=0))
     root = this_root(tmp_path / "this", "Raspberry Pi 4 Model B", cpu_max="20000 100000\n")
     assert load_board("this", root).threads == 1
 
@@ -194,12 +187,6 @@ def test_the_scores_are_the_published_figures_beside_the_references(name, single
     assert board.thermal_limit_c == thermal_limit_c
 
 
-def test_a_score_is_a_whole_section(tmp_path):
-    path = own_profile(tmp_path, **{"  single": 0})
-    with pytest.raises(ConfigError, match=r"`benchmark_score\.single` is 0"):
-        load_board(path)
-
-
 def test_this_machine_knows_where_it_begins_to_slow_down(tmp_path):
     assert load_board("this", this_root(tmp_path / "pi", "Raspberry Pi 3 Model B Plus Rev 1.3")).thermal_limit_c == 60
     root = this_root(tmp_path / "nano", "NVIDIA Jetson Nano Developer Kit")
@@ -208,21 +195,3 @@ def test_this_machine_knows_where_it_begins_to_slow_down(tmp_path):
     for name, content in {"type": "CPU-therm", "trip_point_0_type": "passive", "trip_point_0_temp": "97000"}.items():
         (zone / name).write_text(content + "\n")
     assert load_board("this", root).thermal_limit_c == 97
-
-
-def test_a_profile_of_this_very_machine_cannot_promise_more_memory_than_there_is(tmp_path):
-    root = this_root(tmp_path / "root", "Raspberry Pi 4 Model B Rev 1.4", ram_kb=1_000_000)
-    path = own_profile(tmp_path, ram_mb=8192)
-    with pytest.raises(ConfigError, match=r"8192.* 1024"):
-        load_board(path, root)
-    assert load_board(path, this_root(tmp_path / "other", "Raspberry Pi 5 Model B")).ram_mb == 8192
-    assert load_board(own_profile(tmp_path, ram_mb=1030), root).ram_mb == 1030
-
-
-def test_a_machine_without_a_device_tree_is_known_again_by_what_it_calls_itself(tmp_path):
-    root = this_root(tmp_path / "root", ram_kb=1_000_000)
-    (root / "proc/cpuinfo").write_text("model name\t: Intel(R) N100\n")
-    mine = own_profile(tmp_path, machine="a machine without a name (Intel(R) N100)", recognised_by="null", ram_mb=8192)
-    with pytest.raises(ConfigError, match="1024"):
-        load_board(mine, root)
-    assert load_board("this", root).machine == "a machine without a name (Intel(R) N100)"

@@ -10,7 +10,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.calibrate import DUTY_PERIOD_S, LOADS, calibrate, fit_power, hold_load, measure_at, work_a_period
 from edgevpr.power.sensors import Meter, MeterError
 
-METER = Meter(title="INA3221 (hwmon1), channel VDD_IN", period_s=0.05, look=lambda: 4.0)
+METER = Meter(title="INA3221 (hwmon1), channel VDD_IN", look=lambda: 4.0)
 
 
 def test_a_perfect_line_is_found_exactly():
@@ -35,11 +35,10 @@ def test_noise_shows_as_residual_and_hardly_moves_the_line():
         ([], "0 different loads"),
         ([(0.5, 4.0)] * 5, "1 different loads"),
         ([(0.0, 2.0), (0.02, 2.1), (0.9, 6.0), (0.91, 6.1)], "2 different loads"),
-        ([(0.2, 0.5), (0.6, 3.0), (1.0, 5.5)], "-0.75 W at idle"),
-        ([(0.0, 5.0), (0.5, 4.0), (1.0, 3.0)], r"\(-2 W"),
-        ([(0.0, 5.0), (0.5, 5.0), (1.0, 5.0)], "follow"),
-        ([(0.0, 5.0), (0.3, 4.0), (0.6, 6.0), (1.0, 5.1)], r"\(0.644 W .*, R2 0.11\)"),
-        ([(0.0, 2.0), (0.5, float("nan")), (1.0, 3.0)], "not a number"),
+        ([(0.2, 0.5), (0.6, 3.0), (1.0, 5.5)], "-0.75 W idle"),
+        ([(0.0, 5.0), (0.5, 4.0), (1.0, 3.0)], "-2 W more"),
+        ([(0.0, 5.0), (0.5, 5.0), (1.0, 5.0)], "of no board"),
+        ([(0.0, 5.0), (0.3, 4.0), (0.6, 6.0), (1.0, 5.1)], r"0.644 W .*, R2 0.11"),
     ],
 )
 def test_figures_that_no_board_can_have_are_one_sentence(samples, word):
@@ -59,7 +58,7 @@ def test_a_board_gets_the_watts_at_what_the_whole_machine_did(monkeypatch):
     board = fit.applied_to(load_board("rpi-4b"), METER)
     assert (board.idle_w, board.full_w, board.verified) == (pytest.approx(2.0), pytest.approx(5.0), True)
     assert board.source.startswith("straight line through 5 loads measured on this machine with its INA3221 (hwmon1)")
-    assert not fit.applied_to(board, Meter(title="INA219", period_s=1, look=METER.look, certain=False)).verified
+    assert not fit.applied_to(board, Meter(title="INA219", look=METER.look, certain=False)).verified
 
 
 @pytest.mark.slow
@@ -82,13 +81,6 @@ def test_work_and_rest_are_as_asked_however_long_one_call_takes(share):
         worked_s, rested_s = worked_s + now_s[0] - before_s, rested_s + rest_s
     assert worked_s / (worked_s + rested_s) == pytest.approx(share, abs=1e-9)
     assert worked_s >= 50 * share * DUTY_PERIOD_S
-
-
-def test_no_load_starts_no_thread():
-    with hold_load(0.0):
-        before_s = time.process_time()
-        time.sleep(0.05)
-        assert time.process_time() - before_s < 0.04
 
 
 @pytest.mark.slow

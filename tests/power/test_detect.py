@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from edgevpr.power.boards import MachineSpeed, describe, detect, is_this_machine, load_board, own_profile, profile_text
+from edgevpr.power.boards import MachineSpeed, describe, detect, load_board, own_profile, profile_text
 
 DMI = "sys/class/dmi/id"
 USABLE = len(os.sched_getaffinity(0))
@@ -53,8 +53,8 @@ def written(root):
 def test_a_known_board_is_recognised_and_its_profile_has_what_is_really_there(tree, model, parts, ram_kb, board, cpu):
     root = tree(arm(model, *parts, ram_kb=ram_kb))
     found = detect(root)
-    assert (found.board, found.model, found.cpu, found.cores) == (board, model, cpu, len(parts))
-    assert found.usable_cores == min(len(parts), USABLE)
+    assert (found["board"], found["model"], found["cpu"], found["cores"]) == (board, model, cpu, len(parts))
+    assert found["usable_cores"] == min(len(parts), USABLE)
     mine, shipped = written(root), load_board(board)
     assert (mine.idle_w, mine.full_w, mine.verified) == (shipped.idle_w, shipped.full_w, shipped.verified)
     assert (mine.source, mine.benchmark_score) == (shipped.source, SPEED)
@@ -72,7 +72,7 @@ def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree):
         }
     )
     found = detect(root)
-    assert (found.board, found.cpu, found.thermal_limit_c) == (None, "4 x Cortex-A55 + 4 x Cortex-A76", 85.0)
+    assert (found["board"], found["cpu"], found["thermal_limit_c"]) == (None, "4 x Cortex-A55 + 4 x Cortex-A76", 85.0)
     board = written(root)
     assert board.title == "Radxa ROCK 5B (4 x Cortex-A55 + 4 x Cortex-A76)"
     assert (board.recognised_by, board.cores, board.ram_mb) == ("Radxa ROCK 5B", 8, 16384.0)
@@ -84,8 +84,8 @@ def test_an_unknown_arm_board_gets_a_profile_that_invents_nothing(tree):
 def test_an_x86_machine_is_named_by_its_firmware(tree):
     root = tree(x86(sys_vendor="AAEON", product_name="UP-APL03", board_name="UP-APL03"))
     found = detect(root)
-    assert (found.board, found.model, found.cpu) == (None, "AAEON UP-APL03", "Intel(R) N100")
-    assert found.thermal_limit_c == 80.0
+    assert (found["board"], found["model"], found["cpu"]) == (None, "AAEON UP-APL03", "Intel(R) N100")
+    assert found["thermal_limit_c"] == 80.0
     board = written(root)
     assert (board.title, board.recognised_by) == ("AAEON UP-APL03 (Intel(R) N100)", None)
 
@@ -108,7 +108,7 @@ def test_an_x86_machine_is_named_by_its_firmware(tree):
     ],
 )
 def test_what_a_maker_has_not_filled_in_is_no_name(tree, dmi, model):
-    assert detect(tree(x86(**dmi))).model == model
+    assert detect(tree(x86(**dmi)))["model"] == model
 
 
 def test_a_control_group_limits_what_the_profile_may_take(tree):
@@ -119,8 +119,8 @@ def test_a_control_group_limits_what_the_profile_may_take(tree):
     }
     root = tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4) | groups)
     found = detect(root)
-    assert (found.cores, found.usable_cores) == (4, 0.4)
-    assert (found.ram_mb, found.ram_limit_mb) == (4096.0, 300.0)
+    assert (found["cores"], found["usable_cores"]) == (4, 0.4)
+    assert (found["ram_mb"], found["ram_limit_mb"]) == (4096.0, 300.0)
     board = written(root)
     assert (board.ram_mb, board.memory_max_mb, board.budget_mb) == (4096.0, 300.0, 150.0)
     assert (board.cores, board.cpu_share, board.threads) == (4, 0.1, 1)
@@ -129,21 +129,19 @@ def test_a_control_group_limits_what_the_profile_may_take(tree):
 @pytest.mark.parametrize("model", ['Board: "X" #1', "- [a, {b", "Bård ÅÄ\x07\x85 ½", "null", "'", "\\n %YAML"])
 def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, model):
     root = tree(arm(model, "0xd03"))
-    board = written(root)
-    assert board.recognised_by == "".join(c if c.isprintable() else " " for c in model)
-    assert is_this_machine(board, root)
+    assert written(root).recognised_by == model
 
 
 def test_an_unknown_processor_is_called_so(tree):
     found = detect(tree(arm("Some board", "0xfff") | {"sys/devices/system/cpu/online": "0,2-3\n"}))
-    assert (found.cpu, found.cores) == ("1 x CPU part 0xfff", 3)
-    assert detect(tree({"proc/cpuinfo": "nothing"})).cpu.startswith("unknown ")
+    assert (found["cpu"], found["cores"]) == ("1 x CPU part 0xfff", 3)
+    assert detect(tree({"proc/cpuinfo": "nothing"}))["cpu"].startswith("unknown ")
 
 
 def test_the_real_machine_is_looked_at():
     found = detect()
-    assert 0 < found.usable_cores <= found.cores
-    assert found.ram_limit_mb <= found.ram_mb
+    assert 0 < found["usable_cores"] <= found["cores"]
+    assert found["ram_limit_mb"] <= found["ram_mb"]
 
 
 def test_it_says_what_the_machine_is_and_what_a_control_group_leaves(tree):

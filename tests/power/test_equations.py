@@ -41,9 +41,9 @@ def test_calc_as_printed_is_as_near_as_its_printed_digits_allow():
 
 
 def test_power_runs_from_idle_to_full_in_a_straight_line():
-    assert equations.power_w(2.29, 6.82, 0) == 2.29
-    assert equations.power_w(2.29, 6.82, 1) == pytest.approx(6.82, abs=1e-12)
-    assert equations.power_w(2.0, 6.0, 0.25) == 3.0
+    assert equations.stage_energy_j(2.29, 6.82, 0, 1) == 2.29
+    assert equations.stage_energy_j(2.29, 6.82, 1, 1) == pytest.approx(6.82, abs=1e-12)
+    assert equations.stage_energy_j(2.0, 6.0, 0.25, 1) == 3.0
 
 
 def test_total_energy_is_idle_energy_plus_marginal_energy():

@@ -1,15 +1,17 @@
 """Stages and whole flights metered with a clock that says what the test wants, and with the real one."""
 
+import os
 import random
 import threading
 import time
 
 import pytest
+from fakes import FakeClock
 
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack, parse_pack
-from edgevpr.power.meter import OwnMemory, QueryMeter, RunningEnergy, query_cost, stage
+from edgevpr.power.meter import OwnLoad, OwnMemory, QueryMeter, RunningEnergy, machine_load, query_cost, stage
 
 
 def clock(*readings):
@@ -55,18 +57,6 @@ def test_a_query_costs_by_the_closed_form():
     assert cost.used_mah == pytest.approx(1000 * total_j / volt_hours, abs=1e-9)
     assert cost.marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-9)
     assert cost.rss_mb == 80.0
-
-
-def test_energy_summed_over_many_short_stages_is_the_closed_form():
-    board, pack = load_board("rpi-3b-plus"), Pack(3, 2200)
-    ticks = [(0.01 * (1 + i % 3), 0.02 * (i % 2)) for i in range(1000)]  # wall, CPU seconds
-    summed_mah = sum(
-        query_cost(StageCost(wall_s, cpu_s), StageCost(0, 0), board, pack, 0.9, rss_mb=80.0).used_mah
-        for wall_s, cpu_s in ticks
-    )
-    wall_s, core_s = (sum(column) for column in zip(*ticks, strict=True))
-    closed_j = board.idle_w * wall_s + (board.full_w - board.idle_w) * core_s / board.cores
-    assert summed_mah == pytest.approx(closed_j / (11.1 * 0.9 * 3.6), abs=1e-9)
 
 
 def test_the_memory_that_takes_long_to_read_is_read_every_twenty_seconds():
@@ -128,19 +118,10 @@ def test_a_scripted_flight_costs_what_the_closed_form_says():
         rest_s = script.uniform(0, 1)
         now_s[0] += rest_s
         closed_j += 2.29 * rest_s
-    so_far = energy.so_far()
-    assert so_far.idle_j + so_far.marginal_j == pytest.approx(closed_j, rel=1e-9)
-    assert so_far.idle_j == pytest.approx(2.29 * now_s[0], rel=1e-9)
-    assert so_far.stages_cpu_s == pytest.approx(closed_cpu_s, rel=1e-9)
-    assert so_far.process_cpu_s == pytest.approx(so_far.stages_cpu_s, rel=1e-9)
-
-
-def test_waiting_costs_idle_power_only():
-    now_s = [50.0]
-    energy = RunningEnergy(PI4, lambda: now_s[0], lambda: 0.0)
-    now_s[0] = 150.0
-    so_far = energy.so_far()
-    assert (so_far.elapsed_s, so_far.idle_j, so_far.marginal_j) == (100.0, pytest.approx(229.0), 0.0)
+    process = energy.process()
+    assert 2.29 * process.wall_s + energy.marginal_j == pytest.approx(closed_j, rel=1e-9)
+    assert energy.stages_cpu_s == pytest.approx(closed_cpu_s, rel=1e-9)
+    assert (process.wall_s, process.cpu_s) == (now_s[0], pytest.approx(closed_cpu_s, rel=1e-9))
 
 
 def test_stages_of_the_real_process_add_up_to_its_own_cpu_time():
@@ -151,6 +132,53 @@ def test_stages_of_the_real_process_add_up_to_its_own_cpu_time():
             while time.process_time() < until_s:
                 pass
         energy.add(metered.cost)
-    so_far = energy.so_far()
-    assert so_far.stages_cpu_s == pytest.approx(so_far.process_cpu_s, rel=0.03)
-    assert so_far.stages_cpu_s <= so_far.process_cpu_s
+    process = energy.process()
+    assert energy.stages_cpu_s == pytest.approx(process.cpu_s, rel=0.03)
+    assert energy.stages_cpu_s <= process.cpu_s
+
+
+def test_a_busy_core_is_seen():
+    machine_load()
+    until_s = time.monotonic() + 0.3
+    while time.monotonic() < until_s:
+        pass
+    load = machine_load()
+    assert len(load.core_shares) == os.cpu_count()
+    assert max(load.core_shares) > 0.5
+    assert all(0 <= share <= 1 for share in load.core_shares)
+    assert 0 < load.ram_used_bytes < load.ram_total_bytes
+
+
+class Working(FakeClock):
+    """The load of a process, by a clock of its own."""
+
+    def __init__(self):
+        super().__init__()
+        self.load = OwnLoad(4, self, lambda: self.cpu_s)
+
+    def work(self, wall_s, ran_s):
+        """Work of one thread that ran for `ran_s` of `wall_s`."""
+        super().work(wall_s, ran_s / wall_s)
+        self.load.busy(StageCost(wall_s, ran_s))
+
+
+def test_the_share_of_all_cores_counts_what_no_work_explains_too():
+    clocks = Working()
+    clocks.work(0.5, 0.5)
+    clocks.now_s += 1.5
+    clocks.cpu_s += 0.3  # another thread decodes a stream
+    assert clocks.load.age_s == 2.0
+    assert clocks.load.look() == (pytest.approx(0.8 / 2 / 4), 0.0)
+    assert clocks.load.age_s == 0.0
+    clocks.now_s += 1.0
+    assert clocks.load.look() == (0.0, 0.0), "since the last look"
+
+
+def test_work_is_late_only_where_its_thread_was_kept_waiting():
+    clocks = Working()
+    clocks.work(0.99, 0.97)
+    clocks.now_s += 0.01
+    assert clocks.load.look()[1] == 0.0, "it takes all the time, and nobody else does"
+    clocks.work(0.9, 0.5)
+    clocks.now_s += 0.1
+    assert clocks.load.look()[1] == pytest.approx(0.9)

@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
-from edgevpr.power.load import MachineLoad
+from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald

@@ -11,7 +11,7 @@ from edgevpr.core.types import FixReport
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.power.load import MachineLoad
+from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator

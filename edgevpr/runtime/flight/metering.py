@@ -6,12 +6,11 @@ from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 
 from edgevpr.core.config import BatteryConfig
-from edgevpr.core.types import NO_TAPE, StageCost, Tape
+from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
-from edgevpr.power.load import MachineLoad, OwnLoad, machine_load
 from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import OwnMemory, QueryMeter, RunningEnergy, Stage, stage
+from edgevpr.power.meter import MachineLoad, OwnLoad, OwnMemory, QueryMeter, RunningEnergy, Stage, machine_load, stage
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -98,17 +97,16 @@ class FlightMeter:
         - `marginal_mah`: the part of that which the stages of queries added; `stages_cpu_s`: their CPU-seconds
         - `elapsed_s`: time since the start; `queries_throttled`: a count.
         """
-        so_far, board = self._energy.so_far(), self._board
-        process = StageCost(so_far.elapsed_s, so_far.process_cpu_s)
-        process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), so_far.elapsed_s)
+        process, board = self._energy.process(), self._board
+        process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
             "queries_throttled": self.queries_throttled,
-            "elapsed_s": so_far.elapsed_s,
-            "used_mah": self._mah(so_far.idle_j + process_j),
+            "elapsed_s": process.wall_s,
+            "used_mah": self._mah(board.idle_w * process.wall_s + process_j),
             "process_mah": self._mah(process_j),
-            "marginal_mah": self._mah(so_far.marginal_j),
-            "process_cpu_s": so_far.process_cpu_s,
-            "stages_cpu_s": so_far.stages_cpu_s,
+            "marginal_mah": self._mah(self._energy.marginal_j),
+            "process_cpu_s": process.cpu_s,
+            "stages_cpu_s": self._energy.stages_cpu_s,
         }
 
     def look_at_heat(self) -> None:

@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from edgevpr import __version__
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.messages import Health, Severity
-from edgevpr.power.load import MachineLoad
+from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import confidence_of
 from edgevpr.runtime.flight.clock import Pace

@@ -193,7 +193,7 @@ def test_the_table_names_machine_date_and_every_technique(kept):
 
 
 def meter_at(held, watts, title="INA3221 (hwmon1), channel VDD_IN", certain=True):
-    return Meter(title=title, period_s=0.05, look=lambda: watts(held[-1]), certain=certain)
+    return Meter(title=title, look=lambda: watts(held[-1]), certain=certain)
 
 
 @pytest.fixture
