@@ -16,7 +16,7 @@ from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Sending
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import POSITION_FIX, Fix, place_match, query_figures
+from edgevpr.mavlink.messages import POSITION_FIX, Fix, named_values
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 OURS, FOREIGN = 1, 2
@@ -74,7 +74,8 @@ class _Bench:
             number = len(self._sendings)
             sending = self.link.send_fix(Fix(10.0 + number / 1e5, 8.0, 20.0, self.clock.now_s))
             self._sendings.append(sending)
-            self.link.send(*place_match(self.clock.now_s, number, 0.5), *query_figures(self.clock.now_s, 0.5, 1.0))
+            told = {"vpr_place": number, "vpr_score": 0.5, "vpr_cpu": 0.5, "vpr_mah": 1.0}
+            self.link.send(*named_values(self.clock.now_s, **told))
             sending.wait(PATIENCE_S if self.link.listens() else 0.0)
             if reads:
                 self.read(answers=answers)

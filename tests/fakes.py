@@ -17,7 +17,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import Fixes, Sending
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
-from edgevpr.mavlink.peer import NoListener
+from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.readiness import Readiness
 from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -154,7 +154,7 @@ class FakeLink:
         vehicle: Callable[[], Vehicle | None] = lambda: None,
     ) -> None:
         self.answer, self.sent = answer, []
-        self.listener = NoListener()
+        self.listener = Listener()
         self.health = Health.BOOT
         self._clock, self._vehicle = clock, vehicle
         self._waiting = Fixes()

@@ -10,15 +10,15 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
-from edgevpr.mavlink import messages, positions
+from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.messages import Health, Severity
-from edgevpr.mavlink.peer import Autopilot, Listener, NoListener
+from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.requests import Requests, Wish, Wished
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
-from edgevpr.mavlink.texts import News, Texts
+from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
 
 MESSAGES_MAX = 64
@@ -28,7 +28,7 @@ HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the l
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 
-_NOBODY = NoListener()
+_NOBODY = Listener()
 
 log = logging.getLogger(__name__)
 
@@ -58,9 +58,9 @@ class LinkSettings:
 
 class Conversation:
     """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
-    `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, the `wishes` among them that only the
-    flight can fulfil, and the count of messages `sent`, by name. Use it inside turns only. `copy_message` is called
-    with every queued message but the fixes, `copy_text` with every text: for the link to the ground."""
+    `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, and the count of messages `sent`, by
+    name. Use it inside turns only. `copy_message` is called with every queued message but the fixes, `copy_text` with
+    every text: for the link to the ground."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -81,11 +81,11 @@ class Conversation:
         self._told_channel = self.channel  # the channel that the listener knows
         self._odometry_since_s = math.inf
         self._origin = settings.origin
-        self._is_there = self._was_there = False
+        self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
 
     @property
     def channel(self) -> Channel:
-        """The channel by which the autopilot is told positions."""
+        """The channel by which the autopilot is told messages."""
         return self.autopilot.interview.choice.channel
 
     @property
@@ -140,10 +140,8 @@ class Conversation:
         return min(longest_s, max(0.0, self._state_due_s - self._clock()))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message. Returns None if nothing is due, else:
-        - the packet;
-        - the fix that it contains, or None.
-        """
+        """Choose and pack the next message. Returns None if nothing is due, else the packet, and the fix that it
+        contains (None: it contains none)."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
             self.settings.signing.stamp(self._packer)
@@ -177,9 +175,9 @@ class Conversation:
                 if news := self.autopilot.identity.take_news():
                     self.fixes.forget_row()
                     self.fixes.break_off("another autopilot has taken its place")
-                    self._tell(News(True, news, "autopilot"))
-            if answer := self.autopilot.take_answer():
-                self._hear_answer(answer, now_s)
+                    self.announce(Severity.WARNING, news, "autopilot")
+            if self.autopilot.answer:
+                self._hear_answer(self.autopilot.answer, now_s)
             if not self.autopilot.identity.is_elsewhere(sender):
                 self._hear_request(message, now_s)
         return is_ours
@@ -188,10 +186,16 @@ class Conversation:
         """Stop waiting for answers that take more than a second. Queue a text for the ground station for each change:
         autopilot silent or back; fixes unanswered or answered again, refused or accepted again."""
         now_s = self._clock()
-        self._tell(self._news_of_presence(now_s))
-        self.fixes.time_out(now_s)
-        self._tell(self.fixes.news_of_silence(self.autopilot.readiness.why_silent(), now_s))
-        self._tell(self.fixes.take_news())
+        is_there = self.autopilot.listens(now_s)
+        if is_there and self._is_there is False:
+            self.announce(Severity.INFO, "autopilot is back", "autopilot")
+        elif self._is_there and not is_there:
+            log.warning("the autopilot is silent")
+            self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
+        if is_there or self._is_there is not None:
+            self._is_there = is_there
+        for news in self.fixes.news(self.autopilot.readiness.why_silent(), now_s):
+            self.announce(*news)
 
     def break_off(self, lost_fixes: int) -> None:
         """Forget what the loss of the port ends. `lost_fixes` is the number of fixes thrown away with the port."""
@@ -205,10 +209,6 @@ class Conversation:
         self.fixes.drop_stale(math.inf)
 
     def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
-        """Choose the next message. Returns None if nothing is due, else:
-        - the message;
-        - the fix that it contains, or None.
-        """
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after delays
@@ -222,7 +222,7 @@ class Conversation:
                 self.fixes.withhold(why)
             elif sending := self.fixes.next(now_s):
                 if self.channel is Channel.SENSOR:
-                    return positions.position_sensor(sending.fix, now_s), sending
+                    return messages.position_sensor(sending.fix, now_s), sending
                 return messages.position_fix(sending.fix, now_s, system_id), sending
         else:
             self.fixes.drop_stale(now_s)
@@ -243,13 +243,13 @@ class Conversation:
         t_s = now_s - choice.lag_s
         state = self.settings.listener.state_at(t_s)
         if choice.channel is Channel.GPS_INPUT:
-            return positions.gps_input(state, choice.receiver, t_s, autopilot.unix_s(t_s))
+            return messages.gps_input(state, choice.receiver, t_s, autopilot.unix_s(t_s))
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")
             here, self._origin = self._origin, None
             return messages.origin(system_id, here.lat_deg, here.lon_deg, here.alt_m or 0.0)
         if state and state.attitude and autopilot.origin:
-            return positions.odometry(state, state.attitude, autopilot.origin)
+            return messages.odometry(state, state.attitude, autopilot.origin)
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
@@ -285,17 +285,3 @@ class Conversation:
         if answer == "FAILED" and readiness.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.put(messages.message_request(self.autopilot.system_id or 0, origin))
-
-    def _news_of_presence(self, now_s: float) -> News | None:
-        is_there, was_there = self.autopilot.listens(now_s), self._was_there
-        if is_there == self._is_there:
-            return None
-        self._is_there, self._was_there = is_there, was_there or is_there
-        if is_there:
-            return News(False, "autopilot is back", "autopilot") if was_there else None
-        log.warning("the autopilot is silent")
-        return News(True, "autopilot is silent", "autopilot")
-
-    def _tell(self, news: News | None) -> None:
-        if news:
-            self.announce(Severity.WARNING if news.is_alarming else Severity.INFO, news.text, news.topic)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from threading import Event
 
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.readiness import GPS_IN_USE, TAKEN, Reason
+from edgevpr.mavlink.messages import Fix, Severity
+from edgevpr.mavlink.readiness import GPS_IN_USE, Reason
 from edgevpr.mavlink.texts import News
 
 FIXES_MAX = 8
@@ -83,7 +83,7 @@ class Fixes:
         self._under_way: deque[tuple[float, Sending]] = deque()  # sent, without an answer; with the time of sending
         self._taken_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
         self._last_answer: tuple[str, Reason] | None = None
-        self._news: News | None = None
+        self._news: list[News] = []  # the newest about an answer
         self._sent_s = -math.inf
         self.forget_row()
 
@@ -169,13 +169,24 @@ class Fixes:
             self._resumes_s = now_s + ANSWERED_WITHIN_S
         self._row = 0
         self.time_out(now_s)
-        self._note_answer(result, reason)
-        if result == "ACCEPTED":
+        is_taken = result == "ACCEPTED"
+        if (result, reason) != self._last_answer:
+            level = logging.INFO if is_taken else logging.WARNING
+            log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason.sentence)
+            if not is_taken:
+                severity = Severity.INFO if reason is GPS_IN_USE else Severity.WARNING
+                self._news = [(severity, f"fixes refused: {reason.brief}", "fixes")]
+            elif self._last_answer:
+                self._news = [(Severity.INFO, "fixes are taken again", "fixes")]
+        self._last_answer = result, reason
+        if is_taken:
             self._taken_s = now_s
+        else:
+            self.refusal = reason
         if not self._under_way:
             return None
         sent_s, sending = self._under_way.popleft()
-        sending.outcome = FixAnswer(result, None if reason is TAKEN else reason.sentence, now_s - sent_s)
+        sending.outcome = FixAnswer(result, None if is_taken else reason.sentence, now_s - sent_s)
         return sending
 
     def time_out(self, now_s: float) -> None:
@@ -188,28 +199,24 @@ class Fixes:
         while self._under_way:
             self._give_up(reason)
 
-    def news_of_silence(self, reason: Reason, now_s: float) -> News | None:
-        """Return once a text for the ground station when sending stops, because no fix is answered (for `reason`), and
-        once when it resumes. None: nothing has changed."""
-        is_stopped = self._row >= UNANSWERED_MAX
+    def news(self, why_silent: Reason, now_s: float) -> list[News]:
+        """Return the texts for the ground station about what has changed since the last call: sending stops, because no
+        fix is answered (for the reason `why_silent`), or resumes; the answers are others."""
+        self.time_out(now_s)
+        is_stopped, news = self._row >= UNANSWERED_MAX, self._news
+        self._news = []
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
-            return None
+            return news
         self._is_stopped = is_stopped
         if not is_stopped:
             log.warning("position fixes are answered again: they are sent again")
-            return News(False, "fixes are answered again", "answers")
+            return [(Severity.INFO, "fixes are answered again", "answers"), *news]
         log.warning(
             "five fixes in a row had no answer, and only one every %g s is sent until one is answered: %s",
             TRIED_AGAIN_AFTER_S,
-            reason.sentence,
+            why_silent.sentence,
         )
-        return News(True, f"fixes unanswered: {reason.brief}", "answers")
-
-    def take_news(self) -> News | None:
-        """Return once a text for the ground station when the answers change: refused, refused for another reason, or
-        accepted again. None: nothing has changed."""
-        news, self._news = self._news, None
-        return news
+        return [(Severity.WARNING, f"fixes unanswered: {why_silent.brief}", "answers"), *news]
 
     def _drop(self, sending: Sending, why: str) -> None:
         self.dropped += 1
@@ -222,15 +229,3 @@ class Fixes:
         if sending.sent:
             self.unanswered += 1
             sending.outcome = FixAnswer(None, reason, None)
-
-    def _note_answer(self, result: str, reason: Reason) -> None:
-        if (result, reason) != self._last_answer:
-            is_refused = result != "ACCEPTED"
-            level = logging.WARNING if is_refused else logging.INFO
-            log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason.sentence)
-            if is_refused:
-                self._news = News(reason is not GPS_IN_USE, f"fixes refused: {reason.brief}", "fixes")
-            elif self._last_answer:
-                self._news = News(False, "fixes are taken again", "fixes")
-        self._last_answer = result, reason
-        self.refusal = self.refusal if reason is TAKEN else reason

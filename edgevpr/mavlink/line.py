@@ -25,8 +25,7 @@ class Line:
         self.port = port
         self._tap = tap
         self._clock = clock
-        self._packet = b""  # the packet that was put last
-        self._unsent = b""  # the bytes of it that the port has not accepted yet
+        self._packet = self._unsent = b""  # the packet that was put last, and what the port has not accepted of it yet
         self._taken = 0  # number of bytes that the port has accepted so far
         self._leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
         self._blocked_since_s: float | None = None
@@ -91,9 +90,6 @@ class Line:
             if not self.is_idle:
                 self.port.throw_away()
         self.port.close()
-        lost = len(self._leaving)
         for _, sending in self._leaving:
             sending.settle(False, LOST)
-        self._leaving.clear()
-        self._unsent = b""
-        return lost
+        return len(self._leaving)

@@ -40,11 +40,10 @@ log = logging.getLogger(__name__)
 class LinkStats:
     """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
-    `trouble` is why the link is not open, or last was not; None once data arrives. `foreign_messages` were refused
-    because they came from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no
-    answer, or the ground has paused the flight. `unanswered_fixes` had no answer within a second; `refused_why` says in
-    a few words why the last refused fix was refused (None: none was). `commands` counts the commands addressed to us,
-    by result, and `ignored_requests` the other messages to us that had no effect. With a signing key,
+    `trouble` is why the link is not open, or last was not; None once data arrives. `foreign_messages` came from another
+    autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or the ground has paused
+    the flight. `refused_why` says why the last refused fix was refused (None: none was). `commands` counts the commands
+    addressed to us on any link, by result, and `ignored_requests` the other messages to us that had no effect.
     `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason.
     """
 
@@ -165,13 +164,33 @@ class Link:
     def listens(self) -> bool:
         """Return True if a fix can be sent now: the port is connected and the autopilot has been heard lately."""
         with self.turn("listens"):
-            is_connected, *_ = self._tape.read("port", self._port)
-            return is_connected and self._conversation.autopilot.listens(self._turns.now_s())
+            return self._tape.read("port", self._port)[0] and self._conversation.autopilot.listens(self._turns.now_s())
 
     def stats(self) -> LinkStats:
         """Return the counts and the state of the link."""
         with self.turn("stats"):
-            return self._stats()
+            said, autopilot, fixes = self._conversation, self._conversation.autopilot, self._conversation.fixes
+            connected, trouble, reopened = self._tape.read("port", self._port)
+            return LinkStats(
+                connected=connected,
+                trouble=trouble,
+                autopilot_heard=autopilot.listens(self._turns.now_s()),
+                autopilot_system_id=autopilot.system_id,
+                sent=dict(said.sent),
+                received=dict(said.reader.received),
+                acks=dict(autopilot.acks),
+                dropped_stale_fixes=fixes.dropped,
+                withheld_fixes=fixes.withheld,
+                commands=dict(said.requests.results),
+                ignored_requests=said.requests.ignored,
+                unanswered_fixes=fixes.unanswered,
+                refused_why=fixes.refusal.brief if fixes.refusal else None,
+                foreign_messages=autopilot.identity.foreign_messages,
+                refused_signatures=dict(said.settings.signing.refused),
+                dropped_queue_full=said.dropped_queue_full,
+                bad_bytes=said.reader.bad_bytes,
+                reopened=reopened,
+            )
 
     def close(self) -> None:
         """Send the queued messages and texts, wait for the answers to the fixes sent, both for half a second at most,
@@ -192,36 +211,9 @@ class Link:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _stats(self) -> LinkStats:
-        conversation, autopilot, fixes = self._conversation, self._conversation.autopilot, self._conversation.fixes
-        connected, trouble, reopened = self._tape.read("port", self._port)
-        return LinkStats(
-            connected=connected,
-            trouble=trouble,
-            autopilot_heard=autopilot.listens(self._turns.now_s()),
-            autopilot_system_id=autopilot.system_id,
-            sent=dict(conversation.sent),
-            received=dict(conversation.reader.received),
-            acks=dict(autopilot.acks),
-            dropped_stale_fixes=fixes.dropped,
-            withheld_fixes=fixes.withheld,
-            commands=dict(conversation.requests.results),
-            ignored_requests=conversation.requests.ignored,
-            unanswered_fixes=fixes.unanswered,
-            refused_why=fixes.refusal.brief if fixes.refusal else None,
-            foreign_messages=autopilot.identity.foreign_messages,
-            refused_signatures=dict(conversation.settings.signing.refused),
-            dropped_queue_full=conversation.dropped_queue_full,
-            bad_bytes=conversation.reader.bad_bytes,
-            reopened=reopened,
-        )
-
     def _port(self) -> tuple[bool, str | None, int]:
-        return self._is_connected(), self._trouble, self._reopened
-
-    def _is_connected(self) -> bool:
         line = self._line
-        return line is not None and line.port.connected
+        return line is not None and line.port.connected, self._trouble, self._reopened
 
     def _opened(self) -> Line:
         return Line(open_port(self._address), self._settings.clock, self._settings.tap)
@@ -307,11 +299,14 @@ class Link:
 
     def _lose(self, error: Exception) -> None:
         with self._turns.of_link(self.name) as step:
-            lost_fixes = self._line.close() if self._line else 0
-            self._line = None
-            step("lost", lost_fixes)
+            step("lost", lost_fixes := self._close_line())
             self._conversation.break_off(lost_fixes)
         self._note_trouble(error)
+
+    def _close_line(self) -> int:
+        """Close the port, if it is open, and return the number of fixes thrown away with it."""
+        line, self._line = self._line, None
+        return line.close() if line else 0
 
     def _note_trouble(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or str(error)
@@ -322,7 +317,7 @@ class Link:
     def _flush(self) -> None:
         give_up_s = time.monotonic() + FLUSH_S
         with suppress(OSError):
-            while self._line and self._is_connected() and time.monotonic() < give_up_s:
+            while self._line and self._line.port.connected and time.monotonic() < give_up_s:
                 self._turn(self._line, timeout_s=0.01)
                 is_all_answered = not len(self._conversation.fixes)  # so that the final counts include all answers
                 if not self._conversation.waits and self._line.is_idle and is_all_answered:
@@ -330,9 +325,7 @@ class Link:
 
     def _close_all(self) -> None:
         with self._turns.of_link(self.name) as step:
-            lost_fixes = self._line.close() if self._line else 0
-            self._line = None
-            step("closed", lost_fixes)
+            step("closed", self._close_line())
             self._conversation.end()
         self._bell.close()
         self._bell_button.close()

@@ -1,5 +1,6 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
-Used by the link and the flight.
+Used by the link and the flight. A position goes out as command 43003 or message 296 (single fixes), or as GPS_INPUT or
+ODOMETRY (a continuous position).
 
 `t_mono_s` is a time of the system's monotonic clock in seconds, the only clock of a link: an autopilot keeps a single
 time correction for all messages of a link.
@@ -10,11 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+from pymavlink.quaternion import QuaternionBase
+from pymavlink.rotmat import Matrix3, Vector3
+
+from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.wire import Message, mavlink
 
 POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 TEXT_BYTES = 50
+SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
+_YAW_SD = math.radians(5.0)
+_GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800  # 1980-01-06; leap seconds since then, as of 2017
 
 
 class Health(IntEnum):
@@ -56,6 +64,23 @@ class Fix:
             raise ValueError(f"a frame taken at {self.t_frame_s} s has no age")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionState:
+    """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
+    standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
+    `attitude` is (roll, pitch, yaw) in radians, None if unknown."""
+
+    t_mono_s: float
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    velocity_m_s: tuple[float, float, float]
+    accuracy_m: float
+    alt_accuracy_m: float
+    speed_accuracy_m_s: float
+    attitude: tuple[float, float, float] | None = None
+
+
 def heartbeat(health: Health) -> Message:
     """Make the HEARTBEAT (0) of an onboard computer."""
     return mavlink.MAVLink_heartbeat_message(
@@ -91,30 +116,115 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     )
 
 
+def position_sensor(fix: Fix, t_sent_s: float) -> Message:
+    """Make a GLOBAL_POSITION_SENSOR (296): a position found by vision, without altitude. PX4 ignores its time stamp: it
+    subtracts a delay, a parameter of its own, from the time of arrival."""
+    return mavlink.MAVLink_global_position_sensor_message(
+        target_system=0,
+        target_component=0,
+        id=SENSOR_ID,
+        time_usec=round(t_sent_s * 1e6),
+        processing_time=0,
+        source=mavlink.GLOBAL_POSITION_SRC_VISION,
+        flags=0,
+        lat=round(fix.lat_deg * 1e7),
+        lon=round(fix.lon_deg * 1e7),
+        alt=math.nan,
+        alt_ellipsoid=math.nan,
+        eph=fix.accuracy_m,
+        epv=math.nan,
+    )
+
+
+def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
+    """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix".
+    `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970 (None: unknown)."""
+    has_fix, state = state is not None, state or _NOWHERE
+    week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
+    east, north, down = state.velocity_m_s
+    return mavlink.MAVLink_gps_input_message(
+        time_usec=round(t_mono_s * 1e6),
+        gps_id=receiver,
+        ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
+        time_week_ms=int(rest_s * 1000),
+        time_week=int(week),
+        fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if has_fix else mavlink.GPS_FIX_TYPE_NO_FIX,
+        hdop=0.0,
+        vdop=0.0,
+        # The smallest number with which a filter starts, so that a real receiver is always preferred.
+        satellites_visible=6 if has_fix else 0,
+        lat=round(state.lat_deg * 1e7),
+        lon=round(state.lon_deg * 1e7),
+        alt=state.alt_m,
+        vn=north,
+        ve=east,
+        vd=down,
+        speed_accuracy=state.speed_accuracy_m_s,
+        horiz_accuracy=state.accuracy_m,
+        vert_accuracy=state.alt_accuracy_m,
+    )
+
+
+def odometry(state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float]) -> Message:
+    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `origin`
+    (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
+    `attitude` is (roll, pitch, yaw) in radians and must not contain NaN.
+
+    ArduPilot computes a standard deviation as the cube root of the sum of the squared variances
+    (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
+    the height is sent as zero, because the height is not measured by us.
+    """
+    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
+    east, north, down = state.velocity_m_s
+    to_earth = Matrix3()
+    to_earth.from_euler(*attitude)
+    velocity = to_earth.transposed() * Vector3(north, east, down)  # along nose, right, down
+    # The upper triangle of 6 x 6, row by row: only its diagonal is known.
+    pose_variances, velocity_variances = [0.0] * 21, [0.0] * 21
+    pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)
+    pose_variances[20] = math.sqrt(_YAW_SD**3)
+    velocity_variances[0] = velocity_variances[6] = velocity_variances[11] = state.speed_accuracy_m_s**2
+    return mavlink.MAVLink_odometry_message(
+        time_usec=round(state.t_mono_s * 1e6),
+        frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
+        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
+        x=float(north_m),
+        y=float(east_m),
+        z=origin[2] - state.alt_m,
+        q=list(QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
+        vx=velocity.x,
+        vy=velocity.y,
+        vz=velocity.z,
+        rollspeed=math.nan,
+        pitchspeed=math.nan,
+        yawspeed=math.nan,
+        pose_covariance=pose_variances,
+        velocity_covariance=velocity_variances,
+        reset_counter=0,
+        estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        quality=100,
+    )
+
+
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). On many autopilots the companion's port sends none of them unless asked. `firmware` is a MAV_AUTOPILOT; a
-    continuous channel (`is_continuous`) needs more.
-
-    - 10 Hz: GLOBAL_POSITION_INT (33) and ATTITUDE (30); 5 Hz: GPS_RAW_INT (24).
-    - 2 Hz: DISTANCE_SENSOR (132), TERRAIN_REPORT (136), and the status of the position filter of a known firmware.
-    - Continuous: ATTITUDE and SCALED_IMU (26) at 25 Hz; SYSTEM_TIME (2) and GPS_GLOBAL_ORIGIN (49) at 1 Hz.
-    """
-    wanted_us = {
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 100_000,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE: _DENSE_US if is_continuous else 100_000,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 200_000,
-        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 500_000,
-        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 500_000,
+    continuous channel (`is_continuous`) needs more."""
+    rates_hz = {
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: _DENSE_HZ if is_continuous else 10,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
+        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 2,
+        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 2,
     }
     if is_continuous:
-        wanted_us[mavlink.MAVLINK_MSG_ID_SCALED_IMU] = _DENSE_US
-        wanted_us[mavlink.MAVLINK_MSG_ID_SYSTEM_TIME] = 1_000_000
-        wanted_us[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = 1_000_000
+        rates_hz[mavlink.MAVLINK_MSG_ID_SCALED_IMU] = _DENSE_HZ
+        rates_hz[mavlink.MAVLINK_MSG_ID_SYSTEM_TIME] = 1
+        rates_hz[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = 1
     if firmware in _FILTER_REPORTS:
-        wanted_us[_FILTER_REPORTS[firmware]] = 500_000
+        rates_hz[_FILTER_REPORTS[firmware]] = 2
     interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-    return tuple(_command(target_system, interval, *wanted) for wanted in wanted_us.items())
+    return tuple(_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
 
 
 def message_request(target_system: int, message_id: int) -> Message:
@@ -134,25 +244,17 @@ def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> 
     )
 
 
-def place_match(t_mono_s: float, place_id: int, score: float, confidence: float | None = None) -> tuple[Message, ...]:
-    """Make the messages for an accepted match: NAMED_VALUE_INT (252) `vpr_place`, NAMED_VALUE_FLOAT (251) `vpr_score`
-    and, if `confidence` (0..1) is known, `vpr_conf`, the probability that the match is right."""
-    return (
-        mavlink.MAVLink_named_value_int_message(_boot_ms(t_mono_s), b"vpr_place", place_id),
-        _named_float(t_mono_s, b"vpr_score", score),
-        *((_named_float(t_mono_s, b"vpr_conf", confidence),) if confidence is not None else ()),
+def named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
+    """Make a NAMED_VALUE_INT (252) for each whole number and a NAMED_VALUE_FLOAT (251) for each other; None: it is not
+    known, and nothing is made. docs/reference/ground-station.md has the names that are sent, of 10 letters at most."""
+    boot_ms = _boot_ms(t_mono_s)
+    return tuple(
+        mavlink.MAVLink_named_value_int_message(boot_ms, name.encode(), value)
+        if isinstance(value, int)
+        else mavlink.MAVLink_named_value_float_message(boot_ms, name.encode(), value)
+        for name, value in values.items()
+        if value is not None
     )
-
-
-def query_figures(t_mono_s: float, cpu_share: float, used_mah: float) -> tuple[Message, Message]:
-    """Make two NAMED_VALUE_FLOAT (251) with the cost of a query: `vpr_cpu`, its share of all processor cores (0..1),
-    and `vpr_mah`, the charge used so far in the flight (mAh)."""
-    return (_named_float(t_mono_s, b"vpr_cpu", cpu_share), _named_float(t_mono_s, b"vpr_mah", used_mah))
-
-
-def gps_distance(t_mono_s: float, off_m: float) -> Message:
-    """Make a NAMED_VALUE_FLOAT (251) `vpr_gps_m`: the distance between GPS and an accepted match, metres."""
-    return _named_float(t_mono_s, b"vpr_gps_m", off_m)
 
 
 def source_set(number: int, target_system: int) -> Message:
@@ -201,8 +303,18 @@ def status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
-_DENSE_US = 40_000  # an ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second
+_DENSE_HZ = 25  # an ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second
 _UNUSED = 2**32 - 1
+_NOWHERE = MotionState(
+    t_mono_s=0.0,
+    lat_deg=0.0,
+    lon_deg=0.0,
+    alt_m=0.0,
+    velocity_m_s=(0.0, 0.0, 0.0),
+    accuracy_m=0.0,
+    alt_accuracy_m=0.0,
+    speed_accuracy_m_s=0.0,
+)
 # Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
 _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
@@ -212,10 +324,6 @@ _FILTER_REPORTS = {
 
 def _command(target_system: int, command: int, first: float, second: float = 0) -> Message:
     return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, command, 0, first, second, 0, 0, 0, 0, 0)
-
-
-def _named_float(t_mono_s: float, name: bytes, value: float) -> Message:
-    return mavlink.MAVLink_named_value_float_message(_boot_ms(t_mono_s), name, value)
 
 
 def _boot_ms(t_mono_s: float) -> int:

@@ -4,26 +4,15 @@ answers to fixes, and the position and motion of its vehicle. Used by `conversat
 import math
 from collections import Counter
 from dataclasses import replace
-from typing import Protocol
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.identity import Identity, Speaker
-from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX
-from edgevpr.mavlink.positions import MotionState
+from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
 from edgevpr.mavlink.readiness import Readiness
-from edgevpr.mavlink.vehicle import (
-    FILTER_REPORTS,
-    GPS_REPORTS,
-    HEIGHT_REPORTS,
-    Attitude,
-    Attitudes,
-    Certainty,
-    Heights,
-    gps_sd_m,
-)
+from edgevpr.mavlink.vehicle import GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, gps_sd_m
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
@@ -33,35 +22,28 @@ SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 _MILLI_G_M_S2 = 9.80665e-3
 
 
-class Listener(Protocol):
-    """Navigates by the reports of the autopilot, and gives the positions that a continuous channel sends. Its methods
-    are called in the link's thread; they never block and never raise. All times are of the monotonic clock, in seconds.
+class Listener:
+    """Navigates by the reports of the autopilot, and gives the positions that a continuous channel sends; this one does
+    nothing. The methods are called in the link's thread; they never block and never raise. All times are of the
+    monotonic clock, in seconds.
     """
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
-        return
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which the autopilot is told positions: when first chosen, and when it changes."""
-        return
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of the vehicle's position and velocity."""
-        return
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s^2 along nose, right and down, and the
         attitude at `t_s`."""
-        return
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
         return None
-
-
-class NoListener(Listener):
-    """A `Listener` that does nothing, for a link without navigation."""
 
 
 class Autopilot:
@@ -76,7 +58,7 @@ class Autopilot:
         self._listener = listener
         self._own_component = own_component
         self._heard_s = -math.inf
-        self._answer: str | None = None  # the newest answer, until `take_answer`
+        self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
         self._forget()
 
     def _forget(self) -> None:
@@ -115,20 +97,16 @@ class Autopilot:
         heading_deg = None if vehicle.heading_deg is None else attitude.yaw_deg % 360
         return replace(vehicle, roll_deg=attitude.roll_deg, pitch_deg=attitude.pitch_deg, heading_deg=heading_deg)
 
-    def take_answer(self) -> str | None:
-        """Return the newest answer to a fix (name of a MAV_RESULT) once; None until the next answer."""
-        answer, self._answer = self._answer, None
-        return answer
-
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
         """Process a message received at `now_s` from `address` (None: the link has one sender only). Returns True if it
         is a heartbeat of our autopilot."""
+        self.answer = None
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
             if self.identity.is_elsewhere(address):
                 self.identity.refuse()
             return False
         kind = message.get_type()
-        beats = kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+        beats = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
         before = self.identity.kept
         if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
             return False
@@ -136,21 +114,25 @@ class Autopilot:
             self._forget()
             self._listener.hear_autopilot(now_s)
         self.interview.hear(message)
-        if kind != "COMMAND_ACK":
-            self.readiness.hear(message, now_s)
-        elif message.target_component in (0, self._own_component):  # 0: to all
-            self.readiness.hear(message, now_s)
-            self._hear_ack(message)
+        if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
+            return False
+        self.readiness.hear(message, now_s)
         if beats:
             self._heard_s, self.firmware = now_s, message.autopilot
-            return True
-        if kind in HEIGHT_REPORTS:
-            self._heights.hear(message, now_s, self.attitudes.at(now_s))
-        elif kind in GPS_REPORTS:
-            self._hear_gps(message, now_s)
-        elif kind in FILTER_REPORTS:
-            self.certainty.hear(message, now_s)
-        match kind:
+        else:
+            self._hear_report(message, now_s)
+        return beats
+
+    def _hear_report(self, message: Message, now_s: float) -> None:
+        match message.get_type():
+            case "COMMAND_ACK":
+                self._hear_ack(message)
+            case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
+                self._heights.hear(message, now_s, self.attitudes.at(now_s))
+            case "GPS_RAW_INT" | "GPS2_RAW":
+                self._hear_gps(message, now_s)
+            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
+                self.certainty.hear(message, now_s)
             case "GLOBAL_POSITION_INT":
                 self._hear_position(message, now_s)
             case "ATTITUDE":
@@ -162,7 +144,6 @@ class Autopilot:
                 self._utc_ahead_s = message.time_unix_usec / 1e6 - now_s
             case "GPS_GLOBAL_ORIGIN":
                 self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
-        return False
 
     def unix_s(self, t_mono_s: float) -> float | None:
         """Convert a time of our monotonic clock to the autopilot's UTC, seconds since 1970; None if that is unknown."""
@@ -215,5 +196,5 @@ class Autopilot:
     def _hear_ack(self, message: Message) -> None:
         if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
             known = mavlink.enums["MAV_RESULT"].get(message.result)
-            self._answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
+            self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
             self.acks[answer] += 1

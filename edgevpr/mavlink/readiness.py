@@ -74,18 +74,12 @@ class Readiness:
 
     def why(self, result: str, now_s: float) -> "Reason":
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
-        match result:
-            case "ACCEPTED":
-                return TAKEN
-            case "FAILED":
-                return self._why_failed(now_s)
-            case "TEMPORARILY_REJECTED":
-                return GPS_IN_USE if self.has_gps(now_s) else OTHER_AID if self.is_px4 else UNKNOWN
-            case "DENIED":
-                return WRONG_FORM
-            case "UNSUPPORTED":
-                return NO_COMMAND
-        return Reason("see its log", f"it answers {result}")
+        if result == "FAILED":
+            return self._why_failed(now_s)
+        if result == "TEMPORARILY_REJECTED":
+            return GPS_IN_USE if self.has_gps(now_s) else OTHER_AID if self.is_px4 else UNKNOWN
+        known = {"ACCEPTED": TAKEN, "DENIED": WRONG_FORM, "UNSUPPORTED": NO_COMMAND}
+        return known.get(result) or Reason("see its log", f"it answers {result}")
 
     def why_silent(self) -> "Reason":
         """Return the likely reason why the autopilot does not answer fixes."""
@@ -100,10 +94,10 @@ class Readiness:
         flags = self.flags if now_s - self.flags_s <= _FLAGS_FRESH_S else 0
         causes = {
             NO_ORIGIN: lacks_origin and not has_gps,
-            NOT_STARTED: bool(flags & mavlink.EKF_UNINITIALIZED),
+            NOT_STARTED: flags & mavlink.EKF_UNINITIALIZED,
             GPS_IN_USE: has_gps,
             NOT_ARMED: self.is_armed is False,
-            NOT_RECKONING: bool(flags & mavlink.EKF_CONST_POS_MODE),
+            NOT_RECKONING: flags & mavlink.EKF_CONST_POS_MODE,
         }
         return next((reason for reason, is_there in causes.items() if is_there), UNKNOWN)
 

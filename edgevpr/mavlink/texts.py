@@ -2,7 +2,6 @@
 
 import logging
 import math
-from typing import NamedTuple
 
 from edgevpr.mavlink.messages import Severity, status_text
 from edgevpr.mavlink.wire import Message
@@ -10,15 +9,9 @@ from edgevpr.mavlink.wire import Message
 SPACING_S = 5.0
 WAITING_MAX = 16
 
+News = tuple[Severity, str, str]  # a change to be announced to the ground station: severity, text and topic
+
 log = logging.getLogger(__name__)
-
-
-class News(NamedTuple):
-    """A change to be announced to the ground station: a warning if `is_alarming`, else a note; its text and topic."""
-
-    is_alarming: bool
-    text: str
-    topic: str
 
 
 class Texts:

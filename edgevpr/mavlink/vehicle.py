@@ -20,7 +20,6 @@ _FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a seco
 _GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 
 GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
-HEIGHT_REPORTS = ("DISTANCE_SENSOR", "TERRAIN_REPORT")
 # ArduPilot: EKF_STATUS_REPORT. PX4: ESTIMATOR_STATUS. The flags have the same values. An ArduPilot that
 # dead-reckons reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
 FILTER_REPORTS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
@@ -86,8 +85,8 @@ class Heights:
         self._terrain: tuple[float, float] | None = None
 
     def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process one of the `HEIGHT_REPORTS`. `attitude` is the current one (None: unknown), by which the slanted
-        distance of a range finder becomes a height."""
+        """Process a DISTANCE_SENSOR or TERRAIN_REPORT. The slanted distance of a range finder becomes a height by the
+        current `attitude` (None: unknown)."""
         if message.get_type() == "TERRAIN_REPORT":
             # A spacing of 0 says that the autopilot has no terrain of this place.
             self._terrain = (message.current_height, now_s) if message.spacing else None

@@ -7,8 +7,8 @@ from conversing import Autopilot
 
 from edgevpr.core.types import Position
 from edgevpr.mavlink.channel import Answers, Channel, Kind, ardupilot_choice, kind_of, px4_can_fuse, px4_choice
-from edgevpr.mavlink.peer import NoListener
-from edgevpr.mavlink.positions import MotionState
+from edgevpr.mavlink.messages import MotionState
+from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.wire import mavlink
 
 INT8 = mavlink.MAV_PARAM_TYPE_INT8
@@ -80,7 +80,7 @@ def test_kinds():
     assert kind_of(mavlink.MAV_TYPE_SUBMARINE) is Kind.OTHER
 
 
-class Ear(NoListener):
+class Ear(Listener):
     def __init__(self):
         self.channels, self.forces, self.state = [], [], STATE
 

@@ -108,7 +108,7 @@ def test_answers_that_take_half_a_second_stop_no_quick_fixes_and_nothing_is_said
             sent(fixes, now_s)
             due_s.append(now_s + 0.45)
             count += 1
-        news.append(fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, now_s))
+        news.append(fixes.news(readiness.NO_COMMAND_ANSWERED, now_s))
     assert not any(news)
     assert count > 900
 
@@ -118,10 +118,10 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     fixes.note_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
-    assert fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, 8.5)
+    assert fixes.news(readiness.NO_COMMAND_ANSWERED, 8.5)
     sent(fixes, 17.5)
     fixes.note_lost(2)
-    assert (fixes.why_not(20.0), fixes.news_of_silence(readiness.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, None)
+    assert (fixes.why_not(20.0), fixes.news(readiness.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, [])
 
 
 def fly(autopilot, count, every_s=1.0):

@@ -15,9 +15,8 @@ from edgevpr.mavlink.messages import (
     Health,
     Severity,
     computer_status,
-    place_match,
+    named_values,
     position_fix,
-    query_figures,
     status_text,
 )
 from edgevpr.mavlink.signing import TO_GROUND, Signing, TimeStamps
@@ -51,7 +50,8 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     flight.send(text("wake up"))
     autopilot.expect("COMMAND_LONG")
     station.expect_text("wake up")
-    flight.send(*place_match(1.0, 5, 0.5), *query_figures(1.0, 0.5, 2.0), computer_status(1.0, [0.5], 2**20, 2**30))
+    figures = named_values(1.0, vpr_place=5, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0)
+    flight.send(*figures, computer_status(1.0, [0.5], 2**20, 2**30))
     flight.send(position_fix(Fix(1.0, 2.0, 3.0, clock()), clock(), 7))  # not even where it is queued as a message
     flight.send_fix(Fix(50.0, 14.0, 25.0, clock()))
     flight.send(text("end"))

@@ -13,7 +13,7 @@ from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_unt
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import Fix, Health, Severity, place_match, query_figures, status_text
+from edgevpr.mavlink.messages import Fix, Health, Severity, named_values, status_text
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = pytest.mark.network
@@ -80,7 +80,7 @@ def test_only_the_first_autopilot_counts(link, peer, clock):
 
 def test_events_and_figures_go_to_anyone_but_a_fix_waits_for_an_autopilot(link, peer, clock):
     link.send_fix(fix_at(clock.now_s))
-    link.send(*place_match(clock.now_s, 12, 0.5), *query_figures(clock.now_s, 0.25, 1.5), text("end"))
+    link.send(*named_values(clock.now_s, vpr_place=12, vpr_score=0.5, vpr_cpu=0.25, vpr_mah=1.5), text("end"))
     assert [m.get_type() for m in peer.expect_text("end")] == ["NAMED_VALUE_INT"] + ["NAMED_VALUE_FLOAT"] * 3
     clock.now_s += 0.5
     peer.heartbeat()
@@ -127,7 +127,7 @@ def test_noise_between_messages_is_counted_and_the_link_goes_on(link, peer):
 
 
 def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, clock, caplog):
-    link.send(*place_match(clock.now_s, 2**40, 0.5), text("next"))
+    link.send(*named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
     assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
     assert "NAMED_VALUE_INT" in caplog.text
 
@@ -334,7 +334,7 @@ def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
         wait_until(lambda: link.stats().autopilot_heard)
         link.send_fix(fix_at(clock.now_s))
         assert other.recv_match(type="COMMAND_INT", blocking=True, timeout=60).command == 43003
-        link.send(*place_match(1.0, 2, 0.5), *query_figures(1.0, 0.5, 2.0), text("end"))
+        link.send(*named_values(1.0, vpr_place=2, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0), text("end"))
         names = [other.recv_match(blocking=True, timeout=60).get_type() for _ in range(5)]
         assert names == ["NAMED_VALUE_INT", *["NAMED_VALUE_FLOAT"] * 3, "STATUSTEXT"]
         assert other.mav.total_receive_errors == 0

@@ -147,17 +147,17 @@ class ToAutopilot:
     def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
-            match = messages.place_match(now_s, best.place.place_id, best.match.score, confidence_of(event))
-            self._link.send(*match)
+            found = {"vpr_place": best.place.place_id, "vpr_score": best.match.score, "vpr_conf": confidence_of(event)}
+            self._link.send(*messages.named_values(now_s, **found))
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
-            self._link.send(*messages.query_figures(now_s, cpu_share, used_mah))
+            self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
         """Send the distance `off_m` (metres) from the GPS position to a match. The navigator does not use GPS while it
         `is_wrong`."""
         with self._link.turn("gps"):
-            self._link.send(messages.gps_distance(self._clock.mono_s(), off_m))
+            self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong)
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:

@@ -13,8 +13,8 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.positions import MotionState
+from edgevpr.mavlink.messages import Fix, MotionState
+from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, SeenFix
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
@@ -50,7 +50,7 @@ class Advice:
     is_held: bool = False
 
 
-class Navigator:
+class Navigator(Listener):
     """Navigates for one autopilot. `map_sd_m` is the standard deviation of the error that all fixes share, `every_s`
     the time between two queries. `is_muted`, in a dry run: no continuous position is given."""
 

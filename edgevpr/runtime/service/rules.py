@@ -24,7 +24,7 @@ from edgevpr.mavlink.channel import (
     px4_choice,
     receiver_name,
 )
-from edgevpr.mavlink.positions import SENSOR_ID
+from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
 
 Parameters = Mapping[str, float | int]

@@ -79,7 +79,7 @@ def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
         link.set_health(Health.ACTIVE)
         wait_until(lambda: link.stats().autopilot_heard, "the other process")
         link.send_fix(Fix(50.1234567, 14.0, 25.0, time.monotonic()))
-        link.send(*messages.place_match(time.monotonic(), 3, 0.5))
+        link.send(*messages.named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
         wait_until(lambda: link.stats().acks == {"ACCEPTED": 1})
         wait_until(lambda: link.stats().sent.get("NAMED_VALUE_FLOAT") == 1)
     process.send_signal(signal.SIGTERM)
@@ -141,7 +141,7 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
         assert there.lat / 1e7 == 50.0
         with link_to(f"udpout:{link}") as flight:
             wait_until(lambda: flight.stats().autopilot_heard)
-            flight.send(*messages.place_match(time.monotonic(), 3, 0.5))
+            flight.send(*messages.named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
             wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
     finally:
         autopilot.finish()

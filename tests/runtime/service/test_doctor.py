@@ -15,7 +15,7 @@ from edgevpr.mavlink import asking as module
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import ardupilot_choice
-from edgevpr.mavlink.positions import SENSOR_ID
+from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
