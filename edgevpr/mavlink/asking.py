@@ -23,8 +23,7 @@ HEARTBEAT_S = 1.0
 HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
 TRIES, ANSWER_WAIT_S = 3, 1.0
 IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
-LISTEN_S = 4.0
-ROUND_TRIPS = 10
+LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
 
 _FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
@@ -39,7 +38,7 @@ class Inquiry:
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
     - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
-    - `says_version_1`: its last message was MAVLink 1.
+    - `says_version_1`: its last message was MAVLink 1. `round_trips_s`: how long it took to answer each `message`.
     - `others`: system ids of any other autopilots on the link.
     """
 
@@ -57,6 +56,7 @@ class Inquiry:
         self.signed = 0
         self.others: set[int] = set()
         self.says_version_1 = False
+        self.round_trips_s: list[float] = []
         self.signing = signing
         self._address = address
         self._reader = PacketReader(signing.admits)
@@ -92,7 +92,7 @@ class Inquiry:
         return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
-        """Receive for `wait_s` seconds, only to count in `heard` the messages that the autopilot sends unasked."""
+        """Receive for `wait_s` seconds what comes unasked."""
         self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
@@ -100,9 +100,11 @@ class Inquiry:
         refuses the request, or does not answer three requests."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
+            sent_s = time.monotonic()
             self._put(messages.message_request(self.system_id or 0, message_id))
             answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
             if answer is not None:
+                self.round_trips_s.append(time.monotonic() - sent_s)
                 return answer if answer.get_type() == name else None
         return None
 
@@ -120,21 +122,6 @@ class Inquiry:
                 self._read_parameters(missing[start : start + IN_FLIGHT], values, bytewise)
             missing = [name for name in missing if name not in values]
         return values
-
-    def round_trips_s(self, count: int) -> list[float]:
-        """Send `count` TIMESYNC requests, one after another, and return the round-trip time of each in seconds. Those
-        without an answer within a second are left out."""
-        times_s = []
-        for _ in range(count):
-            sent_ns = time.monotonic_ns()
-            self._put(mavlink.MAVLink_timesync_message(0, sent_ns))
-
-            def answers(message: Message, sent_ns: int = sent_ns) -> bool:
-                return bool(message.get_type() == "TIMESYNC" and message.tc1 != 0 and message.ts1 == sent_ns)
-
-            if self._first(ANSWER_WAIT_S, answers):
-                times_s.append((time.monotonic_ns() - sent_ns) / 1e9)
-        return times_s
 
     def _read_parameters(self, names: Collection[str], values: dict[str, float | int], bytewise: bool) -> None:
         """Request the parameters `names`, and store the answers in `values`, until no answer has come for a second."""
@@ -215,11 +202,11 @@ class Inquiry:
 class AutopilotReading:
     """All that an autopilot tells about itself; None and empty stand for what it did not answer.
 
-    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of a `Kind`. `streams_hz` is the rate of the
-    messages that came unasked, `heard` the names of all that came. `gps_fix` is the fix type of the first and second
-    receiver. `filter_flags` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS. `origin` is (latitude, longitude) in
-    degrees. `signs`: its messages are signed; `is_signed_to`: ours are. `answers`: it has answered any question;
-    `says_version_1`: it sends MAVLink 1. `clock_ahead_s` is its UTC less that of this machine.
+    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of a `Kind`. `heard` are the names of all
+    messages that came. `gps_fix` is the fix type of the first and second receiver. `filter_flags` are those of
+    EKF_STATUS_REPORT or ESTIMATOR_STATUS. `origin` is (latitude, longitude) in degrees. `signs`: its messages are
+    signed; `is_signed_to`: ours are. `answers`: it has answered any question; `says_version_1`: it sends MAVLink 1.
+    `clock_ahead_s` is its UTC less that of this machine.
     """
 
     system_id: int
@@ -229,7 +216,6 @@ class AutopilotReading:
     version: tuple[int, int, int] | None
     version_text: str | None
     parameters: dict[str, float | int]
-    streams_hz: dict[str, float]
     heard: tuple[str, ...]
     gps_fix: tuple[int | None, int | None]
     filter_flags: int | None
@@ -258,12 +244,9 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     if beat is None:
         return None
     firmware = _FIRMWARES.get(beat.autopilot, "other")
-    before = asking.heard.copy()
     asking.listen(LISTEN_S)
-    streams_hz = {name: count / LISTEN_S for name, count in sorted((asking.heard - before).items())}
     said = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    trips_s = asking.round_trips_s(ROUND_TRIPS if said else 1)
-    answers = bool(said or trips_s or asking.heard["COMMAND_ACK"])
+    answers = bool(said or asking.heard["COMMAND_ACK"])
     is_px4 = firmware == "px4"
     wanted_ids = {
         "filter": mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
@@ -288,7 +271,6 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         version=version if said else None,
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
         parameters=asking.parameters(wanted.get(firmware, ()) if answers else (), bytewise),
-        streams_hz=streams_hz,
         heard=tuple(sorted(asking.heard)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
         filter_flags=told["filter"] and told["filter"].flags,
@@ -299,7 +281,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         says_version_1=asking.says_version_1,
         other_systems=tuple(sorted(asking.others)),
         bad_bytes=asking.bad_bytes,
-        round_trip_s=statistics.median(trips_s) if trips_s else None,
+        round_trip_s=statistics.median(asking.round_trips_s) if asking.round_trips_s else None,
         clock_ahead_s=clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None,
     )
 

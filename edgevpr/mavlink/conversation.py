@@ -172,7 +172,7 @@ class Conversation:
             if self.autopilot.hear(message, now_s, sender):
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
-                if news := self.autopilot.identity.take_news():
+                if news := self.autopilot.identity.news:
                     self.fixes.forget_row()
                     self.fixes.break_off("another autopilot has taken its place")
                     self.announce(Severity.WARNING, news, "autopilot")

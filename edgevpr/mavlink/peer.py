@@ -1,15 +1,15 @@
-"""The state of the autopilot at the other end of the link, collected from its messages: its system id, presence,
-answers to fixes, and the position and motion of its vehicle. Used by `conversation`."""
+"""The autopilot at the other end of the link: which of the senders it is, and its state, collected from its messages:
+presence, answers to fixes, and the position and motion of its vehicle. Used by `conversation`."""
 
+import logging
 import math
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
-from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
 from edgevpr.mavlink.readiness import Readiness
 from edgevpr.mavlink.vehicle import GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, gps_sd_m
@@ -20,6 +20,98 @@ GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 _MILLI_G_M_S2 = 9.80665e-3
+
+# A flight controller that restarts is back within 20 s; other senders in the meantime are not it.
+RETAKEN_AFTER_S = 30.0
+STEADY_S = 5.0  # another address takes over after heartbeats for this time (not after one stray packet),
+GAP_S = 2.5  # without a longer gap: they come once a second, and one may be lost
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Speaker:
+    """The sender of an autopilot's messages: its system id, and its address (None if the link has one sender only)."""
+
+    system_id: int
+    address: Sender | None
+
+    def __str__(self) -> str:
+        return f"system {self.system_id}{self.where}"
+
+    @property
+    def where(self) -> str:
+        """The address as text with a space before it (" at HOST:PORT"); empty without an address."""
+        return f" at {self.address[0]}:{self.address[1]}" if self.address else ""
+
+
+class Identity:
+    """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
+    id. Another system id never takes its place. The same one at another address does so after 30 s of silence, with
+    steady heartbeats.
+
+    `kept` is our autopilot (None: not heard yet), `news` a short text if it has become so by the last message at
+    another address. `foreign_messages` counts the messages refused since they came from another autopilot or address.
+    """
+
+    def __init__(self, system_id: int | None = None) -> None:
+        self.kept: Speaker | None = None
+        self.foreign_messages = 0
+        self._configured = system_id
+        self._spoke_s = -math.inf
+        self._other: tuple[Speaker, float, float] | None = None  # times of its first and last unbroken heartbeat
+        self._has_warned = False
+        self.news: str | None = None
+
+    def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
+        """Return True if a message of this speaker comes from our autopilot. `beats`: the message is the heartbeat of
+        an autopilot, by which the speaker may become ours. Messages of others are counted."""
+        self.news = None
+        if beats and speaker != self.kept and self._is_next(speaker, now_s):
+            self._take(speaker, now_s)
+        if speaker != self.kept:
+            self.refuse()
+            return False
+        self._spoke_s = now_s
+        return True
+
+    def is_elsewhere(self, address: Sender | None) -> bool:
+        """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
+        return self.kept is not None and address != self.kept.address
+
+    def refuse(self) -> None:
+        """Count a message of another sender in `foreign_messages`, unless any sender may still become our autopilot."""
+        self.foreign_messages += self.kept is not None or self._configured is not None
+
+    def _is_next(self, speaker: Speaker, now_s: float) -> bool:
+        """Note the heartbeat of a speaker that is not our autopilot; return True if it becomes ours now."""
+        kept = self.kept
+        if kept is None and self._configured in (None, speaker.system_id):
+            return True
+        if not self._has_warned:  # two vehicles on one link are dangerous
+            self._has_warned = True
+            log.warning(
+                "another autopilot, %s, is on this link: fixes go to %s only; give each vehicle a link of its own, or "
+                "set mavlink.system_id and restart edgevpr",
+                speaker,
+                kept or f"system {self._configured}",
+            )
+        if kept is None or speaker.system_id != kept.system_id:
+            return False
+        other, first_s, last_s = self._other or (speaker, now_s, now_s)
+        if other != speaker or now_s - last_s > GAP_S:
+            first_s = now_s
+        self._other = speaker, first_s, now_s
+        return now_s - self._spoke_s >= RETAKEN_AFTER_S and now_s - first_s >= STEADY_S
+
+    def _take(self, speaker: Speaker, now_s: float) -> None:
+        before, self.kept, self._other, self._has_warned = self.kept, speaker, None, False
+        if before is None:
+            log.info("autopilot heard: %s", speaker)
+        else:
+            silent_s = now_s - self._spoke_s
+            log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, silent_s)
+            self.news = f"autopilot now{speaker.where}"
 
 
 class Listener:

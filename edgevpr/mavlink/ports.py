@@ -114,8 +114,7 @@ class UdpInPort(Port):
         return 0
 
     def answer_sender(self) -> None:
-        self._peer = self.sender
-        self.connected = self._peer is not None
+        self._peer, self.connected = self.sender, self.sender is not None
 
 
 class TcpPort(Port):
@@ -127,8 +126,7 @@ class TcpPort(Port):
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_GIVE_UP_MS)
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_SEND_BYTES)
         if self._sock.getsockname() == self._sock.getpeername():
-            # A connection to a local port without a listener can, by chance, start from this same port: a socket that
-            # is connected to itself.
+            # By chance, a connection to a local port without a listener can start from this same port.
             self.close()
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
 
@@ -174,6 +172,24 @@ class SerialPort(Port):
         self._port.close()
 
 
+_OPENERS: dict[str, Callable[[str, int], Port]] = {
+    "udpout": UdpOutPort,
+    "udpin": UdpInPort,
+    "tcp": TcpPort,
+    "serial": SerialPort,
+}
+_NOT_PERMITTED = "the system does not permit it: take a port above 1023 and the address of one host"
+_NOT_OPENED = "this user may not open the device: add the user to the group that owns it (often `dialout`)"
+_ADVICE = {  # by error, and whether the link is a serial one
+    (errno.EADDRINUSE, False): "the port is in use by another program: stop that one, or take another port",
+    (errno.EWOULDBLOCK, True): "the device is in use by another program: stop that one",
+    (errno.EACCES, True): _NOT_OPENED,
+    (errno.EPERM, True): _NOT_OPENED,
+    (errno.EACCES, False): _NOT_PERMITTED,
+    (errno.EPERM, False): _NOT_PERMITTED,
+}
+
+
 def open_port(address: LinkAddress) -> Port:
     """Open the port of a link.
 
@@ -181,6 +197,7 @@ def open_port(address: LinkAddress) -> Port:
     network), LinkError for another fault that the user must correct (a port in use, no permission), and OSError for a
     fault that may end by itself (a device that is not plugged in, a server that is not running).
     """
+    is_serial = address.kind == "serial"
     try:
         return _OPENERS[address.kind](address.where, address.number)
     except (socket.gaierror, UnicodeError) as error:
@@ -193,36 +210,18 @@ def open_port(address: LinkAddress) -> Port:
             f"{address}: it cannot be opened ({error}): correct the device or the baud rate."
         ) from error
     except OSError as error:
-        match error.errno, address.kind:
-            case (errno.EADDRINUSE, _):
-                advice = f"port {address.number} is in use by another program: stop that one, or take another port"
-            case (errno.EWOULDBLOCK, "serial"):
-                advice = "the device is in use by another program: stop that one"
-            case (errno.EACCES | errno.EPERM, "serial"):
-                advice = "this user may not open the device: add the user to the group that owns it (often `dialout`)"
-            case (errno.EACCES | errno.EPERM, _):
-                advice = "the system does not permit it: take a port above 1023 and the address of one host"
-            case _:
-                raise
-        is_wrong = error.errno == errno.EACCES and address.kind != "serial"
-        raise (LinkAddressError if is_wrong else LinkError)(f"{address}: {advice}.") from error
-
-
-_OPENERS: dict[str, Callable[[str, int], Port]] = {
-    "udpout": UdpOutPort,
-    "udpin": UdpInPort,
-    "tcp": TcpPort,
-    "serial": SerialPort,
-}
+        if not (advice := _ADVICE.get((error.errno or 0, is_serial))):
+            raise
+        kind = LinkAddressError if error.errno == errno.EACCES and not is_serial else LinkError
+        raise kind(f"{address}: {advice}.") from error
 
 
 def _udp_socket(attach: Callable[[socket.socket, Sender], None], host: str, port: int) -> socket.socket:
     """Make a UDP socket, and attach it to `host` and `port` by `attach`: socket.bind or socket.connect."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
-        attach(sock, (str(address[0]), int(address[1])))
-    except OSError:
+        attach(sock, (host, port))
+    except (OSError, UnicodeError):
         sock.close()
         raise
     return sock

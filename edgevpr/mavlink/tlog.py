@@ -7,7 +7,7 @@ import os
 import struct
 import threading
 import time
-from io import FileIO
+from collections import deque
 from pathlib import Path
 
 from edgevpr.core.appending import append, is_at, keep_as_earlier, open_appending, sync
@@ -15,7 +15,7 @@ from edgevpr.core.errors import EdgevprError
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
 SPARED_BYTES = 20_000_000  # of the disk, which are left to the flight log
-WAITING_BYTES = 256_000  # of packets that a slow disk keeps waiting: half a minute or more of a usual link
+WAITING_MAX = 4096  # packets that a slow disk keeps waiting: half a minute or more of a usual link
 WRITE_S = 1.0
 CLOSE_S = 2.0
 
@@ -33,9 +33,8 @@ class Tlog:
     def __init__(self, path: str | Path) -> None:
         """Open the file. Raises EdgevprError if it cannot be opened."""
         self._path = Path(os.path.realpath(path))
-        self._waiting = bytearray()
+        self._waiting: deque[bytes] = deque()  # time stamps with their packets
         self._missing = 0  # number of packets left out
-        self._lock = threading.Lock()  # guards these two, and is held for no longer than a copy takes
         self._closing, self._ended = threading.Event(), False
         try:
             self._file = open_appending(self._path)
@@ -56,13 +55,11 @@ class Tlog:
     def record(self, packet: bytes) -> None:
         """Queue a packet to be written. Any thread may call this; it never blocks and never raises."""
         stamp = struct.pack(">Q", time.time_ns() // 1000 & ~3)  # the last two bits would be the number of a link
-        with self._lock:
-            if self._ended:
-                return
-            if len(self._waiting) + len(stamp) + len(packet) > WAITING_BYTES:
-                self._missing += 1
+        if not self._ended:
+            if len(self._waiting) < WAITING_MAX:
+                self._waiting.append(stamp + packet)
             else:
-                self._waiting += stamp + packet
+                self._missing += 1
 
     def close(self) -> None:
         """Write the queued packets, for two seconds at most, and close the file."""
@@ -88,27 +85,23 @@ class Tlog:
                 error.strerror,
             )
         finally:
-            with self._lock:
-                self._ended = True
-                self._waiting.clear()
+            self._ended = True
+            self._waiting.clear()
             self._file.close()
 
     def _write(self) -> None:
-        with self._lock:
-            records, self._waiting = self._waiting, bytearray()
+        records = b"".join(self._waiting.popleft() for _ in range(len(self._waiting)))
         if not records:
             return
-        if not is_at(self._file, self._path):  # moved or deleted in flight
-            self._file = self._reopened()
-        elif os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES:
+        is_full = os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES
+        is_there = is_at(self._file, self._path)  # neither moved nor deleted in flight
+        if is_there and is_full:
             keep_as_earlier(self._path)
-            self._file = self._reopened()
+        if is_full or not is_there:
+            self._file.close()
+            self._file = open_appending(self._path)
         disk = os.fstatvfs(self._file.fileno())
         if disk.f_bavail * disk.f_frsize < SPARED_BYTES:
             raise OSError(errno.ENOSPC, f"less than {SPARED_BYTES // 1_000_000} MB are left on the disk")
-        append(self._file, bytes(records))
+        append(self._file, records)
         sync(self._file)
-
-    def _reopened(self) -> FileIO:
-        self._file.close()
-        return open_appending(self._path)

@@ -7,9 +7,9 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.identity import Identity, Speaker
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.peer import Identity, Speaker
 from edgevpr.mavlink.wire import mavlink
 
 OURS, FOREIGN = Speaker(1, None), Speaker(2, None)
@@ -34,7 +34,7 @@ def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
         assert not identity.admits(FOREIGN, False, t_s + 0.6)
     assert identity.kept == OURS
     assert identity.foreign_messages == 202
-    assert caplog.text.count("a second autopilot, system 2") == 1
+    assert caplog.text.count("another autopilot, system 2") == 1
 
 
 def test_messages_that_are_no_heartbeat_keep_our_place_too():
@@ -52,8 +52,7 @@ def test_the_same_system_from_elsewhere_is_taken_after_thirty_seconds_of_silence
     for t_s in seconds(20, 40):
         assert beat(identity, Speaker(7, THERE), t_s) == [False]
         assert beat(identity, Speaker(1, THERE), t_s + 0.5) == [t_s >= 30]
-    assert identity.take_news() == "autopilot now at 127.0.0.1:2000"
-    assert identity.take_news() is None
+        assert (identity.news == "autopilot now at 127.0.0.1:2000") == (t_s == 30)
     assert "for 30 s" in caplog.text
     assert beat(identity, Speaker(1, HERE), 41.0) == [False]
 
@@ -85,7 +84,7 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
     identity = Identity(system_id=1)
     assert not any(beat(identity, Speaker(2, HERE), *seconds(0, 99)))
     assert identity.foreign_messages == 100
-    assert caplog.text.count("is not system 1, which is configured") == 1
+    assert caplog.text.count("fixes go to system 1 only") == 1
     assert beat(identity, Speaker(1, HERE), 100.0) == [True]
     assert not any(beat(identity, Speaker(2, HERE), *seconds(101, 200)))
     assert beat(identity, Speaker(1, THERE), *seconds(201, 206)) == [False] * 5 + [True]
@@ -152,7 +151,7 @@ def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speak
     assert names(thief) == []
     assert link.stats().acks == {"FAILED": 40}, "nor is it believed"
     assert link.stats().foreign_messages == 80
-    assert caplog.text.count("a second autopilot of that number") == 1
+    assert caplog.text.count("another autopilot, system 1") == 1
 
 
 @pytest.mark.network

@@ -191,9 +191,9 @@ def test_a_slow_disk_keeps_nobody_waiting_and_fills_no_memory(path, caplog, monk
     with Tlog(path) as log:
         log.record(packet(0))
         assert is_slow.wait(60)
-        for number in range(1, 20_000):  # 600 kB
+        for number in range(1, 20_000):
             log.record(packet(number))
-        assert len(log._waiting) <= tlog.WAITING_BYTES
+        assert len(log._waiting) <= tlog.WAITING_MAX
         go_on.set()
     found = numbers(path)
     assert found == list(range(len(found)))

@@ -142,7 +142,7 @@ def _link(reading: AutopilotReading, address: LinkAddress) -> Finding:
         look_at = "look at ground wire, cable and baud rate"
         return wrong("link", f"{who}: {reading.bad_bytes} bytes arrived damaged: {look_at}.")
     if reading.round_trip_s is None:
-        return fine("link", f"{who}; it does not answer TIMESYNC")
+        return fine("link", who)
     trip = f"an answer takes {1000 * reading.round_trip_s:.0f} ms"
     if reading.round_trip_s > _SLOW_S:
         late = f"{who}; {trip}, so every fix comes late: use a faster line."
@@ -171,8 +171,7 @@ def _streams(reading: AutopilotReading) -> Finding:
             f"No {' and no '.join(missing)} comes, even on request: an autopilot that does not know its position "
             "yet may keep it back; let it have GPS.",
         )
-    rates = ", ".join(f"{name} {reading.streams_hz[name]:g} Hz" for name in _NEEDED if name in reading.streams_hz)
-    return fine("streams", f"without being asked: {rates or 'none'}; in flight edgevpr asks for what it needs")
+    return fine("streams", "position, attitude and GPS come; in flight edgevpr asks for what it needs")
 
 
 def _filter(reading: AutopilotReading) -> Finding:

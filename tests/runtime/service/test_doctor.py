@@ -34,7 +34,6 @@ COPTER = AutopilotReading(
     version=(4, 6, 2),
     version_text="4.6.2",
     parameters=PLAIN | {"GPS2_TYPE": 14},
-    streams_hz={"ATTITUDE": 4.0},
     heard=("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
     gps_fix=(3, None),
     filter_flags=READY,
@@ -388,7 +387,7 @@ def test_the_command_over_a_link(link, capsys, tmp_path, monkeypatch):
     assert {what: message for what, (ok, message) in found.items() if not ok} == {}
     assert code == 0
     assert list(tmp_path.iterdir()) == []
-    assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ", "TIMESYNC"}
+    assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"}
 
 
 @pytest.mark.network
