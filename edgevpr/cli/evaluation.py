@@ -46,7 +46,6 @@ def add(commands: Any) -> None:
         "--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on there"
     )
     parser.add_argument("--workers", type=_count, metavar="N", help="with --out: processes at work (all cores)")
-    parser.add_argument("--cache", metavar="FOLDER", help="with --out: where finished work is kept (OUT/cache)")
     video = (
         "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and FLIGHT.csv: time,lat,lon[,...])"
     )
@@ -70,8 +69,8 @@ def add(commands: Any) -> None:
         "--similarity",
         nargs="+",
         metavar="FILE",
-        help="instead of techniques, measure stored similarities (.npy, .npz, .csv; a row for each query; of --query "
-        "and --ref where they are given)",
+        help="instead of techniques, measure stored similarities (.npy; a row for each query; of --query and --ref "
+        "where they are given)",
     )
     parser.add_argument(
         "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
@@ -114,16 +113,16 @@ def _measure_many(args: Namespace) -> int:
     _say_cameras(plan)
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
-    outcome = measure(plan, args.cache or out / "cache", args.workers or len(os.sched_getaffinity(0)), progress)
+    outcome = measure(plan, out, args.workers or len(os.sched_getaffinity(0)), progress)
     write_results(out, outcome)
-    for of in outcome.sets:
-        _say(*of.dataset.notes)
+    for dataset in outcome.sets.values():
+        _say(*dataset.notes)
     if args.json:
         print_json(as_json(outcome))
     else:
-        for of in outcome.sets:
-            if results := [row.result for row in outcome.found if row.set_name == of.name]:
-                print(f"{shown(of.name)}\n\n{quality_text(results)}\n")
+        for name in outcome.sets:
+            if rows := outcome.rows_of(name):
+                print(f"{shown(name)}\n\n{quality_text([row.result for row in rows])}\n")
         print(f"{out / 'index.html'}: look at it.")
     _say(*(f"{name}, {row} was not measured: {why}" for (name, row), why in outcome.failed.items()))
     return 1 if outcome.failed else 0
@@ -133,12 +132,11 @@ def _measure_techniques(args: Namespace) -> int:
     """Measure techniques on one set, and print the results. Files are written only for --plot."""
     from edgevpr.core.text import progress, require_picture
     from edgevpr.lab.evaluate import evaluate as evaluation
-    from edgevpr.lab.evaluate.cache import Cache
     from edgevpr.lab.evaluate.tables import plot, results_text
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.techniques import create
 
-    if args.sets or args.workers or args.cache:
+    if args.sets or args.workers:
         raise UsageError("Name a folder for the results with --out.")
     if args.data and len(args.data) > 1:
         raise UsageError("Several sets need a folder for the results: name it with --out.")
@@ -157,8 +155,8 @@ def _measure_techniques(args: Namespace) -> int:
         raise next(iter(errors.values()))
     gate = gate_of(config_of(args, args.config).salience)
     ((name, chosen),) = plan.sets.items()
-    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as cache:
-        dataset = chosen.open(Cache(cache), progress)
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as videos:
+        dataset = chosen.open(Path(videos), progress)
         _say(*dataset.notes)
         _say_cameras(plan)
         measured = [
@@ -176,23 +174,20 @@ def _measure_techniques(args: Namespace) -> int:
 
 
 def _measure_similarities(args: Namespace) -> int:
-    from edgevpr.core.text import decoded_name, require_picture
-    from edgevpr.frames.images import list_images
-    from edgevpr.lab.evaluate.numbered import truth_in
-    from edgevpr.lab.evaluate.similarity import measure, read_similarities
+    from edgevpr.core.text import require_picture
+    from edgevpr.lab.evaluate.dataset import names_in
+    from edgevpr.lab.evaluate.similarity import measure, read_similarities, truth_of
     from edgevpr.lab.evaluate.tables import plot, quality_text
-
-    def names_in(folder: str | None) -> list[str] | None:
-        return [decoded_name(path.name) for path in list_images(folder)] if folder else None
 
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
     if args.plot:
         require_picture(Path(args.plot))
-    truth, queries, references = truth_in(args.ground_truth), names_in(args.query), names_in(args.ref)
-    results = [
-        measure(Path(file).stem, read_similarities(file), truth, references, queries) for file in args.similarity
-    ]
+    queries, references = (names_in(folder) if folder else None for folder in (args.query, args.ref))
+    results = []
+    for file in args.similarity:
+        scores = read_similarities(file)
+        results.append(measure(Path(file).stem, scores, *truth_of(args.ground_truth, scores, queries, references)))
     if args.plot:
         plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
     if args.json:

@@ -1,7 +1,4 @@
-"""Asks the queries of a data set one by one, with the recogniser of a flight, and judges each answer by ground truth.
-
-`evaluate`, and through it the workers of `many`, use this module.
-"""
+"""Asks the queries of a data set one by one, with the recogniser of a flight, and judges each by ground truth."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

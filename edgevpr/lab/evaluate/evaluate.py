@@ -71,7 +71,7 @@ class TechniqueResult(Quality):
     t_encode_max_s: float | None = None
 
 
-def _quietly(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+def quietly(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
     return items
 
 
@@ -80,7 +80,7 @@ def evaluate(
     dataset: Dataset,
     parameters: dict[str, Any] | None = None,
     options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
-    progress: Progress[Any] = _quietly,
+    progress: Progress[Any] = quietly,
     gate: Gate | None = None,
 ) -> TechniqueResult:
     """Map the references of `dataset` in a temporary file, ask every query, and score the answers. `parameters` are
@@ -91,26 +91,22 @@ def evaluate(
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
     technique = create(technique_name, parameters)
-    source = open_source(str(dataset.ref_dir), live=False)
-    frames = progress(all_frames(source), source.total, f"{technique_name}: references")
-    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
-        path = Path(folder) / "references.gpkg"
-        make_map(path, frames, technique, dataset.ref_dir)
-        found = answers_on(path, technique, dataset, options, progress, gate)
+    found = answered(technique, dataset, options, progress, gate)
     return summary(technique, len(dataset.references), found, length_of(technique.spec, options.sequence))
 
 
-def answers_on(
-    path: Path,
+def answered(
     technique: Technique,
     dataset: Dataset,
     options: MatchOptions,
-    progress: Progress[Any] = _quietly,
+    progress: Progress[Any] = quietly,
     gate: Gate | None = None,
 ) -> list[QueryAnswer]:
-    """Ask every query of `dataset` in the map file `path` of its references, and return the judged answers."""
-    with opened(path, technique) as (place_map, index):
-        walk = Walk(technique, place_map, index, own_meter(), options=options, gate=gate)
+    """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers."""
+    source, meter = open_source(str(dataset.ref_dir), live=False), own_meter()
+    frames = progress(all_frames(source), source.total, f"{technique.spec.name}: references")
+    with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
+        walk = Walk(technique, place_map, index, meter, options=options, gate=gate)
         walk.warm_up(dataset.queries[0].path)
         return list(answers(walk, dataset, progress))
 
@@ -143,10 +139,10 @@ def make_map(
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter)
         with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
-            refine_map(place_map, technique, images, _quietly)
+            refine_map(place_map, technique, images, quietly)
         if images:
             with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
-                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), _quietly)
+                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), quietly)
 
 
 @contextmanager

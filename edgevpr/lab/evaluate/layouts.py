@@ -10,8 +10,8 @@
   video with positions beside it, query.mp4 with query.csv, or a folder that holds one.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +19,14 @@ import numpy as np
 from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import Footprint, footprint, shared
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions
-from edgevpr.lab.evaluate.dataset import Dataset, Judged, ScoredQuery, load_dataset
-from edgevpr.lab.evaluate.numbered import Numbered, read_numbered
+from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, load_dataset, names_in
+from edgevpr.lab.evaluate.numbered import read_numbered
 from edgevpr.lab.evaluate.videos import side_of, without_position
 
 _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
@@ -57,10 +58,13 @@ def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], P
     if (numbers := folder / "ground_truth_new.npy").is_file():
         return _of_numbers(query, ref, numbers)
     if (matrices := folder / "GT.npz").is_file():
-        return _of_matrices(folder, matrices)
-    for inner in (folder, folder / "test", folder / "images" / "test"):
-        if (inner / "database").is_dir() and (inner / "queries").is_dir():
-            return _of_utm(inner / "queries", inner / "database", rule)
+        inner = sorted(path for path in folder.iterdir() if path.is_dir())
+        if len(inner) != 2:
+            raise UsageError(f"{folder} needs two folders beside GT.npz, that of the map first by name.")
+        return _of_numbers(inner[1], inner[0], matrices)
+    for outer in (folder, folder / "test", folder / "images" / "test"):
+        if (outer / "database").is_dir() and (outer / "queries").is_dir():
+            return _of_utm(outer / "queries", outer / "database", rule)
     query_side, ref_side = side_of(folder, "query"), side_of(folder, "ref")
     if query_side and ref_side:
         return of_positions(query_side, ref_side, rule, pictures)
@@ -82,63 +86,24 @@ def of_positions(
             "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
         )
     _, origin, _ = references[0]
-    judged = _near(_shots(queries, origin), _shots(references, origin), rule)
-    notes = (*_notes(Path(query), query_dir), *_notes(Path(ref), ref_dir))
-    return replace(_dataset(query_dir, ref_dir, judged), notes=notes)
-
-
-def _notes(given: Path, folder: Path) -> Iterator[str]:
-    if given != folder:
-        without, count = without_position(folder)
+    truth = _near(_shots(queries, origin), _shots(references, origin), rule)
+    notes = []
+    for given, folder in ((query, query_dir), (ref, ref_dir)):
+        without, count = without_position(folder) if Path(given) != folder else (0, 0)
         if without:
-            yield f"{given}: {without} of {count} frames have no position, and are left out"
+            notes.append(f"{given}: {without} of {count} frames have no position, and are left out")
+    return joined(query_dir, ref_dir, truth, query_dir, notes)
 
 
 def _of_numbers(query_dir: Path, ref_dir: Path, path: Path) -> Dataset:
-    numbered = read_numbered(path)
-    for folder, count in zip((ref_dir, query_dir), numbered.shape, strict=True):
-        there = len(list_images(folder))
-        if count > there:
-            raise UsageError(f"{path} names image {count - 1} of {folder}, which has {there}: bring all of them.")
-    return _dataset(query_dir, ref_dir, _named(numbered, query_dir, ref_dir))
-
-
-def _of_matrices(folder: Path, path: Path) -> Dataset:
-    found = sorted(inner for inner in folder.iterdir() if inner.is_dir())
-    if len(found) != 2:
-        raise UsageError(
-            f"{folder} has {len(found)} folders beside GT.npz: it needs two, that of the map first by name."
-        )
-    ref_dir, query_dir = found
-    numbered = read_numbered(path)
-    there = len(list_images(ref_dir)), len(list_images(query_dir))
-    if numbered.shape != there:
-        raise UsageError(
-            f"{path} judges {numbered.shape} pairs, and there are {there[0]} images in {ref_dir} and {there[1]} in "
-            f"{query_dir}: the first folder by name must be that of the map."
-        )
-    return _dataset(query_dir, ref_dir, _named(numbered, query_dir, ref_dir))
-
-
-def _named(numbered: Numbered, query_dir: Path, ref_dir: Path) -> dict[str, Judged]:
-    queries, references = ([path.name for path in list_images(folder)] for folder in (query_dir, ref_dir))
-    return numbered.named(queries, references).scored
+    return joined(query_dir, ref_dir, read_numbered(path, names_in(query_dir), names_in(ref_dir)), path)
 
 
 def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
     queries, references = (
         [_Shot(path, *_utm_m(path), GeoTag()) for path in list_images(each)] for each in (query_dir, ref_dir)
     )
-    only_distance = Nearness(within_m=rule.within_m)
-    return _dataset(query_dir, ref_dir, _near(queries, references, only_distance))
-
-
-def _dataset(query_dir: Path, ref_dir: Path, judged: dict[str, Judged]) -> Dataset:
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    scored = tuple(
-        ScoredQuery(path, judged[path.name].right, judged[path.name].ignored) for path in queries if path.name in judged
-    )
-    return Dataset(scored, ref_dir, tuple(path.name for path in references))
+    return joined(query_dir, ref_dir, _near(queries, references, Nearness(within_m=rule.within_m)), query_dir)
 
 
 def _utm_m(path: Path) -> tuple[float, float]:
@@ -177,12 +142,11 @@ def _shots(tagged: Sequence[tuple[Path, Position, GeoTag]], origin: Position) ->
     return [_Shot(path, *place, tag) for (path, _, tag), place in zip(tagged, places, strict=True)]
 
 
-def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness) -> dict[str, Judged]:
-    """Return the ground truth of each query that has a right reference, by its name. Raises UsageError where no query
-    has one, or where a heading or height that `rule` needs is unknown."""
+def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness) -> GroundTruth:
+    """Return the ground truth of each query that has a right reference. Raises UsageError where none has."""
     there_m = np.array([(shot.east_m, shot.north_m) for shot in references])
     prints = [_print(shot, rule) for shot in references] if rule.overlap is not None else []
-    judged = {}
+    truth = {}
     for query in queries:
         near = np.hypot(*(there_m - (query.east_m, query.north_m)).T) <= rule.within_m
         if rule.within_deg is not None:
@@ -191,11 +155,11 @@ def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness)
             own = _print(query, rule)
             near &= [bool(ok) and shared(own, other) >= rule.overlap for ok, other in zip(near, prints, strict=True)]
         if near.any():
-            names = frozenset(shot.path.name for shot, is_near in zip(references, near, strict=True) if is_near)
-            judged[query.path.name] = Judged(names, frozenset(), str(query.path))
-    if not judged:
+            names = (decoded_name(shot.path.name) for shot, is_near in zip(references, near, strict=True) if is_near)
+            truth[decoded_name(query.path.name)] = Judged(frozenset(names))
+    if not truth:
         raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
-    return judged
+    return truth
 
 
 def _apart_deg(one: GeoTag, other: GeoTag) -> float:

@@ -41,17 +41,14 @@ class Quality:
 
 
 def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Return the positions in `ranked`, int, of the references that count, which are those not ignored.
-
-    `ranked` is int (K,), numbers of references, best first; `ignored` is bool (references,), True where a match counts
-    as neither right nor wrong.
-    """
+    """Return the positions in `ranked`, int (K,), numbers of references, best first, of those that are not `ignored`,
+    bool (references,): where a match counts as neither right nor wrong."""
     return np.flatnonzero(~ignored[ranked])
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Return the rank, from 0, of the first right reference; infinite if there is none. `ranked` is int (K,), numbers
-    of references, best first; `right` is bool (references,)."""
+    """Return the rank, from 0, of the first reference of `ranked`, as above, that is `right`, bool (references,);
+    infinite if none is."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
 
@@ -62,13 +59,8 @@ def recall_at(k: int, ranks: np.ndarray) -> float:
 
 
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the curve with the threshold at every score that occurs, from the highest down. Returns two parts:
-    precision (2.1), float (points,);
-    recall (2.2), float (points,).
-
-    Queries with the same score are accepted together, so there is one point per distinct score. If no match at all is
-    right, recall is taken to be 0.
-    """
+    """Compute the curve with the threshold at every distinct score, from the highest down: precision (2.1) and recall
+    (2.2), float (points,). If no match at all is right, recall is taken to be 0."""
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
     order = np.argsort(-scores, kind="stable")
     last_of_its_score = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
@@ -78,11 +70,9 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
 
 
 def auc(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute the area under the precision-recall curve (2.3): only the points that occur, no extra one at recall 0.
-
-    It is at most (N-1)/N. It is 0 if all scores are the same: one point spans no area.
-    """
-    return float(np.sum((precision[:-1] + precision[1:]) / 2 * np.diff(recall)))
+    """Compute the area under the precision-recall curve (2.3): only the points that occur, no extra one at recall 0. So
+    it is at most (N-1)/N, and 0 if all scores are the same."""
+    return float(np.trapezoid(precision, recall))
 
 
 def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
@@ -107,10 +97,8 @@ def extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
 
 
 def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
-    """Compute the area under the ROC curve: the chance that a right match scores higher than a wrong one.
-
-    It says how well the score separates right from wrong. Ties count half. None if all matches are right, or none is.
-    """
+    """Compute the area under the ROC curve: the chance that a right match scores higher than a wrong one. Ties count
+    half. None if all matches are right, or none is."""
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
     right, wrong = scores[correct], np.sort(scores[~correct])
     if not len(right) or not len(wrong):
@@ -122,9 +110,7 @@ def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
 
 def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
     """Compute the performance per compute unit (6.3.1): precision at 100 % recall times log10(t_e,max / t_e + 9).
-
-    `t_encode_max_s` is the encoding time of the slowest technique compared. The PCU of that technique is its precision.
-    """
+    `t_encode_max_s` is the encoding time of the slowest technique compared, whose PCU is its precision."""
     return precision * math.log10(t_encode_max_s / t_encode_s + 9)
 
 
@@ -132,9 +118,8 @@ def figures(scores: np.ndarray, ranks: np.ndarray) -> dict[str, Any]:
     """Return the fields of a `Quality`, by name, except `technique` and the counts. `ranks`, float (N,), are the ranks
     of the first right references (see `first_right`)."""
     precision, recall = precision_recall(scores, ranks == 0)
-    recalls = {f"recall_at_{k}": recall_at(k, ranks) for k in (1, 5, 10)}
     return {
-        **recalls,
+        **{f"recall_at_{k}": recall_at(k, ranks) for k in (1, 5, 10)},
         **{f"recall_at_{k}_interval": interval(ranks < k) for k in (1, 5, 10)},
         "precision_at_100_recall": precision_at_100_recall(precision, recall),
         "recall_at_100_precision": recall_at_100_precision(precision, recall),

@@ -3,7 +3,6 @@ curves, costs and examples of matches. Functions that return a str return HTML."
 
 import json
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -16,7 +15,8 @@ from edgevpr.core.text import decoded_name
 from edgevpr.frames.images import counting_order, list_images, read_image, small_jpeg
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.asking import QueryAnswer
-from edgevpr.lab.evaluate.many import CURVE_TO, MeasuredRow, Measurements, OpenSet
+from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.evaluate.many import CURVE_TO, MeasuredRow, Measurements
 from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED
 from edgevpr.lab.evaluate.provenance import machine, today, versions
 from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
@@ -26,10 +26,7 @@ _COLOURS = 8  # of lines; those after the eighth are dashed
 _PICTURE_PX = 240
 _MOST_MATCHES = 90  # on the page: each has three pictures of some 8 KB
 _FEWEST_OF_A_ROW, _MOST_OF_A_ROW = 2, 8  # matches shown of one row
-
 _SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.2, "0.2"), (0.4, "0.4"), (0.6, "0.6"), (0.8, "0.8"), (1.0, "1")])
-_HEADINGS = ("row", "recall@1", "95 %", "@5", "@10", "AUC", "P@100%R", "R@100%P", "PCU", "accepted (wrong)")
-_COSTS = ("row", "encode ms", "match ms", "RAM B/place", "disk B/place", "mAh/query", "measured")
 
 Numbered = tuple[int, MeasuredRow]  # a row after its number, which is the same on the whole page
 
@@ -43,26 +40,22 @@ def write_results(folder: Path, outcome: Measurements) -> None:
 
 def as_json(outcome: Measurements) -> dict[str, Any]:
     """Return all results, with date, machine and versions, for `json.dumps`."""
+    sizes = {
+        name: {"queries": len(each.queries), "references": len(each.references)} for name, each in outcome.sets.items()
+    }
     return {
         "date": today(),
         "machine": machine(),
         "versions": versions(),
         "seeds": {"intervals": SEED, "resamples": RESAMPLES},
-        "sets": {
-            of.name: {
-                **{key: value for key, value in asdict(of.plan).items() if value is not None},
-                "queries": len(of.dataset.queries),
-                "references": len(of.dataset.references),
-            }
-            for of in outcome.sets
-        },
+        "sets": {name: {**asdict(outcome.plan.sets[name]), **size} for name, size in sizes.items()},
         "results": [
             {
                 "set": row.set_name,
                 "row": row.label,
                 **asdict(row.result),
                 "recall_at_k": row.recalls,
-                "made": asdict(row.made),
+                "made": {**row.made, "was_kept": row.was_kept},
             }
             for row in outcome.found
         ],
@@ -72,26 +65,22 @@ def as_json(outcome: Measurements) -> dict[str, Any]:
 
 def page_of(outcome: Measurements) -> str:
     """Return the whole page. Its style and pictures are inside: it loads no other file."""
-    sets = [_of_set(number, of, outcome) for number, of in enumerate(outcome.sets, start=1)]
-    known = [f"sets: {len(outcome.sets)}", f"rows: {len(_labels(outcome))}", f"written on {today()}"]
+    labels = list(dict.fromkeys(row.label for row in outcome.found))
+    known = [f"sets: {len(outcome.sets)}", f"rows: {len(labels)}", f"written on {today()}"]
     body = [
         heading("Evaluation", [*known, f"edgevpr {versions()['edgevpr']}"]),
         notes(_notes(outcome)),
-        section("All sets", _over_sets(outcome)),
-        *sets,
+        section("All sets", _over_sets(outcome, labels)),
+        *(_of_set(name, outcome, labels) for name in outcome.sets),
         section("How it was measured", _how(outcome)),
     ]
     return page("Evaluation", Path(__file__).with_name("page.css"), body)
 
 
-def _labels(outcome: Measurements) -> list[str]:
-    return list(dict.fromkeys(row.label for row in outcome.found))
-
-
 def _notes(outcome: Measurements) -> Iterator[str]:
     for (of, label), why in outcome.failed.items():
         yield f"{label} was not measured on {of}: {why}"
-    if kept := sum(row.made.was_kept for row in outcome.found):
+    if kept := sum(row.was_kept for row in outcome.found):
         yield (
             f"{kept} of {len(outcome.found)} results were measured earlier: their times are of that day and that "
             "machine, which are named below."
@@ -100,40 +89,41 @@ def _notes(outcome: Measurements) -> Iterator[str]:
         yield "SciPy is not installed: there are no intervals."
 
 
-def _over_sets(outcome: Measurements) -> str:
+def _over_sets(outcome: Measurements, labels: Sequence[str]) -> str:
     """Return a table of recall@1 of every row on every set; "" if there is one set, whose own table has it."""
     if len(outcome.sets) < 2:
         return ""
     found = {(row.label, row.set_name): row.result.recall_at_1 for row in outcome.found}
     rows = []
-    for number, label in enumerate(_labels(outcome), start=1):
-        shares = [found.get((label, of.name)) for of in outcome.sets]
+    for number, label in enumerate(labels, start=1):
+        shares = [found.get((label, name)) for name in outcome.sets]
         known = [share for share in shares if share is not None]
         mean = sum(known) / len(known) if len(known) == len(shares) else None
         rows.append([_name(label, number), *map(tables.share_text, shares), f"<b>{tables.share_text(mean)}</b>"])
-    names = [f'<a href="#set-{number}">{foreign(of.name)}</a>' for number, of in enumerate(outcome.sets, start=1)]
+    names = map(foreign, outcome.sets)
     return "<p>Recall@1 on every set, and the mean of the sets.</p>" + table(["row", *names, "mean"], rows, str)
 
 
-def _of_set(set_number: int, of: OpenSet, outcome: Measurements) -> str:
-    numbers = {label: number for number, label in enumerate(_labels(outcome), start=1)}
-    rows = [(numbers[row.label], row) for row in outcome.found if row.set_name == of.name]
-    title = f'<span id="set-{set_number}">{foreign(of.name)}</span>'
-    camera = {"nadir": ", camera straight down", "forward": ", camera ahead"}.get(of.plan.camera or "", "")
-    scored = f"{len(of.dataset.queries)} queries scored against {len(of.dataset.references)} references{camera}"
+def _of_set(name: str, outcome: Measurements, labels: Sequence[str]) -> str:
+    dataset, camera = outcome.sets[name], outcome.plan.sets[name].camera
+    rows = [(labels.index(row.label) + 1, row) for row in outcome.rows_of(name)]
+    scored = f"{len(dataset.queries)} queries scored against {len(dataset.references)} references"
+    scored += f", camera {camera}" if camera else ""
     if not rows:
-        return section(title, f'<p class="soft">{scored}</p><p>No row was measured on it.</p>')
+        return section(foreign(name), f'<p class="soft">{scored}</p><p>No row was measured on it.</p>')
     most = max(_FEWEST_OF_A_ROW, min(_MOST_OF_A_ROW, _MOST_MATCHES // len(outcome.found)))
-    matches = [_matches(of, row, number, most) for number, row in rows]
+    reached = [[_name(row.label, number), *tables.quality(row.result)] for number, row in rows]
+    paid = [[_name(row.label, number), *tables.costs(row.result), row.made["date"]] for number, row in rows]
+    matches = "".join(_matches(dataset, row, number, most) for number, row in rows)
     return section(
-        title,
+        foreign(name),
         f'<p class="soft">{scored}</p>'
-        + table(_HEADINGS, [_quality(row, number) for number, row in rows], str)
+        + table(("row", *tables.QUALITY), reached, str)
         + f'<div class="charts">{"".join(_charts(rows))}</div>'
         + "<h3>Costs</h3>"
-        + table(_COSTS, [_costs(row, number) for number, row in rows], str)
+        + table(("row", *tables.COSTS, "measured"), paid, str)
         + "<h3>Matches</h3>"
-        + "".join(matches).replace("<details>", "<details open>", 1),
+        + matches.replace("<details>", "<details open>", 1),
     )
 
 
@@ -147,7 +137,9 @@ def _charts(rows: Sequence[Numbered]) -> Iterator[str]:
     at_k = [Series("", _look(number), list(enumerate(row.recalls, start=1))) for number, row in rows]
     axis = Axis(1, most, [(k, str(k)) for k in (1, 5, 10, 15, 20, CURVE_TO) if k <= most])
     yield chart("Recall@K", f"over K, to {most}", at_k, axis, top=1.0)
-    yield _against("Recall@1 over charge", "mAh a query", rows, _mah)
+    yield _against(
+        "Recall@1 over charge", "mAh a query", rows, lambda row: 1000 * row.result.ah_total / row.result.queries
+    )
     yield _against("Recall@1 over memory", "bytes of RAM a place", rows, lambda row: row.result.descriptor_bytes)
 
 
@@ -160,55 +152,33 @@ def _against(title: str, unit: str, rows: Sequence[Numbered], cost: Callable[[Me
     )
     if not points:
         return ""
-    low, high = math.floor(points[0][0]), math.ceil(points[-1][0])
-    high = max(high, low + 1)
+    low = math.floor(points[0][0])
+    high = max(math.ceil(points[-1][0]), low + 1)
     ticks = [(float(power), f"{10.0**power:g}") for power in range(low, high + 1)]
     return scatter(title, unit, points, Axis(low, high, ticks), 1.0)
 
 
-def _quality(row: MeasuredRow, number: int) -> list[str]:
-    first, within, five, _, ten, _, precise, recalled, area, *_ = tables.quality(row.result)
-    shares = [f"<b>{first}</b>", within, five, ten, area, precise, recalled]
-    return [_name(row.label, number), *shares, *tables.decided(row.result)]
-
-
-def _costs(row: MeasuredRow, number: int) -> list[str]:
-    result = row.result
-    return [
-        _name(row.label, number),
-        f"{1000 * result.t_encode_s:.1f}",
-        f"{1000 * result.t_match_s:.1f}",
-        f"{result.descriptor_bytes:,}",
-        f"{result.fine_bytes:,}",
-        figure(_mah(row)),
-        f"{'earlier: ' if row.made.was_kept else ''}{row.made.date}",
-    ]
-
-
-def _matches(of: OpenSet, row: MeasuredRow, number: int, most: int) -> str:
+def _matches(dataset: Dataset, row: MeasuredRow, number: int, most: int) -> str:
     """Return about `most` matches of a row: wrong ones, highest scores first, then right ones, lowest scores first."""
     wrong = sorted((answer for answer in row.answers if not answer.is_right), key=lambda answer: -answer.score)
     right = sorted((answer for answer in row.answers if answer.is_right), key=lambda answer: answer.score)
-    shown = "".join(_match(of, answer) for answer in [*wrong[:most], *right[: max(1, most - len(wrong))]])
+    shown = "".join(_match(dataset, answer) for answer in [*wrong[:most], *right[: max(1, most - len(wrong))]])
     summary = f"<summary>{_name(row.label, number)}: {len(wrong)} of {len(row.answers)} wrong</summary>"
     return f"<details>{summary}<div class='matches'>{shown}</div></details>"
 
 
-def _match(of: OpenSet, answer: QueryAnswer) -> str:
-    (query,) = [query for query in of.dataset.queries if query.path.name == answer.query]
-    references = {decoded_name(path.name): path for path in list_images(of.dataset.ref_dir)}
+def _match(dataset: Dataset, answer: QueryAnswer) -> str:
+    (query,) = [query for query in dataset.queries if query.path.name == answer.query]
+    references = {decoded_name(path.name): path for path in list_images(dataset.ref_dir)}
     pictures = _picture("query", query.path) + _picture("found", references.get(answer.found or ""))
     accepted = "accepted" if answer.accepted else "not accepted"
-    if answer.is_right:
-        return _framed("", "right", answer, accepted, pictures)
-    names = sorted(query.right, key=counting_order)
-    pictures += _picture("right", references.get(names[0]), f" (one of {len(names)})" if len(names) > 1 else "")
-    rank = "not found" if math.isinf(answer.first_right) else f"number {answer.first_right + 1:.0f}"
-    accepted = f'<b class="bad">{accepted}</b>' if answer.accepted_wrong else accepted
-    return _framed("wrong", f"wrong, the right one is {rank}", answer, accepted, pictures)
-
-
-def _framed(kind: str, verdict: str, answer: QueryAnswer, accepted: str, pictures: str) -> str:
+    kind, verdict = "", "right"
+    if not answer.is_right:
+        names = sorted(query.right, key=counting_order)
+        pictures += _picture("right", references.get(names[0]), f" (one of {len(names)})" if len(names) > 1 else "")
+        rank = "not found" if math.isinf(answer.first_right) else f"number {answer.first_right + 1:.0f}"
+        kind, verdict = "wrong", f"wrong, the right one is {rank}"
+        accepted = f'<b class="bad">{accepted}</b>' if answer.accepted_wrong else accepted
     return (
         f'<div class="match {kind}"><p><b>{verdict}</b>, score {figure(answer.score)}, {accepted}</p>'
         f'<div class="pair">{pictures}</div></div>\n'
@@ -225,12 +195,14 @@ def _picture(what: str, path: Path | None, more: str = "") -> str:
 
 
 def _how(outcome: Measurements) -> str:
-    stories: dict[str, list[str]] = defaultdict(list)
-    for row in outcome.found:
-        stories[row.made.story].append(f"{row.set_name}: {row.label}")
     results = [row.result for row in outcome.found]
+    made = (
+        f"{'Earlier, ' if row.was_kept else ''}{row.made['date']}, {row.made['machine']['cpu']}, "
+        f"{row.made['workers']} of {row.made['machine']['cores']} cores, edgevpr {row.made['versions']['edgevpr']}."
+        for row in outcome.found
+    )
     sentences = [
-        *(f"{story}: {'; '.join(rows)}." for story, rows in stories.items()),
+        *dict.fromkeys(made),
         f"95 %: of {RESAMPLES} times that the queries were resampled (seed {SEED}); where all or none hit, the exact "
         "interval of Clopper and Pearson.",
         "Times are means over the queries, each on one thread, beside as many workers as are named. Recall counts "
@@ -239,10 +211,6 @@ def _how(outcome: Measurements) -> str:
         *dict.fromkeys(f"Weights of {result.weights}." for result in results if result.weights),
     ]
     return "".join(f'<p class="soft">{foreign(sentence)}</p>' for sentence in sentences)
-
-
-def _mah(row: MeasuredRow) -> float:
-    return 1000 * row.result.ah_total / row.result.queries
 
 
 def _look(number: int) -> str:

@@ -1,5 +1,8 @@
-"""Provenance of a measurement, which is stored with every result: the date, the machine and the versions."""
+"""Provenance of a measurement, which is stored with every result: the date, the machine and the versions. And keys by
+which finished work is found again."""
 
+import hashlib
+import json
 import os
 import platform
 from datetime import datetime, timezone
@@ -10,7 +13,6 @@ from typing import Any
 
 import edgevpr
 
-PACKAGE = Path(edgevpr.__file__).parent
 _LIBRARIES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
 
 
@@ -22,18 +24,19 @@ def today() -> str:
 @cache
 def versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
-    return {"edgevpr": edgevpr.__version__, "python": platform.python_version()} | {
-        name: version_of(package) for name, package in _LIBRARIES.items()
-    }
+    found: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
+    for name, package in _LIBRARIES.items():
+        try:
+            found[name] = version(package)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
 
 
 def machine() -> dict[str, Any]:
     """Return the machine: its processor, the cores this process may use, and the threads of NumPy's BLAS library."""
-    return {
-        "cpu": cpu_model(),
-        "cores": len(os.sched_getaffinity(0)),
-        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", "all"),
-    }
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    return {"cpu": cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
 
 
 @cache
@@ -45,9 +48,12 @@ def cpu_model() -> str:
     return platform.machine()
 
 
-def version_of(package: str) -> str | None:
-    """Return the version of an installed package; None where it is missing."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+def key_of(*parts: Any) -> str:
+    """Return a key of `parts`, any values that JSON or `str` can write: their SHA-256 in hex."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def stamp(path: Path) -> tuple[str, int, int]:
+    """Return by what it is seen that a file has changed: its name, its size, and the time when it was written."""
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns

@@ -20,7 +20,6 @@ _CURVE = (
     ("P@100%R", "precision_at_100_recall"), ("R@100%P", "recall_at_100_precision"), ("AUC", "auc"),
     ("AUC from 0", "auc_from_zero"), ("EP", "ep"), ("ROC", "roc_auc"),
 )  # fmt: skip
-_DECIDED = ("PCU", "accepted (wrong)")
 _COSTS: dict[str, Callable[[TechniqueResult], str]] = {
     "t_e ms": lambda result: f"{result.t_encode_s * 1000:.1f}",
     "t_m ms": lambda result: f"{result.t_match_s * 1000:.1f}",
@@ -31,6 +30,7 @@ _COSTS: dict[str, Callable[[TechniqueResult], str]] = {
     "U_m": lambda result: f"{result.u_match:.2f}",
     "mAh/query": lambda result: f"{result.ah_total * 1000 / result.queries:.2g}",
 }
+_DECIDED = ("PCU", "accepted (wrong)")
 QUALITY = (*(heading for heading, _ in (*_RECALLS, *_CURVE)), *_DECIDED)
 COSTS = tuple(_COSTS)
 
@@ -42,14 +42,9 @@ def share_text(share: float | Interval | None) -> str:
     return "-" if share is None else f"{share:.3f}"
 
 
-def decided(result: TechniqueResult) -> list[str]:
-    """Return the cells below `_DECIDED`: the PCU; the number of accepted matches, and of the wrong ones among them."""
-    return [share_text(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
-
-
 def quality(result: TechniqueResult) -> list[str]:
     """Return the quality figures of a technique as texts, in the order of `QUALITY`."""
-    return [share_text(getattr(result, field)) for _, field in (*_RECALLS, *_CURVE)] + decided(result)
+    return [*_shares(result, (*_RECALLS, *_CURVE)), *_decided(result)]
 
 
 def costs(result: TechniqueResult) -> list[str]:
@@ -60,49 +55,52 @@ def costs(result: TechniqueResult) -> list[str]:
 def quality_text(results: Sequence[Quality]) -> str:
     """Make the text that `edgevpr eval` prints for stored similarities, and with --out for each set."""
     first = results[0]
-    return "\n".join(
-        [
-            *_table(results, _RECALLS),
-            *_table(results, _CURVE),
-            f"{first.queries} queries scored against {first.references} references.",
-            _on_figures(first),
-        ]
-    )
+    recalls, curves = (_table(results, fields) for fields in (_RECALLS, _CURVE))
+    scored = f"{first.queries} queries scored against {first.references} references."
+    return f"{recalls}\n{curves}\n{scored}\n{_on_figures(first)}"
 
 
 def results_text(results: Sequence[TechniqueResult]) -> str:
     """Make the text that `edgevpr eval` prints: tables, then the assumptions of their figures. `results` come from
     `evaluate.compare`."""
     first = results[0]
-    sequences = [f"{result.technique} of {result.sequence}" for result in results if result.sequence > 1]
+    sequences = [f"{each.technique} of {each.sequence}" for each in results if each.sequence > 1]
     lines = [
-        *_table(results, _RECALLS),
-        *_table(results, _CURVE, _DECIDED, [decided(result) for result in results]),
-        *_table(results, (), COSTS, [costs(result) for result in results]),
+        _table(results, _RECALLS),
+        _table(results, _CURVE, _DECIDED, [_decided(each) for each in results]),
+        _table(results, (), COSTS, [costs(each) for each in results]),
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.",
         _on_figures(first),
         *([f"Matched in sequences of queries: {', '.join(sequences)}."] if sequences else []),
-        *(_discarded(result) for result in results if result.discarded),
+        *(_discarded(each) for each in results if each.discarded),
         "accepted: queries that would have moved the aircraft, by the technique's own rule.",
         f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {1000 * (first.t_encode_max_s or 0):.1f} ms.",
         f"mAh: {first.ah_assumes}.",
-        *(f"Weights of {weights}." for weights in dict.fromkeys(result.weights for result in results) if weights),
+        *(f"Weights of {weights}." for weights in dict.fromkeys(each.weights for each in results) if weights),
     ]
     return "\n".join(lines)
 
 
+def _shares(result: Quality, fields: Sequence[tuple[str, str]]) -> list[str]:
+    return [share_text(getattr(result, field)) for _, field in fields]
+
+
+def _decided(result: TechniqueResult) -> list[str]:
+    return [share_text(result.pcu), f"{result.accepted} ({result.accepted_wrong})"]
+
+
 def _table(
     results: Sequence[Quality],
-    shares: Sequence[tuple[str, str]],
+    fields: Sequence[tuple[str, str]],
     headings: Sequence[str] = (),
-    more: Sequence[list[str]] = (),
-) -> list[str]:
-    """Return the lines of a table, the last one empty, with a row for each result: its name, the fields in `shares`
-    (pairs of heading and field), then its cells in `more`, below `headings`."""
-    rows = [[result.technique, *(share_text(getattr(result, field)) for _, field in shares)] for result in results]
-    if more:
-        rows = [[*row, *cells] for row, cells in zip(rows, more, strict=True)]
-    return [*aligned([["technique", *(heading for heading, _ in shares), *headings], *rows]), ""]
+    cells: Sequence[list[str]] = (),
+) -> str:
+    """Return a table of `fields`, and of the `cells` below `headings`, with a row for each result."""
+    rows = [
+        [each.technique, *_shares(each, fields), *more]
+        for each, more in zip(results, cells or [[]] * len(results), strict=True)
+    ]
+    return "\n".join(aligned([["technique", *(heading for heading, _ in fields), *headings], *rows])) + "\n"
 
 
 def _on_figures(first: Quality) -> str:
@@ -120,28 +118,20 @@ def _discarded(result: TechniqueResult) -> str:
 
 def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
     """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
-
-    If all scores of a technique are the same, its curve is one point: it is drawn as a mark.
-    """
+    A curve of one point, where all scores are the same, is drawn as a mark."""
     columns = min(len(results), _PANELS_A_ROW)
     rows = -(-len(results) // columns)
     drawn = figure(5.2 * columns, 4.6 * rows)
     # A technique looks the same in every panel, whatever is beside it and whatever the order of the legend.
-    names = dict.fromkeys(result.technique for compared in results.values() for result in compared)
-    looks = {name: look for look, name in enumerate(names)}
+    names = list(dict.fromkeys(result.technique for compared in results.values() for result in compared))
     for at, (title, compared) in enumerate(results.items(), start=1):
         axes = drawn.add_subplot(rows, columns, at)
         for result in sorted(compared, key=lambda result: -result.auc):
-            number = looks[result.technique]
+            number = names.index(result.technique)
             precision, recall = zip(*result.precision_recall, strict=True)
-            axes.plot(
-                recall,
-                precision,
-                _LINES[number // 10 % len(_LINES)],
-                color=f"C{number % 10}",
-                marker="o" if len(recall) == 1 else None,
-                label=f"{result.technique} {result.auc:.2f}",
-            )
+            label, mark = f"{result.technique} {result.auc:.2f}", "o" if len(recall) == 1 else None
+            line, colour = _LINES[number // 10 % len(_LINES)], f"C{number % 10}"
+            axes.plot(recall, precision, line, color=colour, marker=mark, label=label)
         axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
         axes.grid(alpha=0.3)
         # Below the panel, where it hides no curve.

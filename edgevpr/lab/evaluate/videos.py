@@ -1,23 +1,23 @@
-"""Makes folders of pictures from videos with positions, for data sets: each video is decoded once, and cached.
+"""Makes folders of pictures from videos with positions, for data sets: each video is decoded once, and its pictures are
+kept.
 
 The positions of a video lie beside it: a table of its name (later.csv of later.mp4), or positions.csv where it is the
 only video of its folder. `frames.track` explains its columns. A side of a data set is its queries or its references.
 """
 
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.files import sha256_of
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import is_image, write_png
 from edgevpr.frames.positions import MOST_GAP_S, GeoTag, read_positions, write_positions
 from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate.asking import Progress
-from edgevpr.lab.evaluate.cache import Cache, code_of_frames, key_of
+from edgevpr.lab.evaluate.provenance import key_of, stamp
 
 # Videos looked for in a folder, which may hold other files. A video that is given by its own path may have any ending.
 _EXTENSIONS = frozenset(".mp4 .mov .mkv .avi .m4v .webm .ts .mts .m2ts .mpg .mpeg .mjpeg .h264".split())  # noqa: SIM905
@@ -29,54 +29,69 @@ _READ_TIMEOUT_S = 1.0
 @dataclass(frozen=True, slots=True)
 class VideoPictures:
     """Function object that turns a side of a data set, a folder or a video, into a folder of pictures. From a video
-    `rate_hz` pictures a second are taken (None: every frame) and kept in `cache`; `progress` shows it."""
+    `rate_hz` pictures a second are taken (None: every frame) and kept below `folder`; `progress` shows it."""
 
-    cache: Cache
+    folder: Path
     rate_hz: float | None
     progress: Progress[Any]
 
     def __call__(self, given: Path) -> Path:
         """Return `given` if it is a folder of pictures. If it is a video, or a folder with one video and no picture,
-        return the cached folder of that video's pictures. Raises UsageError for a video without positions, ImageError
-        for a damaged one, SourceError for a file that is no video, and EdgevprError for a full disk."""
+        return the folder of that video's pictures. Raises UsageError for a video without positions, ImageError for a
+        damaged one, SourceError for a file that is no video, and EdgevprError for a full disk."""
         video = _video_of(given)
         if video is None:
             return given
         table = _positions_beside(video)
-        key = key_of(code_of_frames(), sha256_of(video), sha256_of(table), self.rate_hz)
-        return self.cache.keep("videos", key, partial(self._take, video, table))
+        made = self.folder / key_of(video, stamp(video), stamp(table), self.rate_hz)
+        if not made.is_dir():
+            step_s = 1 / self.rate_hz if self.rate_hz else None
+            source = open_source(str(video), step_s=step_s, positions=table, live=False)
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryDirectory(prefix=".", dir=self.folder) as unfinished:
+                    whole = Path(unfinished) / "made"
+                    whole.mkdir()
+                    frames = self.progress(_frames(source), source.total, f"{video.name}: pictures")
+                    if not _written(frames, whole):
+                        raise UsageError(
+                            f"No frame of {video} lies between two lines of {table} that are at most {MOST_GAP_S:g} s "
+                            "apart: write `time` in seconds from its first frame."
+                        )
+                    whole.rename(made)
+            except OSError as error:
+                raise EdgevprError(
+                    f"{self.folder} takes no more pictures of {video} ({error.strerror}): make room, take fewer with "
+                    "--rate-hz, or name another folder with --out."
+                ) from error
+            finally:
+                source.close()
+        return made
 
-    def _take(self, video: Path, table: Path, made: Path) -> None:
-        """Write to the new folder `made` each frame of `video` that has a position by `table`, as a PNG, and
-        positions.csv with all frames."""
-        source = open_source(str(video), step_s=1 / self.rate_hz if self.rate_hz else None, positions=table, live=False)
-        tags: dict[str, GeoTag] = {}
-        made.mkdir()
-        try:
-            for frame in self.progress(_frames(source), source.total, f"{video.name}: pictures"):
-                name = _file_name(frame)
-                tags[name] = GeoTag(
-                    position=frame.position,
-                    heading_deg=frame.heading_deg,
-                    roll_deg=frame.roll_deg,
-                    pitch_deg=frame.pitch_deg,
-                    height_m=frame.height_m,
-                )
-                if frame.position:
-                    write_png(made / name, frame.image)
-            write_positions(made / _POSITIONS, tags)
-        except OSError as error:
-            raise EdgevprError(
-                f"{self.cache.folder} takes no more pictures of {video} ({error.strerror}): make room, take fewer with "
-                "--rate-hz, or name another folder with --out or --cache."
-            ) from error
-        finally:
-            source.close()
-        if not any(tag.position for tag in tags.values()):
-            raise UsageError(
-                f"No frame of {video} lies between two lines of {table} that are at most {MOST_GAP_S:g} s apart: write "
-                "`time` in seconds from its first frame."
-            )
+
+def _written(frames: Iterable[Frame], folder: Path) -> int:
+    """Write each frame that has a position to `folder`, as a PNG, and positions.csv with all; return how many it is."""
+    tags: dict[str, GeoTag] = {}
+    for frame in frames:
+        # Like frame_000006_t0.240_s.png: a space would separate names in a ground truth.
+        name = frame.name.replace("=", "").replace(" ", "_") + ".png"
+        tags[name] = GeoTag(
+            position=frame.position,
+            heading_deg=frame.heading_deg,
+            roll_deg=frame.roll_deg,
+            pitch_deg=frame.pitch_deg,
+            height_m=frame.height_m,
+        )
+        if frame.position:
+            write_png(folder / name, frame.image)
+    write_positions(folder / _POSITIONS, tags)
+    return sum(tag.position is not None for tag in tags.values())
+
+
+def _frames(source: Source) -> Iterator[Frame]:
+    while not source.ended:
+        if frame := source.read(_READ_TIMEOUT_S):
+            yield frame
 
 
 def without_position(folder: Path) -> tuple[int, int]:
@@ -120,15 +135,3 @@ def _positions_beside(video: Path) -> Path:
     if common.is_file() and _videos_in(video.parent) == [video]:
         return common
     raise UsageError(f"{video} has no positions beside it: write {own.name} there ({_FORM}).")
-
-
-def _frames(source: Source) -> Iterator[Frame]:
-    while not source.ended:
-        if frame := source.read(_READ_TIMEOUT_S):
-            yield frame
-
-
-def _file_name(frame: Frame) -> str:
-    """Return a file name for the frame, like frame_000006_t0.240_s.png. It has no space: those separate names in a
-    ground truth."""
-    return frame.name.replace("=", "").replace(" ", "_") + ".png"

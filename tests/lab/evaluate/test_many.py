@@ -1,4 +1,4 @@
-"""Many rows on many sets: real workers, killed and started again, with a cache that is damaged or shared."""
+"""Many rows on many sets: real workers, killed and started again."""
 
 import json
 import os
@@ -38,8 +38,8 @@ def plan_of(*folders, rows=ROWS):
     return EvaluationPlan({folder.name: SetPlan(folder=str(folder)) for folder in folders}, rows)
 
 
-def entries(cache, kind):
-    return {path: path.stat().st_mtime_ns for path in (cache / kind).rglob("*") if path.is_file()}
+def results_in(folder):
+    return {path: path.stat().st_mtime_ns for path in (folder / "measured").glob("*.json")}
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +49,9 @@ def meadow(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def measured(meadow, tmp_path_factory):
-    """The outcome on the meadow with one worker, and its cache."""
-    cache = tmp_path_factory.mktemp("cache")
-    return measure(plan_of(meadow), cache, 1, shown), cache
+    """The outcome on the meadow with one worker, and the folder of its results."""
+    folder = tmp_path_factory.mktemp("out")
+    return measure(plan_of(meadow), folder, 1, shown), folder
 
 
 def test_a_row_is_measured_as_by_itself(measured, meadow):
@@ -71,55 +71,39 @@ def test_only_what_is_scored_counts_and_a_loose_hit_counts_neither_way(measured)
     assert (answers["q5.png"].is_right, answers["q0.png"].is_right) == (False, True)
 
 
-@pytest.mark.parametrize("rows", [ROWS, {"cohog": ROWS["cohog"]}], ids=["rows shared out", "queries shared out"])
-def test_several_workers_find_the_same(measured, meadow, tmp_path, rows):
+def test_several_workers_find_the_same(measured, meadow, tmp_path):
     outcome, _ = measured
-    again = measure(plan_of(meadow, rows=rows), tmp_path / "cache", 3, shown)
-    assert without_costs(as_json(again)) == without_costs(as_json(outcome))[: len(rows)]
-    assert [row.answers[0].query for row in again.found] == ["q0.png"] * len(rows)
-    assert {row.made.workers for row in again.found} == {3}
+    again = measure(plan_of(meadow), tmp_path, 3, shown)
+    assert without_costs(as_json(again)) == without_costs(as_json(outcome))
+    assert {row.made["workers"] for row in again.found} == {3}
 
 
-def test_what_is_kept_is_not_measured_now_and_says_so(measured, meadow):
-    outcome, cache = measured
-    before = {kind: entries(cache, kind) for kind in ("results", "maps")}
-    again = measure(plan_of(meadow), cache, 2, shown)
-    assert not any(row.made.was_kept for row in outcome.found)
+def test_what_is_there_is_not_measured_now_and_says_so(measured, meadow):
+    outcome, folder = measured
+    before = results_in(folder)
+    again = measure(plan_of(meadow), folder, 2, shown)
+    assert not any(row.was_kept for row in outcome.found)
     for row, first in zip(again.found, outcome.found, strict=True):
-        assert row == replace(first, made=replace(first.made, was_kept=True)), "with the costs of then"
-    assert {kind: entries(cache, kind) for kind in before} == before
-    assert (len(before["results"]), len(before["maps"])) == (5, 3), "the rows of cohog share a map"
+        assert row == replace(first, was_kept=True), "with the costs of then"
+    assert results_in(folder) == before
+    assert len(before) == len(ROWS)
 
 
 @pytest.mark.parametrize("change", ["query", "truth"])
-def test_what_decides_a_result_is_measured_anew_on_the_map_that_is_there(measured, tmp_path, change):
-    """A copy of the set is the same set."""
-    _, cache = measured
-    copy = make_set(tmp_path / "copy")
-    plan, maps = plan_of(copy, rows=ONLY_HOG), entries(cache, "maps")
-    assert measure(plan, cache, 1, shown).found[0].made.was_kept
+def test_what_decides_a_result_is_measured_anew(tmp_path, change):
+    own = make_set(tmp_path / "own")
+    plan = plan_of(own, rows=ONLY_HOG)
+    assert not measure(plan, tmp_path, 1, shown).found[0].was_kept
     if change == "query":
-        (copy / "query" / "q3.png").write_bytes((copy / "query" / "q0.png").read_bytes())
+        (own / "query" / "q3.png").write_bytes((own / "query" / "q0.png").read_bytes())
     else:
-        truth = copy / "ground_truth.csv"
+        truth = own / "ground_truth.csv"
         truth.write_text(truth.read_text().replace("q5.png,r0.png", "q5.png,r5.png"))
-    found = measure(plan, cache, 1, shown).found[0]
+    found = measure(plan, tmp_path, 1, shown).found[0]
     answers = {answer.query: answer for answer in found.answers}
-    assert not found.made.was_kept
+    assert not found.was_kept
     assert answers["q3.png"].found == ("r0.png" if change == "query" else "r3.png")
     assert answers["q5.png"].is_right == (change == "truth")
-    assert entries(cache, "maps") == maps
-
-
-def test_a_damaged_result_is_measured_anew(meadow, tmp_path):
-    plan = plan_of(meadow, rows=ONLY_HOG)
-    first = measure(plan, tmp_path, 1, shown)
-    (path,) = entries(tmp_path, "results")
-    for content in (path.read_bytes()[:-1], b""):
-        path.write_bytes(content)
-        again = measure(plan, tmp_path, 1, shown)
-        assert not again.found[0].made.was_kept
-        assert without_costs(as_json(again)) == without_costs(as_json(first))
 
 
 def arguments(folder, out, *flags):
@@ -143,10 +127,10 @@ def is_running(pid):
         return False
 
 
-def begun(folder, out, kind):
-    """A run of two workers that has kept one map or result and is at work on another."""
+def begun(folder, out):
+    """A run of two workers that has written one result and is at work on another."""
     process = command(folder, out, "--param", "cohog.w1=208", "--exact", "--workers", "2")
-    while not entries(out / "cache", kind):
+    while not results_in(out):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.005)
     return process
@@ -154,8 +138,8 @@ def begun(folder, out, kind):
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
-    folder, out = make_set(tmp_path / "long", places=60), tmp_path / "out"
-    process = begun(folder, out, "results")
+    folder, out = make_set(tmp_path / "long", places=24), tmp_path / "out"
+    process = begun(folder, out)
     workers = workers_of(process.pid)
     process.send_signal(how)
     said = process.communicate()[1].decode()
@@ -164,19 +148,17 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
         time.sleep(0.01)
     assert "Traceback" not in said
     assert not (out / "results.json").exists()
-    kept = {kind: entries(out / "cache", kind) for kind in ("results", "maps")}
+    kept = results_in(out)
     flags = ["--param", "cohog.w1=208", "--exact", "--workers", "2"]
     assert main(arguments(folder, out, *flags)) == 0
-    for kind, before in kept.items():
-        now = entries(out / "cache", kind)
-        assert {path: now.get(path) for path in before} == before
+    assert kept.items() <= results_in(out).items()
     assert main(arguments(folder, tmp_path / "whole", *flags)) == 0
     results = [json.loads((each / "results.json").read_text()) for each in (out, tmp_path / "whole")]
     assert without_costs(results[0]) == without_costs(results[1])
 
 
 def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path):
-    process = begun(make_set(tmp_path / "long", places=40), tmp_path / "out", "maps")
+    process = begun(make_set(tmp_path / "long", places=24), tmp_path / "out")
     for pid in workers_of(process.pid):
         os.kill(pid, signal.SIGKILL)
     said = process.communicate()[1].decode()
@@ -185,22 +167,10 @@ def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path):
     assert "Traceback" not in said
 
 
-def test_two_runs_at_once_do_not_harm_each_other(meadow, tmp_path):
-    flags = ["--param", "cohog.w1=208", "--workers", "2", "--cache", tmp_path / "cache"]
-    processes = [command(meadow, tmp_path / name, *flags) for name in ("one", "other")]
-    said = [process.communicate()[1].decode() for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], said
-    one, other = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("one", "other"))
-    assert without_costs(one) == without_costs(other)
-
-
 @pytest.mark.parametrize("broken_part", ["ref/r2.png", "query/q3.png"])
 def test_a_picture_that_cannot_be_used_fails_the_rows_of_its_set_only(meadow, tmp_path, broken_part):
     broken = make_set(tmp_path / "broken")
     (broken / broken_part).write_bytes(b"")
-    outcome = measure(plan_of(broken, meadow, rows=ONLY_HOG), tmp_path / "cache", 2, shown)
+    outcome = measure(plan_of(broken, meadow, rows=ONLY_HOG), tmp_path, 2, shown)
     assert [row.set_name for row in outcome.found] == ["meadow"]
     assert Path(broken_part).name in outcome.failed["broken", "hog 8bit"]
-    assert len(entries(tmp_path / "cache", "maps")) == 1, (
-        "that of the meadow, which the broken one shares where its references are whole"
-    )

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.core.errors import UsageError
 from edgevpr.lab.evaluate.dataset import read_truth
 from edgevpr.lab.evaluate.similarity import measure, read_similarities
 
@@ -46,30 +45,20 @@ def test_eight_published_matrices_come_out_as_published(capsys):
         assert low < found[f"corridor_{name}"]["recall_at_1"] < high
 
 
-def test_every_form_says_the_same_and_loose_hits_and_what_is_not_ok_do_not_count(tmp_path, truth):
+def test_loose_hits_and_what_is_not_ok_do_not_count(tmp_path, truth):
     np.save(tmp_path / "a.npy", SCORES)
-    names = {"queries": ["q1", "q2", "q3"], "references": ["r10", "r2", "r1"]}
-    turned = SCORES[[1, 0, 2]][:, [2, 1, 0]]
-    np.savez(tmp_path / "b.npz", similarity=turned, **names)
-    lines = [
-        ",r10,r2,r1",
-        *(f"{q}," + ",".join(map(str, row)) for q, row in zip(names["queries"], turned, strict=True)),
-    ]
-    (tmp_path / "c.csv").write_text("\n".join(lines))
-    (tmp_path / "d.csv").write_text("\n".join(",".join(map(str, row)) for row in SCORES))
-    for name in ("a.npy", "b.npz", "c.csv", "d.csv"):
-        found = measure(name, read_similarities(tmp_path / name), read_truth(truth))
-        assert (found.queries, found.references, found.recall_at_1) == (2, 3, 1.0), name
+    found = measure("a", read_similarities(tmp_path / "a.npy"), read_truth(truth))
+    assert (found.queries, found.references, found.recall_at_1) == (2, 3, 1.0)
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (np.zeros((2, 3)), "scores of 2 queries, and the ground truth names 3"),
-        (np.zeros((3, 4)), "name the folder of all of them with --ref"),
-        (np.zeros(3), "a row for each query"),
-        (np.full((3, 3), np.nan), "give each pair a score"),
-        (np.array([["a", "b"]]), "a row for each query"),
+        (np.zeros((2, 3)), "scores of 2 queries and 3 references, and the ground truth is of 3 and 3"),
+        (np.zeros((3, 4)), "with --query and --ref"),
+        (np.zeros(3), "a row of numbers for each query"),
+        (np.full((3, 3), np.nan), "no NaN"),
+        (np.array([["a", "b"]]), "a row of numbers for each query"),
         (np.array([[None]]), "holds no similarities"),
         (b"rubbish", "holds no similarities"),
         (b"", "holds no similarities"),
@@ -85,15 +74,6 @@ def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, conten
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
-
-
-def test_names_that_do_not_fit_are_refused(tmp_path, truth):
-    np.savez(tmp_path / "a.npz", similarity=SCORES, queries=["q1", "q2", "q2"], references=["r1", "r2", "r10"])
-    with pytest.raises(UsageError, match="2 queries"):
-        read_similarities(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", similarity=SCORES, queries=["q1", "q2", "q3"], references=["r1", "r3", "r10"])
-    with pytest.raises(UsageError, match="`r2`"):
-        measure("b", read_similarities(tmp_path / "b.npz"), read_truth(truth))
 
 
 def test_without_images_and_without_similarities_it_says_what_to_give(truth, capsys):
@@ -154,60 +134,24 @@ def scored(capsys, similarity, truth, *more):
     return {key: value for key, value in found.items() if key != "technique"}
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_ground_truth_of_numbers_scores_as_the_same_in_names(seed, tmp_path, capsys):
     judgement = Judgement(seed)
-    np.save(tmp_path / "plain.npy", judgement.scores)
-    names = {"queries": judgement.queries, "references": judgement.references}
-    np.savez(tmp_path / "named.npz", similarity=judgement.scores, **names)
-    turned = np.random.default_rng(seed)
-    rows, columns = turned.permutation(len(judgement.queries)), turned.permutation(len(judgement.references))
-    np.savez(
-        tmp_path / "turned.npz",
-        similarity=judgement.scores[rows][:, columns],
-        queries=np.array(judgement.queries)[rows],
-        references=np.array(judgement.references)[columns],
-    )
+    scores, names = tmp_path / "scores.npy", tmp_path / "truth.csv"
+    np.save(scores, judgement.scores)
     folders = judgement.folders(tmp_path)
+    recalls = []
     for truth, soft in (
         (judgement.npz(tmp_path / "GT.npz"), True),
         (judgement.npy(tmp_path / "ground_truth_new.npy"), False),
     ):
-        expected = scored(capsys, tmp_path / "named.npz", judgement.csv(tmp_path / "truth.csv", soft))
+        expected = scored(capsys, scores, judgement.csv(names, soft))
         assert expected["queries"] == len(judgement.queries) - 1
-        assert scored(capsys, tmp_path / "plain.npy", truth) == expected, "no image and no name"
-        assert scored(capsys, tmp_path / "named.npz", truth) == expected
-        assert scored(capsys, tmp_path / "plain.npy", truth, *folders) == expected
-        of_turned = scored(capsys, tmp_path / "turned.npz", tmp_path / "truth.csv")
-        assert scored(capsys, tmp_path / "turned.npz", truth, *folders) == of_turned
-        assert of_turned["recall_at_1"] == expected["recall_at_1"]
-        assert scored(capsys, tmp_path / "plain.npy", tmp_path / "truth.csv", *folders) == expected
-        assert main(["eval", "--similarity", str(tmp_path / "turned.npz"), "--ground-truth", str(truth)]) == 2
-        assert "--query" in capsys.readouterr().err
-    softly = scored(capsys, tmp_path / "plain.npy", tmp_path / "GT.npz")
-    assert softly["recall_at_1"] > expected["recall_at_1"], "what is soft counts neither way"
-
-
-@pytest.mark.data
-def test_published_matrices_score_the_same_by_the_numbers_of_their_ground_truth(tmp_path, capsys):
-    if not _PUBLISHED.is_dir():
-        pytest.skip("the published matrices are not here")
-    corridor = _DATA / "corridor"
-    queries, references = (sorted(path.name for path in (corridor / part).iterdir()) for part in ("query", "ref"))
-    truth = read_truth(corridor / "ground_truth.csv").scored
-    hard = np.array([[ref in truth[query].right for query in queries] for ref in references])
-    soft = np.array([[ref in truth[query].ignored for query in queries] for ref in references])
-    np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=hard | soft)
-    rows = np.empty((len(queries), 2), object)
-    for number in range(len(rows)):
-        rows[number] = number, np.flatnonzero(hard[:, number]).tolist()
-    np.save(tmp_path / "ground_truth_new.npy", rows, allow_pickle=True)
-    assert not soft.any()
-    for name in ("CoHOG", "HOG", "NetVLAD"):
-        matrix = _PUBLISHED / f"corridor_{name}.npy"
-        expected = scored(capsys, matrix, corridor / "ground_truth.csv")
-        assert scored(capsys, matrix, tmp_path / "GT.npz") == expected
-        assert scored(capsys, matrix, tmp_path / "ground_truth_new.npy") == expected
+        assert scored(capsys, scores, truth) == expected, "no image and no name"
+        assert scored(capsys, scores, truth, *folders) == expected
+        assert scored(capsys, scores, names, *folders) == expected
+        recalls.append(expected["recall_at_1"])
+    assert recalls[0] > recalls[1], "what is soft counts neither way"
 
 
 def rows_of(*rows):
@@ -223,22 +167,19 @@ EYE = np.eye(3, dtype=bool)
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("GT.npz", {"GThard": EYE[:2], "GTsoft": EYE[:2]}, "is of 3 queries and 3 references, and"),
+        ("GT.npz", {"GThard": EYE[:2], "GTsoft": EYE[:2]}, "there are 3 references"),
         ("GT.npz", {"GThard": EYE}, "it has no `GTsoft`"),
-        ("GT.npz", {"GThard": EYE, "GTsoft": EYE[:2]}, "GThard is bool (3, 3) and GTsoft bool (2, 3)"),
-        ("GT.npz", {"GThard": EYE.astype(str), "GTsoft": EYE}, "is no GT.npz of VPR_Tutorial"),
-        ("GT.npz", {"GThard": EYE[0], "GTsoft": EYE[0]}, "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", {"GThard": EYE, "GTsoft": EYE[:2]}, "GThard is (3, 3), GTsoft (2, 3)"),
         ("GT.npz", {"GThard": np.array([[None]]), "GTsoft": EYE}, "is no GT.npz of VPR_Tutorial"),
         ("GT.npz", {"GThard": EYE & False, "GTsoft": EYE}, "scores none of its queries"),
         ("GT.npz", b"rubbish", "is no GT.npz of VPR_Tutorial"),
         ("GT.npz", None, "cannot be read (No such file"),
-        ("new.npy", rows_of((0, [3])), "numbers at least 1 and 4"),
-        ("new.npy", rows_of((3, [0])), "numbers at least 4 and 1"),
+        ("new.npy", rows_of((0, [3])), "numbers more than 3 queries and 3 references"),
+        ("new.npy", rows_of((3, [0])), "numbers more than 3 queries and 3 references"),
         ("new.npy", rows_of((0, [-1])), "it names image [-1]"),
         ("new.npy", rows_of((0, [0.5])), "it names image [0.5]"),
         ("new.npy", rows_of((0, ["a"])), "is no ground truth of VPR-Bench"),
         ("new.npy", rows_of(([0, 1], [1])), "is no ground truth of VPR-Bench"),
-        ("new.npy", rows_of((0, [1]), (0, [2])), "it has two rows of query 0"),
         ("new.npy", np.eye(2), "it holds no lists"),
         ("new.npy", b"", "is no ground truth of VPR-Bench"),
         ("new.npy", None, "cannot be read (No such file"),

@@ -17,7 +17,6 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.lab.evaluate.cache import Cache
 from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
 from edgevpr.lab.evaluate.videos import VideoPictures
 
@@ -110,14 +109,14 @@ def test_videos_give_the_figures_of_the_folders_of_their_pictures(films, mapping
 
 @pytest.mark.parametrize("rule", RULES)
 def test_what_is_right_is_the_same_by_distance_heading_and_ground_in_common(rule, films, mapping, later, tmp_path):
-    pictures = VideoPictures(Cache(tmp_path / "cache"), None, shown)
+    pictures = VideoPictures(tmp_path / "kept", None, shown)
     of_videos = numbers(of_positions(*films, rule, pictures))
     assert of_videos == numbers(of_positions(later.places, mapping.places, rule))
     assert of_videos
 
 
 def test_the_layouts_of_a_folder(tmp_path, mapping, later):
-    pictures = VideoPictures(Cache(tmp_path / "cache"), None, shown)
+    pictures = VideoPictures(tmp_path / "kept", None, shown)
     for name in ("beside", "inside", "both"):
         (tmp_path / name).mkdir()
     later.film(tmp_path / "beside" / "query.MKV", tmp_path / "beside" / "query.csv")
@@ -139,7 +138,7 @@ def test_pictures_a_second_are_as_many_as_asked_for(films, tmp_path, capsys):
 
 
 def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_anew(films, tmp_path, capsys):
-    out, cache = tmp_path / "out", tmp_path / "out" / "cache"
+    out = tmp_path / "out"
 
     def run(*more):
         found = measured(
@@ -149,7 +148,7 @@ def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_a
         return found
 
     def taken():
-        return {path: path.stat().st_mtime_ns for path in (cache / "videos").rglob("*.png")}
+        return {path: path.stat().st_mtime_ns for path in (out / "videos").rglob("*.png")}
 
     first = run()
     assert list(first["sets"]) == ["later.mkv on mapping.mkv"]
@@ -255,7 +254,7 @@ def test_what_cannot_be_used_is_said_in_one_sentence(harm, code, said, out, film
 
 
 def test_two_videos_in_one_folder_and_a_common_table_of_two_are_refused(films, tmp_path):
-    pictures = VideoPictures(Cache(tmp_path / "cache"), None, shown)
+    pictures = VideoPictures(tmp_path / "kept", None, shown)
     with pytest.raises(UsageError, match=r"2 videos \(later"):
         pictures(tmp_path)
     films[0].with_suffix(".csv").rename(tmp_path / "positions.csv")
@@ -271,33 +270,30 @@ def test_two_videos_in_one_folder_and_a_common_table_of_two_are_refused(films, t
 
 
 def test_a_full_disk_is_said_and_leaves_nothing_half_taken(films, tmp_path):
-    cache = Cache(tmp_path / "cache")
-    with (
-        no_file_larger_than(2000),
-        pytest.raises(EdgevprError, match=r"later\.mkv"),
-    ):
-        VideoPictures(cache, None, shown)(films[0])
-    assert list(cache.path("videos", "").iterdir()) == []
-    assert len(list(VideoPictures(cache, None, shown)(films[0]).glob("*.png"))) == PLACES
+    pictures = VideoPictures(tmp_path / "kept", None, shown)
+    with no_file_larger_than(2000), pytest.raises(EdgevprError, match=r"later\.mkv"):
+        pictures(films[0])
+    assert list((tmp_path / "kept").iterdir()) == []
+    assert len(list(pictures(films[0]).glob("*.png"))) == PLACES
 
 
 def test_killed_while_pictures_are_taken_it_goes_on_with_the_next_run(films, tmp_path):
     """As after a power cut: what is half taken is never believed."""
-    cache = tmp_path / "cache"
+    kept = tmp_path / "kept"
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom edgevpr.lab.evaluate import videos\n"
-        "from edgevpr.lab.evaluate.cache import Cache\nwrite = videos.write_png\n"
+        "write = videos.write_png\n"
         "def dying(path, image):\n    write(path, image)\n"
         "    '3' in path.name and os.kill(os.getpid(), signal.SIGKILL)\n"
         "videos.write_png = dying\n"
-        "videos.VideoPictures(Cache(sys.argv[1]), None, lambda items, total, label: items)(Path(sys.argv[2]))\n"
+        "videos.VideoPictures(Path(sys.argv[1]), None, lambda items, total, label: items)(Path(sys.argv[2]))\n"
     )
     root = Path(__file__).parents[3]
     environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, "-c", code, str(cache), str(films[0])], env=environment)
+    done = subprocess.run([sys.executable, "-c", code, str(kept), str(films[0])], env=environment)
     assert done.returncode == -signal.SIGKILL
-    assert list((cache / "videos").iterdir()) == []
-    assert len(list(VideoPictures(Cache(cache), None, shown)(films[0]).glob("*.png"))) == PLACES
+    assert list(kept.glob("[!.]*")) == []
+    assert len(list(VideoPictures(kept, None, shown)(films[0]).glob("*.png"))) == PLACES
 
 
 def test_as_a_camera_films_it_the_places_are_still_found(tmp_path, mapping, later, capsys):
