@@ -1,4 +1,4 @@
-"""A vehicle that starts on the ground and does what it is told: hovers, circles, drives, lands; and the simulated
+"""A vehicle that starts on the ground and does what it is told: hovers, circles, lands; and the simulated
 flight controller in it, which is armed and takes off. Plain kinematics: what matters here is where it is."""
 
 import cmath
@@ -8,7 +8,7 @@ from statistics import fmean
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.ardupilot_rules import _GPS, _NEEDS_POSITION
+from edgevpr.lab.simulate.ardupilot_rules import _GPS, _NEED_POSITION
 from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.firmware import FAILED, OK
 from edgevpr.lab.simulate.generated import ORIGIN
@@ -20,7 +20,7 @@ from edgevpr.mavlink.wire import mavlink
 GRAVITY_M_S2 = 9.81
 AIRSPEED_M_S = 22.0  # of a plane
 CIRCLE_M = 80.0  # radius, where a plane waits
-_CLIMB_M_S = {"copter": 3.0, "plane": 4.0, "rover": 0.0}
+_CLIMB_M_S = {"copter": 3.0, "plane": 4.0}
 _DESCENT_M_S = 0.5
 _TAKEOFF = 13  # a mode of a plane
 _COMMAND_GOOD_FOR_S = 3.0  # a copter that is told no velocity any more stops
@@ -28,7 +28,7 @@ _CRUISE_DEG = 90.0  # the nose at the start
 
 
 class FreeFlight(Motion):
-    """A copter, plane or rover that begins at `home`, on the ground."""
+    """A copter or plane that begins at `home`, on the ground."""
 
     is_known = True
 
@@ -41,9 +41,7 @@ class FreeFlight(Motion):
 
     @property
     def is_flying(self) -> bool:
-        """True from take-off to landing; for a rover since it was first told to drive."""
-        if self._kind == "rover":
-            return self._told[1] > -math.inf
+        """True from take-off to landing."""
         return self._goal_m > 0 or self._height_m > 0
 
     def begin(self, now_s: float) -> None:
@@ -107,13 +105,13 @@ class Piloted(FlightController):
         self.motion = FreeFlight(self.kind, ORIGIN)
         super().__init__(vehicle, self.motion, gps=True)
         self._gps_s, self._vision_s = [], -math.inf  # when the companion's messages were heard
-        self._streams._reports[mavlink.MAVLINK_MSG_ID_SIM_STATE] = _truth
+        self.reports[mavlink.MAVLINK_MSG_ID_SIM_STATE] = _truth
         for name, value in parameters.items():
             self.set(name, value)
 
     def set_mode(self, mode: int) -> bool:
         """Change the flight mode; of an ArduPilot, one that needs a position is refused without one."""
-        needs_position = self._is_ardupilot and mode in _NEEDS_POSITION[self.kind]
+        needs_position = self._is_ardupilot and self.kind == "copter" and mode in _NEED_POSITION
         if needs_position and not self.brain.origin:
             return False
         self.brain.mode = mode

@@ -10,7 +10,7 @@ from edgevpr.cli.shared import add_json, add_parameters, command, group, paramet
 from edgevpr.core.errors import UsageError
 
 # The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
-_VEHICLES = ("arduplane", "arducopter", "ardurover", "px4-copter", "px4-plane")
+_VEHICLES = ("arduplane", "arducopter", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
 _NUMBERS = {

@@ -24,14 +24,14 @@ _BAD_FOR_S = 1.0  # ten checks of the filter in a row, ten a second
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
 
-_GUIDED, _LAND, _HOLD = {"copter": 4, "plane": 15, "rover": 15}, 9, 4
-_NEEDS_POSITION: dict[str, set[int]] = {"copter": {3, 4, 5, 6, 7, 16}, "rover": {10, 11, 12, 15}, "plane": set()}
+_GUIDED, _LAND = {"copter": 4, "plane": 15}, 9
+_NEED_POSITION = {3, 4, 5, 6, 7, 16}  # modes of a copter; a plane flies on
 _GPS, _EXTERNAL = 3, 6  # EK3_SRCn_POSXY
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
 
 
 class ArduPilot(Firmware):
-    """A copter, plane or rover with ArduPilot."""
+    """A copter or plane with ArduPilot."""
 
     number = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     version = 4 << 24 | 7 << 16  # 4.7.0, type "dev"
@@ -130,16 +130,16 @@ class ArduPilot(Firmware):
 
     def _watch(self) -> None:
         """Stop aiding, and land a copter, when the position is lost for too long. After landing, disarm."""
-        if self.is_armed and self.kind == "copter" and self.mode == _LAND and not self.motion.is_flying:
+        if self.kind == "plane":
+            return
+        if self.is_armed and self.mode == _LAND and not self.motion.is_flying:
             self.is_armed = False
-        if self._is_aiding and self.kind != "plane" and self.now_s - self._passed_s > _AIDING_LOST_S:
+        if self._is_aiding and self.now_s - self._passed_s > _AIDING_LOST_S:
             self._is_aiding, self._good_since_s, self._frozen = False, None, self.reckoning.place(self.truth)
             self._say(mavlink.MAV_SEVERITY_WARNING, "EKF3 IMU0 stopped aiding")
         is_good = bool(self.flags() & _HAS_POSITION)
         self._has_ever_passed |= is_good
-        if self.kind == "plane" or not self._has_ever_passed:
-            return
-        if is_good != self._has_failed:
+        if not self._has_ever_passed or is_good != self._has_failed:
             self._bad_since_s = None
             return
         self._bad_since_s = self.now_s if self._bad_since_s is None else self._bad_since_s
@@ -147,10 +147,7 @@ class ArduPilot(Firmware):
             return
         self._has_failed, self._bad_since_s = not is_good, None
         self._say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared" if is_good else "EKF variance")
-        if not is_good and self.is_armed and self.mode in _NEEDS_POSITION[self.kind]:
-            self.mode, name = (_LAND, "LAND") if self.kind == "copter" else (_HOLD, "HOLD")
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {name} Mode")
+        if not is_good and self.is_armed and self.mode in _NEED_POSITION:
+            self.mode = _LAND
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe: changed to LAND Mode")
             self.motion.land()
-
-    def _say(self, severity: int, text: str) -> None:
-        self.texts.append((severity, text))

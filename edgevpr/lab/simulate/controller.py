@@ -10,7 +10,7 @@ from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
 from edgevpr.lab.simulate.firmware import FAILED, OK, UNSUPPORTED, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.px4_rules import Px4
-from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, heartbeat
+from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, Report
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -18,16 +18,13 @@ STEP_S = 0.02
 VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "arducopter": lambda motion: ArduPilot("copter", motion),
     "arduplane": lambda motion: ArduPilot("plane", motion),
-    "ardurover": lambda motion: ArduPilot("rover", motion),
     "px4-copter": lambda motion: Px4("copter", motion),
     "px4-plane": lambda motion: Px4("plane", motion),
 }
 _START_UTC_S = 1_770_000_000.0  # the UTC at its start, unless given
-HEARTBEAT_S = 1.0
-_WHERE = {
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-}
+_HEARTBEAT_HZ = 1.0
+# Messages that do not exist where the position of the vehicle is unknown.
+_WHERE = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,59 +39,10 @@ class ReceivedFix:
     processing_s: float
 
 
-class Streams:
-    """The messages that are sent at intervals, and their intervals. If the position of the vehicle is unknown, messages
-    that contain it do not exist."""
-
-    def __init__(self, brain: Firmware) -> None:
-        known = {**REPORTS, brain.filter_report: FILTER_REPORTS[brain.filter_report]}
-        hidden = set() if brain.motion.is_known else _WHERE
-        self._brain = brain
-        self._reports = {number: report for number, report in known.items() if number not in hidden}
-        self._default_s = {number: 1 / hz for number, hz in brain.default_hz.items() if number in self._reports}
-        self._interval_s = dict(self._default_s)
-        self._due_s = dict.fromkeys(self._interval_s, 0.0)
-        self._beat_due_s = 0.0
-
-    def knows(self, number: int) -> bool:
-        """Return True if message `number` exists in this autopilot."""
-        return number in self._reports or number in SILENT
-
-    def ask(self, number: int, interval_us: float, now_s: float) -> bool:
-        """Set the interval of message `number` in microseconds (-1: never, 0: default). Returns True if that message
-        exists."""
-        if not self.knows(number):
-            return False
-        if number in SILENT or not math.isfinite(interval_us):
-            return True
-        interval_s = self._default_s.get(number, 0.0) if interval_us == 0 else interval_us / 1e6
-        if interval_s <= 0:
-            self._interval_s.pop(number, None)
-        else:
-            self._interval_s[number], self._due_s[number] = interval_s, now_s
-        return True
-
-    def make(self, number: int) -> Message | None:
-        """Make message `number` once, as requested. None: it does not exist, or has nothing to report."""
-        return self._reports[number](self._brain) if number in self._reports else None
-
-    def due(self) -> list[Message]:
-        """Return the messages that are due now."""
-        brain, messages = self._brain, []
-        if brain.now_s >= self._beat_due_s:
-            self._beat_due_s = max(self._beat_due_s + HEARTBEAT_S, brain.now_s)
-            messages.append(heartbeat(brain))
-        for number, interval_s in self._interval_s.items():
-            if brain.now_s >= self._due_s[number]:
-                self._due_s[number] = max(self._due_s[number] + interval_s, brain.now_s)
-                if message := self._reports[number](brain):
-                    messages.append(message)
-        return messages
-
-
 class FlightController:
     """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
-    start. `start_utc_s` is its UTC at the start, seconds since 1970."""
+    start. `start_utc_s` is its UTC at the start, seconds since 1970. `fixes` are the accepted ones, `answers` what it
+    said to each (a MAV_RESULT), `reports` the messages that it can make, by number."""
 
     def __init__(
         self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
@@ -104,8 +52,15 @@ class FlightController:
         self.brain = VEHICLES[vehicle](motion)
         self.vehicle, self.system_id = vehicle, system_id
         self.fixes: list[ReceivedFix] = []
-        self.answers: list[int] = []  # its answers to fixes, each a MAV_RESULT
-        self._streams = Streams(self.brain)
+        self.answers: list[int] = []
+        known = {**REPORTS, self.brain.filter_report: FILTER_REPORTS[self.brain.filter_report]}
+        self.reports: dict[int, Report] = {
+            number: report for number, report in known.items() if motion.is_known or number not in _WHERE
+        }
+        often_hz = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: _HEARTBEAT_HZ, **self.brain.default_hz}
+        self._default_s = {number: 1 / hz for number, hz in often_hz.items() if number in self.reports}
+        self._interval_s = dict(self._default_s)
+        self._due_s = dict.fromkeys(self._interval_s, 0.0)
         self.brain.start_utc_s = start_utc_s
         self._has_begun = False
         if not gps:
@@ -135,7 +90,10 @@ class FlightController:
         said = []
         while self.brain.now_s + STEP_S <= now_s:
             self.brain.step(STEP_S)
-            said += self._streams.due()
+            for number, interval_s in self._interval_s.items():
+                if self.brain.now_s >= self._due_s[number]:
+                    self._due_s[number] = max(self._due_s[number] + interval_s, self.brain.now_s)
+                    said += self._made(number)
             said += [mavlink.MAVLink_statustext_message(each[0], each[1].encode()) for each in self.brain.texts]
             self.brain.texts.clear()
         return said
@@ -149,7 +107,8 @@ class FlightController:
         match message.get_type():
             case "COMMAND_INT" | "COMMAND_LONG":
                 result, answers = self._obey(message)
-                return [self._ack(message, result), *answers]
+                sender = {"target_system": message.get_srcSystem(), "target_component": message.get_srcComponent()}
+                return [mavlink.MAVLink_command_ack_message(message.command, result, **sender), *answers]
             case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
                 return self.brain.parameters.answer(message)
             case "TIMESYNC" if message.tc1 == 0:
@@ -167,25 +126,38 @@ class FlightController:
     def _obey(self, command: Message) -> tuple[int, list[Message]]:
         """Obey a command; return the result (MAV_RESULT) and what else is said."""
         number = int(command.param1) if math.isfinite(command.param1) else -1
+        is_known = number in self.reports or number in SILENT
         match command.command:
-            case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
-                return self._judge(command), []
+            case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE if command.get_type() == "COMMAND_INT":
+                return self._judge(command), []  # PX4 would take it as COMMAND_LONG too, with a latitude in float32
+            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if is_known:
+                self._stream(number, command.param2)
+                return OK, []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                if self._streams.ask(number, command.param2, self.brain.now_s):
-                    return OK, []
                 if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
                     self.brain.texts.append((mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({number})"))
                 return mavlink.MAV_RESULT_DENIED, []
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
-                message = self._streams.make(number)
-                return OK if self._streams.knows(number) else FAILED, [message] if message else []
+                return OK if is_known else FAILED, self._made(number)
             case mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
                 return self.brain.use_source_set(command.param1), []
         return UNSUPPORTED, []
 
+    def _stream(self, number: int, interval_us: float) -> None:
+        """Set the interval of message `number` in microseconds (-1: never, 0: default)."""
+        if number in SILENT or not math.isfinite(interval_us):
+            return
+        interval_s = self._default_s.get(number, 0.0) if interval_us == 0 else interval_us / 1e6
+        if interval_s <= 0:
+            self._interval_s.pop(number, None)
+        else:
+            self._interval_s[number], self._due_s[number] = interval_s, self.brain.now_s
+
+    def _made(self, number: int) -> list[Message]:
+        message = self.reports[number](self.brain) if number in self.reports else None
+        return [message] if message else []
+
     def _judge(self, command: Message) -> int:
-        if command.get_type() == "COMMAND_LONG":  # PX4 would take that too, with a latitude in float32
-            return UNSUPPORTED
         result = self.brain.take_fix(command)
         self.answers.append(result)
         if result == OK:
@@ -202,17 +174,7 @@ class FlightController:
 
     def _set_origin(self, message: Message) -> list[Message]:
         lat_deg, lon_deg = message.latitude / 1e7, message.longitude / 1e7
-        if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180) or lat_deg == lon_deg == 0:
+        is_place = abs(lat_deg) <= 90 and abs(lon_deg) <= 180 and (lat_deg, lon_deg) != (0, 0)
+        if not is_place or not self.brain.set_origin((lat_deg, lon_deg, message.altitude / 1e3)):
             return []
-        if not self.brain.set_origin((lat_deg, lon_deg, message.altitude / 1e3)):
-            return []
-        told = self._streams.make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        return [told] if told else []
-
-    def _ack(self, command: Message, result: int) -> Message:
-        return mavlink.MAVLink_command_ack_message(
-            command=command.command,
-            result=result,
-            target_system=command.get_srcSystem(),
-            target_component=command.get_srcComponent(),
-        )
+        return self._made(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)

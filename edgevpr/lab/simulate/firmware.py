@@ -5,12 +5,12 @@ import cmath
 import math
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.motion import Motion
-from edgevpr.lab.simulate.sensors import ExternalNavigation, PositionMeasurement, Receivers, Reckoning
+from edgevpr.lab.simulate.sensors import ExternalNavigation, Origin, PositionMeasurement, Receivers, Reckoning
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
 GATE_SD = 5.0  # standard deviations that an innovation may have; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
@@ -19,22 +19,17 @@ FAILED: int = mavlink.MAV_RESULT_FAILED
 DENIED: int = mavlink.MAV_RESULT_DENIED
 NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
-SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0, "rover": 3.0}
-_INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter or a rover dead-reckons
+SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0}
+_INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter dead-reckons
 _WIND_LEARNT_IN_S = 5.0
 _NAME_BYTES = 16
 _MOST = 2**31 - 1
-_TYPES = {
-    "copter": mavlink.MAV_TYPE_QUADROTOR,
-    "plane": mavlink.MAV_TYPE_FIXED_WING,
-    "rover": mavlink.MAV_TYPE_GROUND_ROVER,
-}
+_TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_WING}
 
 
 class Firmware(ABC):
     """The position estimator of a vehicle, and all that depends on it. The failsafe lands `motion`. `texts` are the
-    (severity, text) of the status texts to be sent. `origin` is (latitude, longitude, altitude above sea level) or
-    None."""
+    (severity, text) of the status texts to be sent."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
@@ -48,7 +43,7 @@ class Firmware(ABC):
         self.parameters = Parameters({**parameters, **SIMULATOR}, bytewise=is_px4)
         self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
         self.reckoning = Reckoning()
-        self.origin: tuple[float, float, float] | None = None
+        self.origin: Origin | None = None
         self.mode, self.is_armed = mode, motion.is_flying
         self.texts: list[tuple[int, str]] = []
         self.test_ratio = 0.0
@@ -91,14 +86,17 @@ class Firmware(ABC):
     def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
-    def set_origin(self, at: tuple[float, float, float]) -> bool:
-        """Set the origin (latitude, longitude, altitude); the vehicle does not move. Returns True if it was set."""
+    def set_origin(self, at: Origin) -> bool:
+        """Set the origin; the vehicle does not move. Returns True if it was set."""
         self.origin = at
         return True
 
     def use_source_set(self, number: float) -> int:
         """Execute MAV_CMD_SET_EKF_SOURCE_SET (42007), if the firmware has source sets. Returns a MAV_RESULT."""
         return UNSUPPORTED
+
+    def _say(self, severity: int, text: str) -> None:
+        self.texts.append((severity, text))
 
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
         """Fuse a measurement that is within the gate; reset the position to one outside of it if none was within for
@@ -117,7 +115,7 @@ class Firmware(ABC):
 
     def _go_wrong(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
         """Increase the velocity error of the dead reckoning: of a plane by `unnoticed_share` of the change of wind
-        since the filter learnt it, of the others by the error of their accelerometers."""
+        since the filter learnt it, of a copter by the error of its accelerometers."""
         if self.kind == "plane":
             drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
             self.reckoning.drift_m_s = drift_m_s if self.motion.is_flying else 0j
@@ -125,69 +123,53 @@ class Firmware(ABC):
             self.reckoning.drift_m_s += _INERTIAL_M_S2 * dt_s
 
     def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
-        """Set the estimate to a point that was measured `age_s` seconds ago, plus the distance flown since."""
-        moved_m = self.reckoning.velocity_m_s(self.truth) * age_s
-        self.reckoning.reset_to(self.truth, lat_deg, lon_deg, sd_m)
-        self.reckoning.error_m += moved_m
+        self.reckoning.reset_to(self.truth, lat_deg, lon_deg, sd_m, age_s)
 
 
-class Parameters(Mapping[str, float]):
+class Parameters(dict[str, float]):
     """Parameters by name; each stays an int or a float. With `bytewise` (PX4) the bytes of an integer are sent in the
     float of the message, else (ArduPilot) the integer's value."""
 
     def __init__(self, values: dict[str, float], bytewise: bool) -> None:
-        self._values = dict(values)
+        super().__init__(values)
         self._bytewise = bytewise
-
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
 
     def set(self, name: str, value: float) -> None:
         """Set the value of an existing parameter."""
-        self._values[name] = type(self._values[name])(value)
+        self[name] = type(self[name])(value)
 
     def set_written(self, name: str, text: str) -> None:
         """Set a parameter from the user's text. Raises UsageError for an unknown name, and for an invalid value."""
-        if name not in self._values:
-            raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self._values))}.")
-        kind = type(self._values[name])
+        if name not in self:
+            raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self))}.")
         try:
-            value = kind(text)
+            value = type(self[name])(text)
         except ValueError:
             value = math.nan
         if not -_MOST <= value <= _MOST:  # false for NaN
-            wanted = "a whole number" if kind is int else "a number"
-            raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self._values[name]}.")
+            wanted = "a whole number" if isinstance(self[name], int) else "a number"
+            raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self[name]}.")
         self.set(name, value)
 
     def answer(self, message: Message) -> list[Message]:
         """Return the replies to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""
-        names = list(self._values)
-        if message.get_type() == "PARAM_REQUEST_LIST":
+        kind, names = message.get_type(), list(self)
+        if kind == "PARAM_REQUEST_LIST":
             return [self._message(name, index) for index, name in enumerate(names)]
-        if message.get_type() == "PARAM_REQUEST_READ" and 0 <= message.param_index < len(names):
-            return [self._message(names[message.param_index], message.param_index)]
-        name = message.param_id
-        if name not in self._values:
+        by_index = kind == "PARAM_REQUEST_READ" and 0 <= message.param_index < len(names)
+        name = names[message.param_index] if by_index else message.param_id
+        if name not in self:
             return []
-        if message.get_type() == "PARAM_SET":
+        if kind == "PARAM_SET":
             self.set(name, parameter_value(message, self._bytewise) or 0.0)
         return [self._message(name, names.index(name))]
 
     def _message(self, name: str, index: int) -> Message:
-        value, is_whole = self._values[name], isinstance(self._values[name], int)
+        value, is_whole = self[name], isinstance(self[name], int)
         kind = mavlink.MAV_PARAM_TYPE_INT32 if is_whole else mavlink.MAV_PARAM_TYPE_REAL32
         if is_whole and self._bytewise:
             value = struct.unpack("<f", struct.pack("<i", value))[0]
-        return mavlink.MAVLink_param_value_message(
-            name.encode()[:_NAME_BYTES], float(value), kind, len(self._values), index
-        )
+        return mavlink.MAVLink_param_value_message(name.encode()[:_NAME_BYTES], float(value), kind, len(self), index)
 
 
 # Parameters of the simulation, named as in ArduPilot's own simulator, so that one test can drive both.
@@ -198,23 +180,18 @@ SIMULATOR = {
     "SIM_WIND_SPD": 0.0,
     "SIM_WIND_DIR": 180.0,  # degrees: where the wind comes from
 }
-
+_SERIAL = {f"SERIAL{number}_{name}": value for number in (1, 2) for name, value in (("BAUD", 57), ("PROTOCOL", 2))}
+# The source of each quantity in the first source set, and in the second and third.
+_SOURCES = {"POSXY": (3, 0), "VELXY": (3, 0), "POSZ": (1, 1), "VELZ": (3, 0), "YAW": (1, 0)}
 ARDUPILOT = {
     "AHRS_EKF_TYPE": 3,
     "EK3_ENABLE": 1,
-    **{f"EK3_SRC{number}_POSXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
-    **{f"EK3_SRC{number}_VELXY": 3 if number == 1 else 0 for number in (1, 2, 3)},
-    **{f"EK3_SRC{number}_POSZ": 1 for number in (1, 2, 3)},
-    **{f"EK3_SRC{number}_VELZ": 3 if number == 1 else 0 for number in (1, 2, 3)},
-    **{f"EK3_SRC{number}_YAW": 1 if number == 1 else 0 for number in (1, 2, 3)},
+    **{f"EK3_SRC{number}_{name}": both[number > 1] for name, both in _SOURCES.items() for number in (1, 2, 3)},
     "FLOW_TYPE": 0,
     "GPS1_TYPE": 1,
     "GPS2_TYPE": 0,
     "GPS_AUTO_SWITCH": 1,
-    "SERIAL1_BAUD": 57,
-    "SERIAL1_PROTOCOL": 2,
-    "SERIAL2_BAUD": 57,
-    "SERIAL2_PROTOCOL": 2,
+    **_SERIAL,
     "VISO_QUAL_MIN": 0,
     "VISO_TYPE": 0,
 }

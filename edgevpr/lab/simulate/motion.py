@@ -40,7 +40,7 @@ class FlownTrack:
     lat_deg: NDArray[np.float64]
     lon_deg: NDArray[np.float64]
     alt_m: NDArray[np.float64]
-    heading_deg: NDArray[np.float64]
+    heading_deg: NDArray[np.float64] | None = None
     roll_deg: NDArray[np.float64] | None = None
     pitch_deg: NDArray[np.float64] | None = None
     height_m: NDArray[np.float64] | None = None
@@ -71,15 +71,13 @@ class AlongTrack(Motion):
 
     def __init__(self, track: FlownTrack) -> None:
         self._track = track
-        self._start_s: float | None = None
+        self._start_s = math.inf
 
     def begin(self, now_s: float) -> None:
-        """Start the flight along the track."""
         self._start_s = now_s
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
-        """Return the state at the point of the track for `now_s`."""
-        return truth_at(self._track, 0.0 if self._start_s is None else now_s - self._start_s)
+        return truth_at(self._track, max(0.0, now_s - self._start_s))
 
 
 def read_track(csv_path: str | Path) -> FlownTrack:
@@ -91,18 +89,9 @@ def read_track(csv_path: str | Path) -> FlownTrack:
             rows.append([tag.t_utc_s, *at, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m])
     if not rows:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
-    ordered = np.array(sorted(rows, key=lambda row: row[0] or 0.0), float)
-    t_s, lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = ordered.T
-    return FlownTrack(
-        t_s=t_s - t_s[0],
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_m=alt_m,
-        heading_deg=heading_deg,
-        roll_deg=roll_deg,
-        pitch_deg=pitch_deg,
-        height_m=height_m,
-    )
+    t_s, *columns = np.array(sorted(rows, key=lambda row: row[0] or 0.0), float).T
+    names = ("lat_deg", "lon_deg", "alt_m", "heading_deg", "roll_deg", "pitch_deg", "height_m")
+    return FlownTrack(t_s=t_s - t_s[0], **dict(zip(names, columns, strict=True)))
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:
@@ -142,5 +131,4 @@ def beside(lat_deg: float, lon_deg: float, step_m: complex) -> tuple[float, floa
     return moved(lat_deg, lon_deg, step_m.real, step_m.imag) if step_m else (lat_deg, lon_deg)
 
 
-_ZERO = np.zeros(1)
-_NOWHERE = FlownTrack(t_s=_ZERO, lat_deg=_ZERO, lon_deg=_ZERO, alt_m=_ZERO, heading_deg=np.array([math.nan]))
+_NOWHERE = FlownTrack(t_s=np.zeros(1), lat_deg=np.zeros(1), lon_deg=np.zeros(1), alt_m=np.zeros(1))

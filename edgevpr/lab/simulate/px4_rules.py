@@ -96,7 +96,7 @@ class Px4(Firmware):
         noise_m = max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
         lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
         delay_s = self.parameters["EKF2_AGP0_DELAY"] / 1e3
-        moved_m = self.reckoning.velocity_m_s(self.truth) * delay_s
+        moved_m = (self.truth.velocity_m_s + self.reckoning.drift_m_s) * delay_s
         innovation_m = self.reckoning.innovation_m(self.truth, lat_deg, lon_deg) + moved_m
         variance_m2 = self.reckoning.sd_m**2 + noise_m**2
         if self.origin is None:
@@ -121,7 +121,7 @@ class Px4(Firmware):
             self.is_armed = False
         is_lost = self.origin is not None and not self._is_valid()
         if is_lost and not self._has_failed and self.is_armed:
-            self.texts.append((mavlink.MAV_SEVERITY_CRITICAL, "Failsafe activated: no valid position, landing"))
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe activated: no valid position, landing")
             self.mode = _LAND
             self.motion.land()
         self._has_failed = is_lost

@@ -10,6 +10,7 @@ from edgevpr.lab.simulate.motion import TrueState
 from edgevpr.lab.simulate.sensors import FIX_3D, NO_FIX, Gps
 from edgevpr.mavlink.wire import Message, mavlink
 
+Report = Callable[[Firmware], Message | None]
 _UNKNOWN_16 = 65_535
 _G_MG = 1000
 _CAPABILITIES = (
@@ -36,29 +37,30 @@ def _position(brain: Firmware) -> Message | None:
     if brain.origin is None:
         return None
     truth, (lat_deg, lon_deg) = brain.truth, brain.reckoning.place(brain.truth)
-    velocity_m_s = brain.reckoning.velocity_m_s(truth)
+    velocity_m_s = truth.velocity_m_s + brain.reckoning.drift_m_s
+    north_cm_s, east_cm_s, down_cm_s = (
+        max(-32_768, min(32_767, round(100 * each)))
+        for each in (velocity_m_s.imag, velocity_m_s.real, -truth.climb_m_s)
+    )
     return mavlink.MAVLink_global_position_int_message(
         time_boot_ms=_boot_ms(brain),
         lat=round(lat_deg * 1e7),
         lon=round(lon_deg * 1e7),
         alt=round(truth.alt_m * 1e3),
         relative_alt=0 if math.isnan(truth.height_m) else round(truth.height_m * 1e3),
-        vx=_in_16_bits(velocity_m_s.imag * 100),
-        vy=_in_16_bits(velocity_m_s.real * 100),
-        vz=-_in_16_bits(truth.climb_m_s * 100),
+        vx=north_cm_s,
+        vy=east_cm_s,
+        vz=down_cm_s,
         hdg=_UNKNOWN_16 if math.isnan(truth.heading_deg) else round(truth.heading_deg * 100) % 36_000,
     )
 
 
 def _attitude(brain: Firmware) -> Message | None:
     """Make an ATTITUDE; None if the track does not contain the angles."""
-    truth = brain.truth
-    if math.isnan(truth.roll_deg + truth.pitch_deg):
+    roll, pitch = math.radians(brain.truth.roll_deg), math.radians(brain.truth.pitch_deg)
+    if math.isnan(roll + pitch):
         return None
-    yaw = yaw_of(truth)
-    return mavlink.MAVLink_attitude_message(
-        _boot_ms(brain), math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw, 0, 0, 0
-    )
+    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, yaw_of(brain.truth), 0, 0, 0)
 
 
 def _second_gps(brain: Firmware) -> Message | None:
@@ -89,9 +91,23 @@ def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
     }
 
 
+def _origin(brain: Firmware) -> Message | None:
+    if brain.origin is None:
+        return None
+    lat_deg, lon_deg, alt_m = brain.origin
+    return mavlink.MAVLink_gps_global_origin_message(round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3))
+
+
+def _version(brain: Firmware) -> Message:
+    is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
+    encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
+    return mavlink.MAVLink_autopilot_version_message(
+        _CAPABILITIES | encoding, brain.version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, 0
+    )
+
+
 def _ekf_status(brain: Firmware) -> Message:
-    ratio = brain.test_ratio
-    return mavlink.MAVLink_ekf_status_report_message(brain.flags(), 0.05, ratio, 0.05, 0.02, 0.0)
+    return mavlink.MAVLink_ekf_status_report_message(brain.flags(), 0.05, brain.test_ratio, 0.05, 0.02, 0.0)
 
 
 def _estimator_status(brain: Firmware) -> Message:
@@ -101,23 +117,7 @@ def _estimator_status(brain: Firmware) -> Message:
     )
 
 
-def _origin(brain: Firmware) -> Message | None:
-    if brain.origin is None:
-        return None
-    lat_deg, lon_deg, alt_m = brain.origin
-    return mavlink.MAVLink_gps_global_origin_message(round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3))
-
-
-def _version(brain: Firmware) -> Message:
-    nothing = [0] * 8
-    is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
-    encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
-    return mavlink.MAVLink_autopilot_version_message(
-        _CAPABILITIES | encoding, brain.version, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
-    )
-
-
-REPORTS: dict[int, Callable[[Firmware], Message | None]] = {
+REPORTS: dict[int, Report] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda brain: mavlink.MAVLink_system_time_message(
         round((brain.start_utc_s + brain.now_s) * 1e6), _boot_ms(brain)
@@ -135,14 +135,12 @@ REPORTS: dict[int, Callable[[Firmware], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
 }
 # Each firmware has its own report of its filter, and does not know the other's.
-FILTER_REPORTS = {
+FILTER_REPORTS: dict[int, Report] = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
 }
-SILENT = {  # known, but there is no such sensor
-    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR,
-    mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT,
-}
+# Known, but there is no such sensor.
+SILENT = {mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR, mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT}
 
 
 def _boot_ms(brain: Firmware) -> int:
@@ -150,8 +148,5 @@ def _boot_ms(brain: Firmware) -> int:
 
 
 def yaw_of(truth: TrueState) -> float:
+    """Return the yaw in radians, -pi..pi; 0 where the heading is unknown."""
     return 0.0 if math.isnan(truth.heading_deg) else math.remainder(math.radians(truth.heading_deg), math.tau)
-
-
-def _in_16_bits(value: float) -> int:
-    return max(-32_768, min(32_767, round(value)))

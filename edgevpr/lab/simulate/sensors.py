@@ -20,7 +20,7 @@ _EXTERNAL_GOOD_FOR_S = 0.3
 _TAKEN_SHARE = 0.3  # of an innovation, that each measurement corrects
 _LEAST_SD_M = 0.3
 
-Values = Mapping[str, float]
+Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea level
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,31 +36,21 @@ class PositionMeasurement:
     velocity_m_s: complex = 0j
 
 
+@dataclass(slots=True)
 class Gps:
-    """A GPS receiver as the autopilot sees it: its last report, None if there is none that is recent."""
+    """A GPS receiver as the autopilot sees it: its `last` report, None if there is none that is recent."""
 
-    def __init__(self) -> None:
-        self.fix_type: int = NO_FIX
-        self.last: PositionMeasurement | None = None
-        self._heard_s = -math.inf
-
-    def report(self, fix_type: int, measured: PositionMeasurement) -> None:
-        """Process a report of the receiver."""
-        self._heard_s, self.fix_type, self.last = measured.t_s, fix_type, measured
-
-    def age(self, now_s: float) -> None:
-        """Forget the report of a receiver that has been silent for four seconds."""
-        if now_s - self._heard_s > _TIMEOUT_S:
-            self.fix_type, self.last = NO_FIX, None
+    fix_type: int = NO_FIX
+    last: PositionMeasurement | None = None
 
 
 class Receivers:
     """The two GPS receivers. The first measures the true position plus the glitch that the parameters set, while
-    enabled; the second is fed by GPS_INPUT."""
+    enabled; the second is fed by GPS_INPUT. `primary` is the one in use; the other takes over with a better fix."""
 
-    def __init__(self, parameters: Values) -> None:
+    def __init__(self, parameters: Mapping[str, float]) -> None:
         self.first, self.second = Gps(), Gps()
-        self.primary = self.first  # the one in use; the other takes over when it has the better fix
+        self.primary = self.first
         self._parameters = parameters
         self._due_s = 0.0
 
@@ -82,10 +72,11 @@ class Receivers:
                 velocity_m_s=truth.velocity_m_s,
             )
             if self._parameters["SIM_GPS1_ENABLE"]:
-                self.first.report(_BEST_FIX, seen)
+                self.first.fix_type, self.first.last = _BEST_FIX, seen
             else:  # reports continue, without a fix
-                self.first.report(NO_FIX, replace(self.first.last or seen, t_s=now_s))
-        self.second.age(now_s)
+                self.first.fix_type, self.first.last = NO_FIX, replace(self.first.last or seen, t_s=now_s)
+        if self.second.last and now_s - self.second.last.t_s > _TIMEOUT_S:
+            self.second.fix_type, self.second.last = NO_FIX, None
         other = self.second if self.primary is self.first else self.first
         if max(other.fix_type, FIX_3D - 1) > self.primary.fix_type:
             self.primary = other
@@ -93,7 +84,8 @@ class Receivers:
     def hear(self, message: Message, now_s: float) -> None:
         """Process a GPS_INPUT, if it is for the second receiver."""
         if self.has_second and message.gps_id == 1:
-            measured = PositionMeasurement(
+            self.second.fix_type = message.fix_type
+            self.second.last = PositionMeasurement(
                 lat_deg=message.lat / 1e7,
                 lon_deg=message.lon / 1e7,
                 alt_m=message.alt,
@@ -101,13 +93,12 @@ class Receivers:
                 t_s=now_s,
                 velocity_m_s=complex(message.ve, message.vn),
             )
-            self.second.report(message.fix_type, measured)
 
 
 class ExternalNavigation:
     """Receives positions relative to the estimator's origin: metres north, east and down, in ODOMETRY messages."""
 
-    def __init__(self, parameters: Values) -> None:
+    def __init__(self, parameters: Mapping[str, float]) -> None:
         self._parameters = parameters
         self._last: tuple[complex, float, float] | None = None  # position, standard deviation, time
 
@@ -120,10 +111,9 @@ class ExternalNavigation:
             variances = [message.pose_covariance[number] for number in (0, 6, 11)]
             # The cube root is ArduPilot's own.
             sd_m = 0.0 if math.isnan(variances[0]) else sum(variance**2 for variance in variances) ** (1 / 3)
-            sd_m = min(_MOST_NOISE_M, max(_LEAST_NOISE_M, sd_m))
-            self._last = complex(message.y, message.x), sd_m, now_s
+            self._last = complex(message.y, message.x), min(_MOST_NOISE_M, max(_LEAST_NOISE_M, sd_m)), now_s
 
-    def measured(self, origin: tuple[float, float, float] | None, now_s: float) -> PositionMeasurement | None:
+    def measured(self, origin: Origin | None, now_s: float) -> PositionMeasurement | None:
         """Return the last position in degrees; None if there is no recent one, or `origin` is None."""
         if self._last is None or origin is None or now_s - self._last[2] > _EXTERNAL_GOOD_FOR_S:
             return None
@@ -132,14 +122,14 @@ class ExternalNavigation:
         return PositionMeasurement(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=origin[2], sd_m=sd_m, t_s=t_s)
 
 
+@dataclass(slots=True)
 class Reckoning:
     """The estimated position, kept as its error against the truth: `error_m` (complex, east + 1j * north), `drift_m_s`
     (the growth of that error), and `sd_m`, the standard deviation that the estimator assumes."""
 
-    def __init__(self) -> None:
-        self.error_m = 0j
-        self.drift_m_s = 0j
-        self.sd_m = _LEAST_SD_M
+    error_m: complex = 0j
+    drift_m_s: complex = 0j
+    sd_m: float = _LEAST_SD_M
 
     def step(self, dt_s: float, sd_m_s: float) -> None:
         """Dead-reckon for `dt_s` seconds; the standard deviation grows by `sd_m_s` metres a second."""
@@ -149,10 +139,6 @@ class Reckoning:
     def place(self, truth: TrueState) -> tuple[float, float]:
         """Return the estimated (latitude, longitude) in degrees."""
         return beside(truth.lat_deg, truth.lon_deg, self.error_m)
-
-    def velocity_m_s(self, truth: TrueState) -> complex:
-        """Return the estimated velocity, east + 1j * north."""
-        return truth.velocity_m_s + self.drift_m_s
 
     def innovation_m(self, truth: TrueState, lat_deg: float, lon_deg: float) -> complex:
         """Return the vector from the estimate to a point, metres (east + 1j * north)."""
@@ -164,7 +150,9 @@ class Reckoning:
         self.drift_m_s = 0j
         self.sd_m = max(_LEAST_SD_M, min(self.sd_m, measured.sd_m))
 
-    def reset_to(self, truth: TrueState, lat_deg: float, lon_deg: float, sd_m: float) -> None:
-        """Set the estimate to a point, with the standard deviation `sd_m`."""
-        self.error_m += self.innovation_m(truth, lat_deg, lon_deg)
+    def reset_to(self, truth: TrueState, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
+        """Set the estimate to a point measured `age_s` seconds ago, plus the distance flown since by its velocity, with
+        the standard deviation `sd_m`."""
+        moved_m = (truth.velocity_m_s + self.drift_m_s) * age_s
+        self.error_m += self.innovation_m(truth, lat_deg, lon_deg) + moved_m
         self.sd_m = max(_LEAST_SD_M, sd_m)

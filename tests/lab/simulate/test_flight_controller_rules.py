@@ -35,7 +35,7 @@ class Flown:
 
     def in_air(self) -> "Flown":
         self.wait(10)
-        self.controller.set_mode({"copter": GUIDED, "plane": 13, "rover": 15}[self.kind])
+        self.controller.set_mode({"copter": GUIDED, "plane": 13}[self.kind])
         self.controller.arm()
         self.motion.take_off(30)
         return self.wait(30)
@@ -126,7 +126,7 @@ def test_a_plane_drifts_with_the_wind_that_it_does_not_know_only():
 
 
 def test_ardupilot_brings_a_fix_forward_by_five_seconds_at_the_most():
-    flown = lost("ardurover", wind_m_s=0).wait(3)
+    flown = lost("arducopter", wind_m_s=0).wait(3)
     flown.motion.fly(10j, flown.now_s)
     flown.wait(2)
     assert flown.fix(north_m=-20, age_s=2.0) == ACCEPTED
@@ -136,16 +136,15 @@ def test_ardupilot_brings_a_fix_forward_by_five_seconds_at_the_most():
     assert flown.error_m == pytest.approx(30, abs=3)
 
 
-@pytest.mark.parametrize("vehicle", ["arducopter", "ardurover"])
-def test_without_any_aid_ardupilot_loses_the_position_after_seven_seconds_and_aiding_after_fifteen(vehicle):
-    flown = lost(vehicle)
+def test_without_any_aid_ardupilot_loses_the_position_after_seven_seconds_and_aiding_after_fifteen():
+    flown = lost("arducopter")
     flown.motion.fly(1j, flown.now_s)
     has_position = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
     assert flown.wait(6).flags & has_position
     assert flown.fix() == ACCEPTED
     assert not flown.wait(2).flags & has_position, "the fix did not prevent it"
     flown.wait(2)
-    assert flown.controller.brain.mode == (LAND if vehicle == "arducopter" else 4)
+    assert flown.controller.brain.mode == LAND
     assert "EKF variance" in flown.texts
     assert flown.fix() == ACCEPTED
     flown.wait(6)
