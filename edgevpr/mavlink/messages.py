@@ -11,11 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from pymavlink.quaternion import QuaternionBase
-from pymavlink.rotmat import Matrix3, Vector3
-
 from edgevpr.core.geodesy import offset_m
-from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.mavlink.wire import Matrix3, Message, QuaternionBase, Vector3, mavlink
 
 POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
