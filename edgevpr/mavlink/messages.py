@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from edgevpr.core.geodesy import offset_m
-from edgevpr.mavlink.wire import Matrix3, Message, QuaternionBase, Vector3, mavlink
+from edgevpr.mavlink.wire import Message, mavlink, quaternion, rotmat
 
 POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -173,9 +173,9 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
     """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     east, north, down = state.velocity_m_s
-    to_earth = Matrix3()
+    to_earth = rotmat.Matrix3()
     to_earth.from_euler(*attitude)
-    velocity = to_earth.transposed() * Vector3(north, east, down)  # along nose, right, down
+    velocity = to_earth.transposed() * rotmat.Vector3(north, east, down)  # along nose, right, down
     # The upper triangle of 6 x 6, row by row: only its diagonal is known.
     pose_variances, velocity_variances = [0.0] * 21, [0.0] * 21
     pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)
@@ -188,7 +188,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
         x=float(north_m),
         y=float(east_m),
         z=origin[2] - state.alt_m,
-        q=list(QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
+        q=list(quaternion.QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
         vx=velocity.x,
         vy=velocity.y,
         vz=velocity.z,

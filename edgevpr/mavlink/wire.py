@@ -1,4 +1,5 @@
-"""The one import of pymavlink: its dialect and its rotations, and the parser from bytes to messages. Used by the whole package.
+"""The one import of pymavlink: its dialect and rotations, and the parser from bytes to messages.
+Used by the whole package.
 
 `ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would take
 another 1 MB of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise
@@ -11,21 +12,10 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any, TypeAlias
 
+from pymavlink import quaternion, rotmat
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from pymavlink.quaternion import QuaternionBase
-from pymavlink.rotmat import Matrix3, Vector3
 
-__all__ = [
-    "Matrix3",
-    "Message",
-    "PacketReader",
-    "QuaternionBase",
-    "Tap",
-    "Vector3",
-    "mavlink",
-    "parameter_value",
-    "untapped",
-]
+__all__ = ["Message", "PacketReader", "Tap", "mavlink", "parameter_value", "quaternion", "rotmat", "untapped"]
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
 Tap = Callable[[bytes], object]  # gets the bytes of every whole packet, sent or received
