@@ -5,6 +5,7 @@ All modules that read pictures or streams import `cv2` from here. OpenCV's own l
 reports each fault once, in its own words; to get them back, set OPENCV_LOG_LEVEL before the start.
 """
 
+import contextlib
 import os
 import re
 import zlib
@@ -28,7 +29,6 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm",
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
-_FOLDERS_NAMED = 3  # subfolders suggested in an error message
 _SMALL_PX, _SMALL_QUALITY, _TAPE_QUALITY = 640, 80, 95
 
 _JPEG_START = b"\xff\xd8\xff"
@@ -47,29 +47,18 @@ def list_images(folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     try:
-        names = sorted((path.name for path in folder.iterdir()), key=counting_order)
-    except FileNotFoundError:
-        raise SourceError(f"The folder {folder} does not exist: give the folder that holds the images.") from None
+        names = sorted((path.name for path in folder.iterdir() if is_image(path.name)), key=counting_order)
     except OSError as error:
-        raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from error
-    if images := [folder / name for name in names if is_image(name)]:
-        return images
-    inner = [str(folder / name) for name in names if _holds_images(folder / name)][:_FOLDERS_NAMED]
-    advice = f"give {' or '.join(inner)}" if inner else "give the one that does"
-    raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): {advice}.")
+        raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from None
+    if not names:
+        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give the one that does.")
+    return [folder / name for name in names]
 
 
 def is_image(name: str) -> bool:
     """Return True if the file name is that of an image."""
     # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
-
-
-def _holds_images(folder: Path) -> bool:
-    try:
-        return any(is_image(path.name) for path in folder.iterdir())
-    except OSError:
-        return False  # not a folder, or not readable
 
 
 def counting_order(name: str) -> tuple[list[str | int], str]:
@@ -86,32 +75,20 @@ def read_image(path: str | Path) -> Image:
     """
     try:
         data = read_file(path, _MAX_FILE_BYTES)
-    except FileNotFoundError:
-        raise ImageError(f"The image {path} does not exist: check the name.") from None
     except OSError as error:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
-    except MemoryError:
-        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
-    if not data:
-        raise ImageError(f"{path} is empty: copy it again from the camera.")
     if _is_incomplete(data):
-        raise ImageError(f"{path} is cut short or damaged: copy it again from the camera.")
-    image, is_too_large = None, False
-    try:
+        raise ImageError(f"{path} is empty, cut short or damaged: copy it again from the camera.")
+    image = None
+    with contextlib.suppress(cv2.error):  # raised for too many pixels
         if _STARTS.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    except cv2.error as error:
-        is_too_large = "MAX_IMAGE" in str(error)
     # A program that has imported OpenCV before edgevpr has another limit there: so the size is checked here as well.
-    if is_too_large or (image is not None and image.shape[0] * image.shape[1] > MAX_PIXELS):
+    if image is None or image.dtype != np.uint8 or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(
-            f"{path} has too many pixels; edgevpr reads up to {MAX_PIXELS / 1e6:.0f} megapixels: give a smaller image."
+            f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file of 8 bits a channel "
+            f"and at most {MAX_PIXELS / 1e6:.0f} megapixels."
         )
-    if image is None:
-        raise ImageError(f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file.")
-    if image.dtype != np.uint8:
-        bits = 8 * image.dtype.itemsize
-        raise ImageError(f"{path} has {bits} bits a channel; edgevpr reads 8-bit images: convert it first.")
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
         raise ImageError(
@@ -155,14 +132,14 @@ def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes
 
 
 def _is_incomplete(data: bytes) -> bool:
-    """Return True for a JPEG without its end mark, or a PNG in which a chunk is missing or damaged.
+    """Return True for no data, a JPEG without its end mark, or a PNG in which a chunk is missing or damaged.
 
     OpenCV 4 fills the missing part of a JPEG with grey without an error, and ignores the checksums of a PNG. Its
     decoders of the other formats detect damage themselves. Bytes after the end mark are allowed.
     """
     if data.startswith(_JPEG_START):
         return not jpeg_is_whole(data)
-    return data.startswith(_PNG_START) and not _png_is_whole(data)
+    return not data or (data.startswith(_PNG_START) and not _png_is_whole(data))
 
 
 def jpeg_is_whole(data: bytes) -> bool:

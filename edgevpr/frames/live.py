@@ -46,11 +46,6 @@ class DeviceCapture:
         self._capture.release()
 
 
-def wait_before_reopening_s(failures: int) -> float:
-    """Return the seconds to wait after `failures` failures in a row: 0.5, doubled by each further one, at most 10."""
-    return min(_FIRST_WAIT_S * 2.0 ** min(failures - 1, 10), _LONGEST_WAIT_S)
-
-
 class LiveSource:
     """Gives the newest frame of the camera or stream that `open_capture` opens (None: it could not be opened).
 
@@ -111,15 +106,15 @@ class LiveSource:
         self._thread.join(_EXIT_TIMEOUT_S)
 
     def _capture(self) -> None:
-        failures = 0
+        wait_s = 0.0
         while not self._closing.is_set():
             before = self._captured
             capture = self._open_capture()
             if capture is not None:
                 self._take_pictures(capture)
                 capture.release()
-            failures = 1 if self._captured > before else failures + 1
-            wait_s = wait_before_reopening_s(failures)
+            has_failed_again = wait_s and self._captured == before
+            wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
             self._condition = Condition.LOST
             self.state = f"{'lost' if self._captured else 'nothing there'}, reopening in {wait_s:g} s"
             self._closing.wait(wait_s)

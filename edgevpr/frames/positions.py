@@ -4,10 +4,11 @@ certain seconds. The sources of frames read them; `where` in this module is "FIL
 import csv
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +16,20 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.core.types import Position
 
-_NEEDED_COLUMNS = ("file", "lat", "lon")
-_TRACK_COLUMNS = ("time", "lat", "lon")
-_OTHER_COLUMNS = ("alt", "heading_deg", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "rel_alt")
 ALT_M = (-1000.0, 100_000.0)  # plausible altitudes
+# Each column of numbers with its limits. Of heading_deg and yaw_deg, and of height_m and rel_alt, the first counts.
+_NUMBERS = {
+    "lat": (-90.0, 90.0),
+    "lon": (-180.0, 180.0),
+    "alt": ALT_M,
+    "heading_deg": (-360.0, 360.0),
+    "yaw_deg": (-360.0, 360.0),
+    "roll_deg": (-180.0, 180.0),
+    "pitch_deg": (-90.0, 90.0),
+    "height_m": ALT_M,
+    "rel_alt": ALT_M,
+}
+_NEEDED_COLUMNS, _TRACK_COLUMNS = ("file", "lat", "lon"), ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
@@ -75,61 +86,46 @@ def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> li
     If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
-        lines = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-        header = [name.strip().lower() for name in next(lines, [])]
-        _require_columns(header, csv_path, needed)
-        rows = [(f"{csv_path}, line {lines.line_num}", values) for values in lines if values]
+        table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
+        table.fieldnames = header = [name.strip().lower() for name in table.fieldnames or ()]
+        rows = [(f"{csv_path}, line {table.line_num}", row) for row in table]
     except OSError as error:
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a text file of commas ({error}): save it as CSV in UTF-8.") from error
-    return list(_checked(rows, header, "file" in needed))
-
-
-def _require_columns(header: Sequence[str], csv_path: str | Path, needed: Sequence[str]) -> None:
-    if missing := [name for name in needed if name not in header]:
-        raise UsageError(
-            f"{csv_path}, line 1 has no column `{missing[0]}`: it must name {', '.join(needed)}, "
-            "with commas between them."
-        )
-    if twice := [name for name in (*_NEEDED_COLUMNS, *_OTHER_COLUMNS, "time") if header.count(name) > 1]:
-        raise UsageError(f"{csv_path}, line 1 has two columns `{twice[0]}`: keep one of them.")
-
-
-def _checked(
-    rows: Sequence[tuple[str, list[str]]], header: Sequence[str], are_files: bool
-) -> Iterator[tuple[str, dict[str, str]]]:
-    wheres: dict[str, str] = {}
-    for where, values in rows:
-        if len(values) != len(header):
-            raise UsageError(f"{where} has {len(values)} values; line 1 names {len(header)} columns: make them agree.")
-        row = {name: value.strip() for name, value in zip(header, values, strict=True)}
-        if are_files:
-            if not (name := row["file"]):
-                raise UsageError(f"{where} names no file: write the image's file name or delete the line.")
-            if name in wheres:
-                line = wheres[name].rpartition(", ")[2]
-                raise UsageError(f"{where}: {name} stands in {line} already: keep one of the two.")
-            wheres[name] = where
-        yield where, row
+    for name in (*needed, *_NUMBERS, "time"):
+        if header.count(name) > 1 or (name in needed and name not in header):
+            raise UsageError(
+                f"{csv_path}, line 1 has no column `{name}`, or two: it must name {', '.join(needed)} once each, with "
+                "commas between them."
+            )
+    found, names = [], {""}
+    for where, row in rows:
+        if None in row or None in row.values():  # so says DictReader
+            raise UsageError(f"{where} has not as many values as line 1 has columns: make them agree.")
+        row = {name: value.strip() for name, value in row.items()}
+        if "file" in needed and row["file"] in names:
+            raise UsageError(f"{where} names no image, or one of an earlier line (`{row['file']}`): correct it.")
+        names.add(row.get("file", ""))
+        found.append((where, row))
+    return found
 
 
 def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
     """Convert a row of a table (text by column) to a tag. Raises UsageError, which begins with `where`, for a wrong
     value."""
-    lat_deg = number_in(row, "lat", -90, 90, where)
-    lon_deg = number_in(row, "lon", -180, 180, where)
-    alt_m = number_in(row, "alt", *ALT_M, where)
+    known = {column: number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
+    lat_deg, lon_deg = known["lat"], known["lon"]
     if (lat_deg is None) != (lon_deg is None):
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
-    heading_deg = number_in(row, "heading_deg" if row.get("heading_deg") else "yaw_deg", -360, 360, where)
+    heading_deg = known["yaw_deg"] if known["heading_deg"] is None else known["heading_deg"]
     return GeoTag(
-        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, alt_m),
+        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, known["alt"]),
         heading_deg=None if heading_deg is None else heading_deg % 360,
         t_utc_s=_time_in(row, where),
-        roll_deg=number_in(row, "roll_deg", -180, 180, where),
-        pitch_deg=number_in(row, "pitch_deg", -90, 90, where),
-        height_m=number_in(row, "height_m" if row.get("height_m") else "rel_alt", *ALT_M, where),
+        roll_deg=known["roll_deg"],
+        pitch_deg=known["pitch_deg"],
+        height_m=known["rel_alt"] if known["height_m"] is None else known["height_m"],
     )
 
 
@@ -202,11 +198,18 @@ class VideoTrack:
             return GeoTag()
         one, other = self.tags[after - 1], self.tags[after]
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
-        heading_deg = _turned(one.heading_deg, other.heading_deg, share)
+        heading_deg = _between(one.heading_deg, other.heading_deg, share, is_angle=True)
+        position = None
+        if one.position and other.position:
+            lat_deg, lon_deg, alt_m = (
+                _between(getattr(one.position, name), getattr(other.position, name), share, is_angle=name == "lon_deg")
+                for name in ("lat_deg", "lon_deg", "alt_m")
+            )
+            position = Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m)
         return GeoTag(
-            position=_on_the_way(one.position, other.position, share),
+            position=position,
             heading_deg=None if heading_deg is None else heading_deg % 360,
-            roll_deg=_turned(one.roll_deg, other.roll_deg, share),
+            roll_deg=_between(one.roll_deg, other.roll_deg, share, is_angle=True),
             pitch_deg=_between(one.pitch_deg, other.pitch_deg, share),
             height_m=_between(one.height_m, other.height_m, share),
         )
@@ -230,32 +233,20 @@ def read_track(csv_path: str | Path) -> VideoTrack:
         tag = tag_of(row, where)
         if tag.position is None:
             continue
-        if tag.t_utc_s is None:
-            raise UsageError(f"{where} has no time: write the seconds from the first frame of the video.")
-        if tags and tag.t_utc_s <= next(reversed(tags)):
-            raise UsageError(f"{where}: time is not after that of the line before: sort the lines, one for each time.")
+        if tag.t_utc_s is None or (tags and tag.t_utc_s <= next(reversed(tags))):
+            raise UsageError(
+                f"{where} has no time, or one that is not after that of the line before: write the seconds from the "
+                "first frame of the video, one line for each."
+            )
         tags[tag.t_utc_s] = replace(tag, t_utc_s=None)
     if not tags:
         raise UsageError(f"{csv_path} has no line with time, lat and lon: the positions of a video need them.")
     return VideoTrack(Path(csv_path), tuple(tags), tuple(tags.values()))
 
 
-def _on_the_way(one: Position | None, other: Position | None, share: float) -> Position | None:
+def _between(one: float | None, other: float | None, share: float, is_angle: bool = False) -> Any:
+    """Return the number at `share` of the way; None if one of both is. Angles in degrees turn the shorter way."""
     if one is None or other is None:
         return None
-    lat_deg, alt_m = one.lat_deg + share * (other.lat_deg - one.lat_deg), _between(one.alt_m, other.alt_m, share)
-    lon_deg = one.lon_deg + share * _turn_deg(one.lon_deg, other.lon_deg)
-    return Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m)
-
-
-def _between(one: float | None, other: float | None, share: float) -> float | None:
-    return None if one is None or other is None else one + share * (other - one)
-
-
-def _turned(one_deg: float | None, other_deg: float | None, share: float) -> float | None:
-    return None if one_deg is None or other_deg is None else one_deg + share * _turn_deg(one_deg, other_deg)
-
-
-def _turn_deg(one_deg: float, other_deg: float) -> float:
-    """Return the difference `other_deg` - `one_deg` of two angles in -180..180 degrees."""
-    return (other_deg - one_deg + 180) % 360 - 180
+    way = other - one
+    return one + share * ((way + 180) % 360 - 180 if is_angle else way)

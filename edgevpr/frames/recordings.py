@@ -16,35 +16,23 @@ from edgevpr.frames.shot import Condition, Refusal
 
 
 class RecordingSource:
-    """Base class of sources that end. Only frames whose names are in `only` are read (None: all)."""
+    """Base class of sources that end, see `Source`. Only frames whose names are in `only` are read (None: all)."""
 
-    is_live = False
+    is_live, ended, condition, state = False, False, Condition.RUNNING, "reading"
     dropped: int | None = None
     latency_s: float | None = None
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
-        self._has_ended = False
         self._only = None if only is None else frozenset(only)
 
     def is_wanted(self, name: str) -> bool:
         """Return True if the frame of this name is to be read."""
         return self._only is None or name in self._only
 
-    @property
-    def ended(self) -> bool:
-        """True if no more frames will come."""
-        return self._has_ended
-
-    @property
-    def condition(self) -> Condition:
-        """The state of the source: ENDED or RUNNING."""
-        return Condition.ENDED if self.ended else Condition.RUNNING
-
-    @property
-    def state(self) -> str:
-        """The state of the source in a word, for people."""
-        return "ended" if self.ended else "reading"
+    def end(self) -> None:
+        """Say from now on that no more frames will come."""
+        self.ended, self.condition, self.state = True, Condition.ENDED, "ended"
 
     def close(self) -> None:
         """Do nothing: no file is held open between images."""
@@ -61,11 +49,7 @@ class FolderSource(RecordingSource):
     `positions` (None: positions.csv in or beside the folder), or if it has no line, with its EXIF data."""
 
     def __init__(
-        self,
-        folder: Path,
-        positions: Path | None,
-        clock: Callable[[], float],
-        only: Collection[str] | None = None,
+        self, folder: Path, positions: Path | None, clock: Callable[[], float], only: Collection[str] | None = None
     ) -> None:
         super().__init__(only)
         paths = {decoded_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
@@ -76,11 +60,8 @@ class FolderSource(RecordingSource):
         self._unread = [(name, path) for name, path in paths.items() if self.is_wanted(name)][::-1]
         self.total = len(self._unread)
         self._clock = clock
-
-    @property
-    def ended(self) -> bool:
-        """True after the last image."""
-        return not self._unread
+        if not self._unread:
+            self.end()
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next image, None after the last. Raises ImageError for an image that cannot be used; the next call
@@ -88,6 +69,8 @@ class FolderSource(RecordingSource):
         if self.ended:
             return None
         name, path = self._unread.pop()
+        if not self._unread:
+            self.end()
         try:
             image = read_image(path)
         except ImageError:

@@ -1,6 +1,7 @@
 """Sources of frames: a folder of images, a video file, a camera or a network stream. All have the interface `Source`,
 and `open_source` opens each. Flights, mapping and all commands that read pictures use them."""
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -13,6 +14,7 @@ from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import EXTENSIONS
 from edgevpr.frames.live import LiveSource, open_camera
+from edgevpr.frames.positions import read_track
 from edgevpr.frames.recordings import FolderSource
 from edgevpr.frames.shot import Capture, Condition
 
@@ -98,7 +100,6 @@ def open_source(
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
-    from edgevpr.frames.positions import read_track
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
     return VideoSource(path, step_s or 0.0, clock, only, track=read_track(positions) if positions else None)
@@ -141,14 +142,10 @@ def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | 
 
 
 def _check_address(uri: str) -> None:
-    try:
+    with contextlib.suppress(ValueError):  # of a port that is none, or half an IPv6 address
         address = urlsplit(uri)
-        host, port = address.hostname, address.port
-    except ValueError as error:
-        raise SourceError(f"{uri} is not a proper address ({error}): write it like rtsp://HOST:PORT/PATH.") from None
-    if address.scheme not in _SCHEMES:
-        raise SourceError(f"{uri}: {address.scheme}:// is not understood: give {SOURCES}.")
-    if port is None and address.scheme in _SCHEMES_THAT_NEED_A_PORT:
-        raise SourceError(f"{uri} names no port: write it like {address.scheme}://HOST:PORT.")
-    if host is None and address.scheme != "udp":  # udp://:PORT listens on all interfaces
-        raise SourceError(f"{uri} names no host: write it like {address.scheme}://HOST:PORT.")
+        is_whole = address.port is not None or address.scheme not in _SCHEMES_THAT_NEED_A_PORT
+        is_somewhere = address.hostname is not None or address.scheme == "udp"  # udp://:PORT: on all interfaces
+        if address.scheme in _SCHEMES and is_whole and is_somewhere:
+            return
+    raise SourceError(f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}.")

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from queue import Queue
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -122,23 +123,22 @@ class Arrivals:
     wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown."""
 
     def __init__(self, fetch: Callable[[], Fetched | None], clock: Callable[[], float]) -> None:
-        self._fetch, self._clock = fetch, clock
-        self._waiting: deque[Arrival] = deque()
-        self._changed = threading.Condition()
-        self._is_over = self._is_closing = False
+        self._fetch, self._clock, self._is_closing = fetch, clock, False
+        self._waiting: Queue[Arrival | None] = Queue()  # None: the stream is lost
         self._thread = threading.Thread(target=self._take, name="fetch", daemon=True)
         self._thread.start()
 
     def next(self) -> Arrival | None:
         """Wait for the next packet and return it; None if the stream is lost."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._is_over)
-            return self._waiting.popleft() if self._waiting else None
+        arrival = self._waiting.get()
+        if arrival is None:
+            self._waiting.put(None)
+        return arrival
 
     def can_begin_anew(self) -> bool:
         """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
-        with self._changed:
-            return any(arrival.fetched.packet.is_keyframe for arrival in self._waiting)
+        with self._waiting.mutex:
+            return any(arrival and arrival.fetched.packet.is_keyframe for arrival in self._waiting.queue)
 
     def close(self) -> None:
         """Stop the thread, and wait until its current fetch has returned."""
@@ -152,14 +152,9 @@ class Arrivals:
                 fetched = self._fetch()
                 if fetched is None:
                     break
-                arrival = Arrival(fetched, asked_s, self._clock())
-                with self._changed:
-                    self._waiting.append(arrival)
-                    self._changed.notify()
+                self._waiting.put(Arrival(fetched, asked_s, self._clock()))
         finally:
-            with self._changed:
-                self._is_over = True
-                self._changed.notify()
+            self._waiting.put(None)
 
 
 class StampedTime:
@@ -171,16 +166,14 @@ class StampedTime:
     clock drift or a pause of the sender; in a congested network they vary. `is_live`: True once the pictures that were
     buffered before the opening have been fetched."""
 
-    is_live: bool
-    _in_time: int
-    _order_s: float
-    _order_delay_s: float
-    _least_s: float
-    _least_order_delay_s: float
-    _window: list[tuple[float, float, float]]
-
     def __init__(self) -> None:
         self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self.is_live, self._in_time = False, 0
+        self._order_s, self._order_delay_s = -math.inf, math.nan
+        self._least_order_delay_s = self._least_s = math.inf
+        self._window: list[tuple[float, float, float]] = []
 
     def arrived(self, stamp_s: float, order_s: float, t_mono_s: float) -> None:
         """Record the arrival at `t_mono_s` of a picture with the stamp `stamp_s`. `order_s` is its decoding time stamp,
@@ -207,12 +200,6 @@ class StampedTime:
                 self._least_s = min(delays_s)
             self._window.clear()
         self._window.append((t_mono_s, delay_s, order_delay_s))
-
-    def _begin_anew(self) -> None:
-        self.is_live, self._in_time = False, 0
-        self._order_s, self._order_delay_s = -math.inf, math.nan
-        self._least_order_delay_s = self._least_s = math.inf
-        self._window = []
 
 
 class UnstampedTime:

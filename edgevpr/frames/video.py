@@ -76,13 +76,13 @@ class VideoSource(RecordingSource):
         return None
 
     def close(self) -> None:
-        self._has_ended = True
+        self.end()
         self._whole.close()
 
     def _decode_more(self) -> None:
         fetched = self._whole.fetch()
         if fetched is None:
-            self._end()
+            self._finish()
             return
         if fetched.packet.pts is not None:
             self._heard_s = max(self._heard_s, (fetched.packet.pts - self._first_stamp) * self._unit_s)
@@ -112,10 +112,10 @@ class VideoSource(RecordingSource):
             count,
         )
 
-    def _end(self) -> None:
+    def _finish(self) -> None:
         if self._damaged:
             self._tell_damaged(until=", to the end of the file, which may be cut short")
-        self._has_ended = True
+        self.end()
         seen_s = self._heard_s + self._frame_s
         if self._promised_s - seen_s > _CUT_S:
             raise ImageError(

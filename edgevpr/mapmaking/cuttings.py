@@ -40,11 +40,6 @@ class OrthophotoSource(RecordingSource):
             up_deg=0.0, footprint_m=footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2), is_surveyed=True
         )
 
-    @property
-    def ended(self) -> bool:
-        """True after the last place was read."""
-        return self._read == self.total
-
     def read(self, timeout_s: float) -> Frame | None:
         """Return the frame of the next place, None if that place is left out. Raises ImageError for a damaged part of
         the file; the next call continues with the place after it. `timeout_s` is ignored."""
@@ -53,6 +48,8 @@ class OrthophotoSource(RecordingSource):
         lattice, at = self._lattice, self._read
         row, column = map(_numbered, (lattice.rows[at], lattice.columns[at]), lattice.shape)
         self._read += 1
+        if self._read == self.total:
+            self.end()
         name = f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None

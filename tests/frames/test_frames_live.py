@@ -13,7 +13,7 @@ from fakes import FakeClock
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import streams
-from edgevpr.frames.live import DeviceCapture, LiveSource, wait_before_reopening_s
+from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition, Refusal, Shot
 from edgevpr.frames.source import open_source
 
@@ -306,32 +306,32 @@ def test_the_age_of_the_newest_picture_is_known():
     assert source.latency_s == pytest.approx(2.0)
 
 
-def test_the_wait_before_reopening_doubles_up_to_ten_seconds():
-    waits_s = [wait_before_reopening_s(failures) for failures in (1, 2, 3, 4, 5, 6, 7, 5000)]
-    assert waits_s == [0.5, 1, 2, 4, 8, 10, 10, 10]
+def test_the_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch):
+    waits_s = []
+    source = LiveSource(lambda: None, time.monotonic)
+    source.close()
+    monkeypatch.setattr(source._closing, "is_set", lambda: len(waits_s) == 7)
+    monkeypatch.setattr(source._closing, "wait", waits_s.append)
+    source._capture()
+    assert waits_s == [0.5, 1, 2, 4, 8, 10, 10]
 
 
 @pytest.mark.parametrize(
     ("uri", "complaint"),
     [
         ("/dev/video97", "There is nothing at `/dev/video97`: connect the camera"),
-        ("missing.sdp", "There is nothing at `missing.sdp`"),
         ("missing.mp4", "There is nothing at `missing.mp4`: give a folder of images, a video file, a camera"),
-        ("0", "There is nothing at `0`"),
-        ("rtmp://host/live", "rtmp:// is not understood: give a folder of images"),
-        ("rtsp:///camera", "names no host"),
-        ("udp://127.0.0.1", "names no port: write it like udp://HOST:PORT"),
-        ("tcp://:5000", "names no host"),
-        ("tcp://host:camera", "is not a proper address"),
-        ("http://[::1", "is not a proper address"),
-        ("rtsp://host:99999/x", "is not a proper address"),
+        *(
+            (uri, f"{uri} is no address of a stream")
+            for uri in ("rtmp://host/live", "rtsp:///camera", "udp://127.0.0.1", "tcp://:5000", "tcp://host:camera")
+        ),
+        ("http://[::1", "http://[::1 is no address"),
     ],
 )
 def test_what_can_never_be_opened_is_refused_at_once(uri, complaint):
     with pytest.raises(SourceError) as refusal:
         open_source(uri, live=True)
     assert complaint in str(refusal.value)
-    assert uri in str(refusal.value)
 
 
 @pytest.mark.parametrize("uri", ["udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", "/dev/null"])

@@ -95,47 +95,19 @@ def test_without_a_gimbal_the_nose_tells_the_heading_only(read):
     assert read(packet(attributes)) == GeoTag(heading_deg=270.0)
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-1e9", "361", "", "0/100", "north"])
+@pytest.mark.parametrize("value", ["nan", "-1e9", "361", "", "0/100", "north", "+-"])
 def test_a_senseless_value_is_unknown(read, value):
     assert read(packet(gimbal(10, value, 0))) == GeoTag()
     assert read(packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"<x:xmpmeta",
-        b"<x:xmpmeta></x:xmpmeta>",
-        b"</x:xmpmeta><x:xmpmeta>",
-        b"<x:xmpmeta \xff\xfe></x:xmpmeta>",
-        b"<x:xmpmeta xmlns:x='a'>&unknown;</x:xmpmeta>",
-        b"<x:xmpmeta xmlns:x='a'>" + b"<a>" * 20_000 + b"</x:xmpmeta>",
-        b"<x:xmpmeta xmlns:x='a'>" + b"<a>" * 9_000 + b"</a>" * 9_000 + b"</x:xmpmeta>",
-    ],
-)
-def test_rubbish_says_nothing(read, content):
-    assert read(content[:65_000]) == GeoTag()
-
-
-def test_entities_that_grow_are_never_read(read):
-    bomb = b'<!DOCTYPE x [<!ENTITY a "1111111111">' + b"".join(
-        f'<!ENTITY {chr(98 + n)} "{f"&{chr(97 + n)};" * 10}">'.encode() for n in range(9)
-    )
-    told = packet('drone-dji:RelativeAltitude="&j;"')
-    assert read(bomb + b"]>" + told) == GeoTag(), "an entity that was declared before the packet is unknown in it"
-    within = told.replace(b"<rdf:RDF", bomb + b"]><rdf:RDF").replace(b"&j;", b"40")
-    assert read(within) == GeoTag()
-
-
-def test_a_packet_that_is_too_large_or_too_far_is_left_alone(tmp_path):
-    path = tmp_path / "p.jpg"
+def test_only_numbers_of_the_first_packet_near_the_beginning_are_read(read, tmp_path):
     told = packet('drone-dji:RelativeAltitude="40"')
-    for content in (told.replace(b"<rdf:RDF", b" " * 70_000 + b"<rdf:RDF"), bytes(400_000) + told):
-        path.write_bytes(content)
-        assert read_xmp(path) == GeoTag()
-    path.write_bytes(bytes(200_000) + told)
-    assert read_xmp(path).height_m == 40.0
-    assert read_xmp(tmp_path) == read_xmp(tmp_path / "missing.jpg") == GeoTag()
+    assert read(told + packet('drone-dji:RelativeAltitude="50"')).height_m == 40.0
+    assert read(b'<!DOCTYPE x [<!ENTITY j "40">]>' + told.replace(b"40", b"&j;")) == GeoTag()
+    path = tmp_path / "p.jpg"
+    path.write_bytes(bytes(400_000) + told)
+    assert read_xmp(path) == read_xmp(tmp_path) == read_xmp(tmp_path / "missing.jpg") == GeoTag()
 
 
 def test_bytes_gone_wrong_never_raise(tmp_path):

@@ -67,7 +67,7 @@ def test_the_mask_that_check_learns_covers_the_display(folder, capsys):
 
 def test_a_mask_that_is_missing_is_said_to_be_the_mask(folder, tmp_path, capsys):
     missing = str(tmp_path / "nope.png")
-    said = f"The mask of `source.mask` (--mask) cannot be used: The image {missing} does not exist: check the name."
+    said = f"The mask of `source.mask` (--mask) cannot be used: The image {missing} cannot be read "
     (tmp_path / "c.yaml").write_text(
         f"map: {folder / 'masked.gpkg'}\nsource: {{uri: {folder / 'ref'}, mask: {missing}}}\nlog: {{path: null}}\n"
     )
