@@ -239,7 +239,7 @@ def gone(video):
         (wide_gap, 2, "later.csv that are at most 5 s apart"),
         (table_of_files, 2, "line 1 has no column `time`"),
         (no_video, 1, "later.mkv is not a video that can be decoded"),
-        (gone, 1, "later.mkv does not exist"),
+        (gone, 1, "later.mkv cannot be listed"),
         (bad_bytes, 1, "cannot be used, being damaged"),
         (cut_in_half, 1, "copy the video again"),
     ],
