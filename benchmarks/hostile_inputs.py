@@ -124,7 +124,7 @@ def kinds(ground: Ground) -> dict[str, st.SearchStrategy[Attempt]]:
         (*asked, "FILE"),
         (*asked, ground.pictures, "--positions", "FILE"),
         (*asked, ground.pictures, "--board", "FILE"),
-        *((*command, "--config", "FILE") for command in (("run",), ("check",), ("service",))),
+        *((*command, "--config", "FILE") for command in (("run",), ("check",), ("service", "print"))),
         ("models", "add", "FILE", "--card", "none.yaml"),
         ("models", "add", ground.network, "--card", "FILE"),
         (*data, ground.pictures, "--ground-truth", "FILE"),

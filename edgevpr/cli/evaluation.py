@@ -4,9 +4,8 @@ A set is a data set; a row is a technique with its settings, which is a row of t
 """
 
 import os
-import sys
 import tempfile
-from argparse import ArgumentTypeError, Namespace
+from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,6 @@ from edgevpr.cli.shared import (
     config_of,
     parameters_of,
     positive,
-    print_json,
     value_of,
 )
 from edgevpr.core.config import FORMS
@@ -28,8 +26,6 @@ from edgevpr.core.text import shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
-
-_MOST_WORKERS = 256
 
 
 def add(commands: Any) -> None:
@@ -90,12 +86,6 @@ def evaluate(args: Namespace) -> int:
     if args.similarity:
         return _measure_similarities(args)
     return _measure_many(args) if args.out else _measure_techniques(args)
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= _MOST_WORKERS:
-        raise ArgumentTypeError(f"`{text}` is no number of workers: give 1 to {_MOST_WORKERS}")
-    return int(text)
 
 
 def _measure_many(args: Namespace) -> int:
@@ -269,8 +259,3 @@ def _say_cameras(plan: "EvaluationPlan") -> None:
                 f"{name} is taken to look ahead: where its camera looks straight down, say `--camera nadir` "
                 "(`camera: nadir` in a file of sets)"
             )
-
-
-def _say(*sentences: str) -> None:
-    for sentence in sentences:
-        print(f"edgevpr: {shown(sentence)}", file=sys.stderr)

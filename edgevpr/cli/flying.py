@@ -15,16 +15,17 @@ from edgevpr.cli.shared import (
     command,
     config_of,
     exit_code,
-    frames_of,
+    group,
     leave_out,
     parameters_of,
     path_of,
-    print_json,
-)  # fmt: skip
+    show,
+)
 from edgevpr.core.config import Config, with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import shown
+from edgevpr.core.text import aligned, progress, shown, waiting
 
+_HEADINGS = ("query", "place", "reference image", "score", "accepted", "error m")
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
     "match.matching", "match.form", "match.candidates", "match.sequence",
@@ -57,21 +58,15 @@ def add(commands: Any) -> None:
     )
     check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
-    service = command(commands, "service", run_service, "print the systemd unit for a board, or install it all")
-    service.add_argument(
-        "action",
-        nargs="?",
-        choices=("print", "install", "uninstall"),
-        default="print",
-        help="install: user, folders, program, unit and udev rules; uninstall leaves maps, logs and configuration",
-    )
-    service.add_argument("--board", metavar="NAME", help="print: the board (default: this); else its configuration's")
-    service.add_argument(
-        "--config", metavar="FILE", help="print: the unit's; install: to become /etc/edgevpr/config.yaml"
-    )
-    service.add_argument(
-        "--dry-run", action="store_true", help="say what install and uninstall would do, and do nothing"
-    )
+    services = group(commands, "service", "print the systemd unit for a board, or install it all")
+    unit = command(services, "print", service_print, "print the unit")
+    unit.add_argument("--board", default="this", metavar="NAME", help="that it is for (default: this)")
+    unit.add_argument("--config", metavar="FILE", help="the configuration that it flies with")
+    install = command(services, "install", service_install, "install user, folders, program, unit and udev rules")
+    install.add_argument("--config", metavar="FILE", help="to become /etc/edgevpr/config.yaml")
+    uninstall = command(services, "uninstall", service_uninstall, "leaves maps, logs and configuration")
+    for each in (install, uninstall):
+        each.add_argument("--dry-run", action="store_true", help="say each step, and do nothing")
 
     doctor = command(
         commands, "doctor", run_doctor, "ask the flight controller, and this board, what to change; nothing is written"
@@ -84,7 +79,7 @@ def add(commands: Any) -> None:
 def run_match(args: Namespace) -> int:
     """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
     from edgevpr.core.geodesy import distance_m
-    from edgevpr.frames.source import open_source
+    from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.runtime.recognise.recognition import fields_of
@@ -97,7 +92,8 @@ def run_match(args: Namespace) -> int:
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)
-    for frame in frames_of(source, "matching", unusable):
+    frames = read_to_end(source, lambda error: leave_out(error, unusable))
+    for frame in filter(None, progress(frames, source.total, "matching")):
         event = recogniser.step(frame)
         if event.failed:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
@@ -108,21 +104,22 @@ def run_match(args: Namespace) -> int:
             away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
             fields["error_m"] = round(float(away_m), 2)
         found.append(fields)
-    if args.json:
-        print_json(found)
-    else:
-        print(f"{'query':<28} {'place':>6} {'reference image':<28} {'score':>6}  accepted  error m")
-        for each in found:
-            error = f"{each['error_m']:8.1f}" if "error_m" in each else "       -"
-            yes = "yes" if each["accepted"] else "no"
-            found_place = f"{'-':>6} {'(' + each['reason'].partition(':')[0] + ')':<28} {'-':>6}"
-            if each["place"] is not None:
-                found_place = f"{each['place']:>6} {shown(each['reference_image']):<28} {each['score']:6.3f}"
-            print(f"{shown(each['query']):<28} {found_place}  {yes:<8} {error}")
-        print(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
-        if weights := weights_of(recogniser.technique.spec):
-            print(f"Weights of {weights}.")
+    lines = aligned([_HEADINGS, *map(_matched, found)], left=3)
+    lines.append(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
+    if weights := weights_of(recogniser.technique.spec):
+        lines.append(f"Weights of {weights}.")
+    show(found, args.json, "\n".join(lines))
     return exit_code(unusable)
+
+
+def _matched(fields: dict[str, Any]) -> tuple[str, ...]:
+    """Return the row of a query in the table of `match`."""
+    accepted, off_m = "yes" if fields["accepted"] else "no", fields.get("error_m")
+    error = "-" if off_m is None else f"{off_m:.1f}"
+    if fields["place"] is None:
+        return shown(fields["query"]), "-", f"({fields['reason'].partition(':')[0]})", "-", accepted, error
+    image = shown(fields["reference_image"])
+    return shown(fields["query"]), str(fields["place"]), image, f"{fields['score']:.3f}", accepted, error
 
 
 def run_flight(args: Namespace) -> int:
@@ -137,7 +134,6 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Run `check`: try whether a flight can start with a configuration, and print what was found; or learn a mask."""
-    from edgevpr.core.text import waiting
     from edgevpr.runtime.service.check import check, learn_mask
     from edgevpr.runtime.service.finding import lines
 
@@ -152,31 +148,30 @@ def run_check(args: Namespace) -> int:
     return 0 if all(finding.ok for finding in findings) else 1
 
 
-def run_service(args: Namespace) -> int:
-    """Run `service`: print the systemd unit for a board, or install or uninstall the service on this machine."""
+def service_print(args: Namespace) -> int:
+    """Run `service print`: print the systemd unit for a board."""
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.service.install import install, uninstall
     from edgevpr.runtime.service.unit import render_unit
 
-    if args.action == "print":
-        if args.dry_run:
-            raise UsageError("--dry-run goes with `service install` and `service uninstall`: printing changes nothing.")
-        print(render_unit(load_board(args.board or "this"), args.config), end="")
-        return 0
-    if args.board:
-        raise UsageError(
-            "--board goes with printing: the service that is installed is for the board in its configuration."
-        )
-    if args.action == "install":
-        install(path_of(args.config), args.dry_run, _say)
-        _say("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
-        _say("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
-    elif args.config:
-        raise UsageError("--config goes with `service install`: uninstalling leaves the configuration as it is.")
-    else:
-        uninstall(args.dry_run, _say)
-    if args.dry_run:
-        _say("dry run: nothing was changed")
+    print(render_unit(load_board(args.board), args.config), end="")
+    return 0
+
+
+def service_install(args: Namespace) -> int:
+    """Run `service install`: install the service on this machine."""
+    from edgevpr.runtime.service.install import install
+
+    install(path_of(args.config), args.dry_run, _say)
+    _say("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
+    _say("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
+    return 0
+
+
+def service_uninstall(args: Namespace) -> int:
+    """Run `service uninstall`: remove the service from this machine."""
+    from edgevpr.runtime.service.install import uninstall
+
+    uninstall(args.dry_run, _say)
     return 0
 
 
@@ -186,7 +181,6 @@ def _say(line: str) -> None:
 
 def run_doctor(args: Namespace) -> int:
     """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
-    from edgevpr.core.text import waiting
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import doctor
     from edgevpr.runtime.service.finding import lines
@@ -196,9 +190,6 @@ def run_doctor(args: Namespace) -> int:
         raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
     diagnosis = doctor(config, address, waiting)
-    if args.json:
-        print_json({"link": str(address), "ok": diagnosis.is_fine, **asdict(diagnosis)})
-    else:
-        for line in lines(diagnosis.findings):
-            print(shown(line))
+    known = {"link": str(address), "ok": diagnosis.is_fine, **asdict(diagnosis)}
+    show(known, args.json, "\n".join(map(shown, lines(diagnosis.findings))))
     return 0 if diagnosis.is_fine else 1

@@ -9,13 +9,13 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import evaluation, flying, maps, networks, profile, replaying, review, simulation, top
+from edgevpr.cli import evaluation, flying, maps, networks, profile, review, simulation, top
 from edgevpr.cli.screen import LineFormatter, guarded_output
 from edgevpr.core.config import require_sayable
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
 
-_GROUPS = (maps, flying, top, review, replaying, profile, evaluation, simulation, networks)
+_GROUPS = (maps, flying, top, review, profile, evaluation, simulation, networks)
 
 
 def program() -> None:

@@ -1,54 +1,184 @@
-"""`edgevpr map`: look into, check, repair, merge and shrink place maps (`building` makes them); and `edgevpr
+"""`edgevpr map`: make, correct, calibrate, look into, check, repair, merge and shrink place maps; and `edgevpr
 salience`: print how memorable, static and full of information a picture is."""
 
-from argparse import ArgumentTypeError, Namespace
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import building
-from edgevpr.cli.shared import add_json, command, config_of, group, positive, print_json, watched
-from edgevpr.core.errors import UsageError
+from edgevpr.cli.shared import (
+    add_json,
+    add_keys,
+    add_parameters,
+    add_recording,
+    command,
+    config_of,
+    count,
+    exit_code,
+    group,
+    leave_out,
+    parameters_of,
+    path_of,
+    positive,
+    show,
+)
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
-    from edgevpr.places.examine import MapCheck
+    from edgevpr.mapmaking.making import Cuttings, FlownPictures
+
+_WITHOUT_POSITIONS = (
+    "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
+    "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
+    "video, give --positions with time,lat,lon, in seconds from its first frame"
+)
+_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "margin_m")
+_OF_A_RECORDING = ("positions", "rate_hz")
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = group(commands, "map", "build, look into, check, repair, merge and shrink place maps")
-    building.add(maps)
-    info = command(maps, "info", map_info, "say what a map holds")
-    info.add_argument("map", metavar="MAP")
-    add_json(info)
-    check = command(maps, "check", map_check, "read everything in a map, and say what is damaged")
-    check.add_argument("map", metavar="MAP")
-    add_json(check)
-    repair = command(maps, "repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged")
-    repair.add_argument("map", metavar="MAP")
+
+    def of_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
+        parser = command(maps, name, run, text)
+        parser.add_argument("map", metavar="MAP", help=more)
+        return parser
+
+    _add_build(of_map("build", map_build, "make a map of a flight, or of an orthophoto", "to make, e.g. valley.gpkg"))
+    refine = of_map("refine", map_refine, "find out where the pictures really lie, by matching them")
+    refine.add_argument(
+        "--images", metavar="DIR", help="the images that the map was made of: with them more pictures are tied"
+    )
+    add_json(refine)
+    calibrate = of_map("calibrate", map_calibrate, "find out how sure a map can be, with the pictures it is of")
+    _add_pictures(calibrate)
+    calibrate.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and precision")
+    add_keys(calibrate, "source.mask", "source.fov_deg", "source.up_deg")
+    add_json(calibrate)
+    add_json(of_map("info", map_info, "say what a map holds"))
+    add_json(of_map("check", map_check, "read everything in a map, and say what is damaged"))
+    of_map("repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged")
     merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
     merge.add_argument("out", metavar="OUT", help="the map file to make")
     merge.add_argument("maps", metavar="MAP", nargs="+")
-    smaller = command(maps, "shrink", map_shrink, "keep only the best places, spread over the map")
-    smaller.add_argument("map", metavar="MAP")
+    smaller = of_map("shrink", map_shrink, "keep only the best places, spread over the map")
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
     size = smaller.add_mutually_exclusive_group(required=True)
-    size.add_argument("--places", type=_number_of_places, metavar="N", help="as many places")
+    size.add_argument("--places", type=count, metavar="N", help="as many places")
     size.add_argument("--mb", type=positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
     worth.add_argument("--out", metavar="PNG", help="draw the picture with its three maps")
     worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
-    worth.add_argument("--network", metavar="NAME", help="the card of the network of memorability")
-    worth.add_argument("--detector", metavar="NAME", help="the card of the object detector")
     add_json(worth)
 
 
-def _number_of_places(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise ArgumentTypeError(f"`{text}` is no number of places: give 1 or more")
-    return int(text)
+def _add_build(build: ArgumentParser) -> None:
+    _add_pictures(build)
+    build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
+    add_parameters(build, "a parameter of the technique")
+    build.add_argument("--board", default="this", metavar="NAME", help="that will fly (default: this machine)")
+    build.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and salience")
+    add_keys(build, "source.camera", "source.mask", "source.fov_deg", "source.up_deg", "salience.use")
+    build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places a second of a video (default: all)")
+    build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
+    build.add_argument(
+        "--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure the map can be"
+    )
+    build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
+    add_json(build)
+
+
+def _add_pictures(parser: ArgumentParser) -> None:
+    """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
+    add_recording(parser, required=False)
+    flags = parser.add_argument_group("of an orthophoto, in place of --images")
+    flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
+    flags.add_argument("--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture")
+    flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
+    flags.add_argument(
+        "--area", metavar="FILE", help="only over this: a mission (waypoints, QGC .plan) or GeoJSON (default: all)"
+    )
+    flags.add_argument(
+        "--margin-m", type=float, metavar="M", help="this far beside the path of --area (default: the footprint)"
+    )
+
+
+def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
+    """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
+    from edgevpr.mapmaking.making import Cuttings, FlownPictures
+
+    if (args.source is None) == (args.orthophoto is None):
+        raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
+    others = _OF_AN_ORTHOPHOTO if args.orthophoto is None else _OF_A_RECORDING
+    if given := [name for name in others if getattr(args, name, None) is not None]:
+        source = "--orthophoto" if args.orthophoto is None else "--images"
+        raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
+    if args.source is not None:
+        rate_hz = getattr(args, "rate_hz", None)
+        return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
+    if args.footprint_m is None or args.spacing_m is None:
+        raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
+    if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):
+        raise UsageError(f"--margin-m {args.margin_m:g}: give 0 or more, with --area.")
+    return Cuttings(orthophoto=args.orthophoto, **{name: getattr(args, name) for name in _OF_AN_ORTHOPHOTO})
+
+
+def map_build(args: Namespace) -> int:
+    """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
+    from edgevpr.mapmaking.making import MapOrder, make_map
+
+    config = config_of(args, args.config)
+    order = MapOrder(
+        path=args.map,
+        pictures=_pictures(args),
+        technique=args.technique,
+        parameters=parameters_of(args.param),
+        board=args.board,
+        append=args.append,
+        refine=args.refine,
+        calibrate=args.calibrate,
+    )
+    unusable: list[ImageError] = []
+    made = make_map(order, config, lambda error: leave_out(error, unusable), progress)
+    more: dict[str, Any] = {"refined": asdict(made.refined)} if made.refined else {}
+    more |= {"calibration": made.calibration.figures()} if made.calibration else {}
+    more |= {} if made.without_data is None else {"without_data": made.without_data}
+    about = {"map": args.map, "technique": made.technique, "places": made.places}
+    show({**about, **asdict(made.result), **more}, args.json)
+    if made.places and not made.with_position and not args.json:
+        print(f"{args.map}: {_WITHOUT_POSITIONS}")
+    return exit_code(unusable)
+
+
+def map_refine(args: Namespace) -> int:
+    """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
+    from edgevpr.mapmaking.making import refine_map
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.opening import technique_of
+
+    with PlaceMap.open_for_adding(args.map) as place_map:
+        refined = refine_map(place_map, technique_of(place_map), args.images, progress)
+    show({"map": args.map, **asdict(refined)}, args.json)
+    return 0
+
+
+def map_calibrate(args: Namespace) -> int:
+    """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
+    from edgevpr.mapmaking.making import calibrate_map
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.runtime.recognise.opening import technique_of
+
+    config, pictures = config_of(args, args.config), _pictures(args)
+    with PlaceMap.open_for_adding(args.map) as place_map:
+        found = calibrate_map(place_map, technique_of(place_map), config, pictures, progress)
+    show({"map": args.map, "calibration": found.figures()}, args.json)
+    return 0
 
 
 def map_info(args: Namespace) -> int:
@@ -60,34 +190,12 @@ def map_info(args: Namespace) -> int:
 
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
-    spec = info.spec
-    ram_mb = info.places * bytes_per_place(spec) / 1e6
-    if args.json:
-        known = {"calibration": calibration.figures() if calibration else None}
-        print_json({**asdict(info), **known, "bytes_per_place": bytes_per_place(spec), "ram_mb": ram_mb})
-        return 0
-    settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
-    print(f"{info.path}: {info.places} places, {info.with_position} with a position")
-    print(f"  technique   {spec.name} ({settings})" + (f", model {spec.model_sha256}" if spec.model_sha256 else ""))
-    if info.extent:
-        south, west, north, east = info.extent
-        print(f"  extent      {south:.6f}..{north:.6f} north, {west:.6f}..{east:.6f} east")
-    if info.first_time:
-        print(f"  time        {info.first_time} to {info.last_time}")
-    if info.mean_quality is not None:
-        print(f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)")
-    if info.with_pose:
-        print(
-            f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; a picture shows "
-            f"{info.footprint_m:.0f} m of ground along its longest side"
-        )
-    if info.of_low_quality:
-        print(f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps")
-    if calibration:
-        print(f"  confidence  calibrated {calibration.made}: {calibration.described()}")
-    elif spec.name == WITH_CONFIDENCE:
-        print(f"  confidence  {not_calibrated(info.places)}")
-    print(f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})")
+    each_bytes = bytes_per_place(info.spec)
+    known: dict[str, Any] = {"calibration": calibration.figures() if calibration else None}
+    if calibration is None and info.spec.name == WITH_CONFIDENCE:
+        known["confidence"] = not_calibrated(info.places)
+    ram_mb = info.places * each_bytes / 1e6
+    show({**asdict(info), **known, "bytes_per_place": each_bytes, "ram_mb": ram_mb}, args.json)
     return 0
 
 
@@ -95,11 +203,8 @@ def map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check
 
-    found = check(args.map, watched("checking"))
-    if args.json:
-        print_json({**asdict(found), "is_whole": found.is_whole})
-    else:
-        _print_check(found)
+    found = check(args.map, partial(progress, label="checking"))
+    show({**asdict(found), "is_whole": found.is_whole}, args.json)
     return 0 if found.is_whole else 1
 
 
@@ -107,26 +212,14 @@ def map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check, repair
 
-    found = check(args.map, watched("checking"))
-    _print_check(found)
+    found = check(args.map, partial(progress, label="checking"))
+    show(found, as_json=False)
     if found.is_whole:
         print("nothing is damaged: the map is as it was")
         return 0
-    original = repair(args.map, watched("copying"))
+    original = repair(args.map, partial(progress, label="copying"))
     print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
     return 0
-
-
-def _print_check(found: "MapCheck") -> None:
-    print(f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read")
-    for place_id, problem in found.damaged:
-        print(f"  damaged     place {place_id}: {problem}")
-    for fault in found.faults:
-        print(f"  SQLite      {fault}")
-    if not found.faults:
-        print("  SQLite      the file is sound")
-    lacking = f"{found.without_checksums} places lack some: damage of those cannot be seen"
-    print(f"  checksums   {lacking if found.without_checksums else 'all match'}")
 
 
 def map_merge(args: Namespace) -> int:
@@ -149,7 +242,7 @@ def map_merge(args: Namespace) -> int:
                 merged.record_mask(*masks)
             for path, place_map in zip(args.maps, inputs, strict=True):
                 copied, already_here = absorb(merged, place_map)
-                print(f"{path}: {copied} places copied" + (f", {already_here} there already" if already_here else ""))
+                print(f"{path}: {copied} places copied, {already_here} there already")
             places = len(merged)
             were_calibrated = any(each.calibration is not None for each in inputs)
     print(f"{out}: {places} places")
@@ -164,13 +257,13 @@ def map_shrink(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapfiles import map_path
 
-    count = args.places
-    if count is None:
+    wanted = args.places
+    if wanted is None:
         with PlaceMap.open(args.map) as place_map:
-            count = places_in(int(args.mb * 1e6), place_map)
-        if count < 1:
+            wanted = places_in(int(args.mb * 1e6), place_map)
+        if wanted < 1:
             raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
-    kept, places = shrink(args.map, map_path(args.out), count)
+    kept, places = shrink(args.map, map_path(args.out), wanted)
     print(f"{args.out}: {kept} of {places} places")
     return 0
 
@@ -182,8 +275,7 @@ def run_salience(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.runtime.recognise.salience_gate import drawn_as_png, scores_of, worth_of
 
-    asked = {"salience.use": True, "salience.network": args.network, "salience.detector": args.detector}
-    gate = gate_of(config_of(args, args.config, **asked).salience)
+    gate = gate_of(config_of(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
     if args.out:
         require_folder(Path(args.out))
@@ -192,12 +284,6 @@ def run_salience(args: Namespace) -> int:
     worth = worth_of(scores_of(maps), gate.thresholds)
     if args.out:
         write_whole(Path(args.out), lambda path: path.write_bytes(drawn_as_png(image, maps, worth.salience)))
-    if args.json:
-        print_json(
-            {"image": args.image, **asdict(worth.salience), "kept": worth.reason is None, "reason": worth.reason}
-        )
-    else:
-        for name, score in worth.salience.scores.items():
-            print(f"{name:<13} {'off' if score is None else f'{score:.2f}'}")
-        print(worth.reason or "worth remembering")
+    known = {"kept": worth.reason is None, "reason": worth.reason}
+    show({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

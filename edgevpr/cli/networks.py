@@ -1,17 +1,13 @@
 """`edgevpr train` and `models`: train networks on your own pictures; list, try, add and quantise networks."""
 
-import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, print_json
+from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, show
 from edgevpr.core.errors import EdgevprError, ImageError, ModelError
-from edgevpr.core.text import shown
-
-if TYPE_CHECKING:
-    from edgevpr.runtime.preflight.networks import Verified
+from edgevpr.core.text import progress
 
 
 def add(commands: Any) -> None:
@@ -67,12 +63,8 @@ def train_calc(args: Namespace) -> int:
     from edgevpr.lab.training import job
 
     unusable: list[ImageError] = []
-    result = job.train_calc(args.images, Path(args.out), args.steps, args.seed, unusable)
-    said = (
-        f"{result.model} and {result.card}: {result.steps} steps on {result.pictures} images, equal to PyTorch to "
-        f"{result.largest_difference:.1e}"
-    )
-    return _learnt(args, result, said, unusable)
+    show(job.train_calc(args.images, Path(args.out), args.steps, args.seed, unusable), args.json)
+    return exit_code(unusable)
 
 
 def train_words(args: Namespace) -> int:
@@ -81,12 +73,8 @@ def train_words(args: Namespace) -> int:
 
     unusable: list[ImageError] = []
     wanted = words.WordsWanted(args.model, args.kind, args.count, args.whiten)
-    result = words.train_words(args.images, wanted, path_of(args.out), args.seed, unusable)
-    said = (
-        f"{result.file}: {args.count} words of {result.descriptors} descriptors in {result.pictures} images, mean "
-        f"square distance {result.distance:.3f}"
-    )
-    return _learnt(args, result, said, unusable)
+    show(words.train_words(args.images, wanted, path_of(args.out), args.seed, unusable), args.json)
+    return exit_code(unusable)
 
 
 def train_ground(args: Namespace) -> int:
@@ -94,20 +82,7 @@ def train_ground(args: Namespace) -> int:
     from edgevpr.lab.training.words import train_ground
 
     unusable: list[ImageError] = []
-    result = train_ground(args.images, Path(args.out), args.seed, unusable)
-    said = (
-        f"{result.file}: words of {result.descriptors} regions in {result.pictures} images, mean square distance "
-        f"{result.distance:.3f}"
-    )
-    return _learnt(args, result, said, unusable)
-
-
-def _learnt(args: Namespace, result: Any, said: str, unusable: list[ImageError]) -> int:
-    """Print the `result` of a training, as JSON or as the sentence `said`, and return the exit code."""
-    if args.json:
-        print_json(asdict(result))
-    else:
-        print(said)
+    show(train_ground(args.images, Path(args.out), args.seed, unusable), args.json)
     return exit_code(unusable)
 
 
@@ -116,19 +91,8 @@ def models_list(args: Namespace) -> int:
     from edgevpr.core.files import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
-    found = list_models()
-    if args.json:
-        print_json([asdict(each) for each in found])
-        return 0
-    for each in found:
-        print(f"{each.name:<20} {'WRONG' if each.problem else 'ok   '}  {each.title or ''}")
-        if each.title:
-            print(f"{'':<27} {each.licence}; {each.source}")
-            print(f"{'':<27} {each.file}; {' and '.join(each.outputs)}")
-            print(f"{'':<27} used by {', '.join(each.techniques) or 'none, unless told: --param model=' + each.name}")
-        if each.problem:
-            print(f"{'':<27} {each.problem}")
-    print(f"{len(found)} networks in {' and '.join(map(str, model_folders()))}")
+    folders = [str(folder) for folder in model_folders()]
+    show({"folders": folders, "networks": [asdict(each) for each in list_models()]}, args.json)
     return 0
 
 
@@ -143,17 +107,12 @@ def models_verify(args: Namespace) -> int:
     if not names:
         raise ModelError("There is no network yet: add one with `edgevpr models add FILE.onnx --card CARD.yaml`.")
     works, wrong = [], {}
-    for name in names:
+    for name in progress(names, len(names), "trying networks"):
         try:
-            works.append(verify(load_card(name), threads))
-            if not args.json:
-                print(_verified_text(works[-1]))
+            works.append(asdict(verify(load_card(name), threads)))
         except EdgevprError as error:
             wrong[name] = str(error)
-    if args.json:
-        print_json({"works": [asdict(each) for each in works], "wrong": wrong})
-    for name, problem in wrong.items():
-        print(f"edgevpr: {shown(name)} cannot be used: {shown(problem)}", file=sys.stderr)
+    show({"works": works, "wrong": wrong}, args.json)
     return 1 if wrong else 0
 
 
@@ -163,10 +122,7 @@ def models_add(args: Namespace) -> int:
     from edgevpr.runtime.preflight.networks import add
 
     verified, card = add(Path(args.file), Path(args.card), load_board("this").threads)
-    if args.json:
-        print_json({"card": str(card), **asdict(verified)})
-    else:
-        print(f"{_verified_text(verified)}\nadded as {card}")
+    show({"card": str(card), **asdict(verified)}, args.json)
     return 0
 
 
@@ -175,21 +131,5 @@ def models_quantise(args: Namespace) -> int:
     from edgevpr.lab.training.quantise import quantise
     from edgevpr.power.boards import load_board
 
-    result = quantise(args.name, Path(args.calibrate), load_board("this").threads)
-    if args.json:
-        print_json(asdict(result))
-        return 0
-    print(f"{_verified_text(result.before)}\n{_verified_text(result.after)}")
-    print(f"calibrated with {result.images} images, written as {result.card}")
+    show(quantise(args.name, Path(args.calibrate), load_board("this").threads), args.json)
     return 0
-
-
-def _verified_text(verified: "Verified") -> str:
-    shapes = ", ".join(f"{output} {'x'.join(map(str, shape))}" for output, shape in verified.shapes.items())
-    vector = f"a descriptor of {verified.vector_length} numbers, " if verified.vector_length else ""
-    return (
-        f"{verified.name}: {verified.title}\n"
-        f"  works: {shapes}; {vector}{verified.image_ms:.1f} ms an image, threads: {verified.threads}, "
-        f"{verified.network_mb:.0f} MB of RAM beside {verified.runtime_mb:.0f} of onnxruntime, "
-        f"{verified.file_mb:.2f} MB on disk"
-    )

@@ -1,13 +1,13 @@
 """`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
-import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_keys, command, print_json, value_of
+from edgevpr.cli.shared import add_json, add_keys, command, report, show, value_of
 from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.text import progress, require_picture
 
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
@@ -47,7 +47,6 @@ def _add_plan(parser: ArgumentParser) -> None:
 
 def profile(args: Namespace) -> int:
     """Run `profile`: estimate what each technique costs in a flight, or list, detect or measure boards."""
-    from edgevpr.core.text import progress, require_picture
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import preferred
     from edgevpr.runtime.preflight.estimate import estimate
@@ -79,24 +78,19 @@ def profile(args: Namespace) -> int:
         return 0
     stored, refused = load(Path(args.out) if args.measure and args.out else default_path())
     if refused:
-        print(f"edgevpr: {refused}", file=sys.stderr)
+        report(refused)
     trials = try_each(wanted, board.threads, stored.of if stored else lambda offer: None)
     trials = progress(trials, len(wanted), "trying techniques")
     here = scaled_from(load_board("this"), board, stored)
     result = estimate(board, here, trials, plan, map_technique, stored.date if stored else None)
     if args.plot:
         plot(result, Path(args.plot))
-    if args.json:
-        print_json(asdict(result))
-    else:
-        print(format_table(result))
+    show(result, args.json, format_table(result))
     return 0
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
-    """Return, from the flags: the plan of the flight;
-    the name of the technique of --map (None: no map is given);
-    the techniques to try, in all their forms."""
+    """Return, from the flags, the plan of the flight, the technique of --map, and what to try, in all its forms."""
     from edgevpr import techniques
     from edgevpr.core.config import load_config
     from edgevpr.places.mapfile import PlaceMap
@@ -129,28 +123,23 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tup
 
 
 def _detect(args: Namespace) -> int:
-    from edgevpr.power.boards import describe, detect, own_profile
+    from edgevpr.power.boards import detect, own_profile
     from edgevpr.power.speed import micro_benchmark
     from edgevpr.runtime.preflight.stored import write_profile
 
     found = detect()
-    if args.json:
-        print_json(found)
-    else:
-        print(describe(found))
+    show(found, args.json)
     if args.out:
         write_profile(Path(args.out), own_profile(micro_benchmark()))
-        print(f"edgevpr: {args.out} is written: use it with --board {args.out}.", file=sys.stderr)
-    elif found["board"] is None and not args.json:
-        print("--out FILE.yaml writes a profile of it.")
+        report(f"{args.out} is written: use it with --board {args.out}.")
+    elif found["board"] is None:
+        report("This board has no profile: --out FILE.yaml writes one.")
     return 0
 
 
 def _measure(args: Namespace, quiet: bool) -> None:
-    """Measure this machine, and store the figures. `quiet`: an estimate follows, which prints the only JSON of
-    --json."""
+    """Measure this machine, and store the figures. `quiet`: an estimate follows, which prints the JSON."""
     from edgevpr import techniques
-    from edgevpr.core.text import progress
     from edgevpr.power.boards import load_board
     from edgevpr.power.speed import micro_benchmark
     from edgevpr.runtime.preflight import stored
@@ -167,7 +156,6 @@ def _measure(args: Namespace, quiet: bool) -> None:
         own, power = stored.measured_profile(path, speed)
     except EdgevprError as error:
         own, power = None, str(error)
-    if args.json and not quiet:
-        print_json({**asdict(figures), "file": str(path), "profile": own and str(own), "power": power})
-    elif not args.json:
-        print(f"{format_stored(figures)}\nKept in {path}.\n{power}")
+    if not (args.json and quiet):
+        known = {**asdict(figures), "file": str(path), "profile": own and str(own), "power": power}
+        show(known, args.json, f"{format_stored(figures)}\nKept in {path}.\n{power}")

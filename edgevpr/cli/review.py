@@ -1,13 +1,18 @@
-"""Commands for after a flight: `edgevpr report` and `edgevpr export`, which both read the flight's log."""
+"""Commands for after a flight: `edgevpr report` and `edgevpr export`, which read its log, and `edgevpr replay`, which
+flies a recorded flight again on the ground."""
 
 import logging
 import sys
-from argparse import ArgumentTypeError, Namespace
-from pathlib import Path
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import command
+from edgevpr.cli.shared import add_json, command, path_of, show, write_out
 from edgevpr.core.errors import MapError, UsageError
+from edgevpr.core.text import waiting
 
 if TYPE_CHECKING:
     from edgevpr.review.logged import LoggedFlight
@@ -19,7 +24,7 @@ _log = logging.getLogger(__name__)
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     report = command(commands, "report", run_report, "make a page of a flight from its log, for any browser, offline")
-    _add_log(report)
+    report.add_argument("log", metavar="LOG")
     report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
     for flag, text in (
@@ -28,89 +33,104 @@ def add(commands: Any) -> None:
     ):
         report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
     export = command(commands, "export", run_export, "write matches, fixes and places of a flight, for a map viewer")
-    _add_log(export)
+    export.add_argument("log", metavar="LOG")
     form = export.add_mutually_exclusive_group(required=True)
     for name in ("geojson", "csv", "kml"):
         form.add_argument(f"--{name}", metavar="FILE", help="file to write, - for standard output")
-
-
-def _add_log(parser: Any) -> None:
-    parser.add_argument("log", metavar="LOG")
-    parser.add_argument("--flight", type=_number, metavar="N", help="the flight of the log, from 1 (default: the last)")
-
-
-def _number(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise ArgumentTypeError(f"`{text}` is no number of a flight: give 1 or more")
-    return int(text)
+    text = "fly a recorded flight again: the same, or with another configuration"
+    replay = command(commands, "replay", run_replay, text)
+    replay.add_argument("log", metavar="LOG", help="the flight log; its last flight is taken")
+    replay.add_argument("--map", metavar="MAP", help="the flight's map (default: where it was)")
+    replay.add_argument(
+        "--config", metavar="FILE", help="what if: fly with the keys of this file, and put both side by side"
+    )
+    add_json(replay)
 
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.core.files import require_folder, write_whole
+    from edgevpr.review.logged import text
     from edgevpr.review.page import Album, page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
-    out = _out(args.out, args.log)
-    require_folder(out)
-    flight = _read(args)
-    folder = recording_of(flight.recording, args.log)
+    flight = _read(args.log)
+    folder = recording_of(text(flight.start, "recording"), args.log)
     frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
-    page = page_of(flight, _ground(args.map, flight), frames, references)
-    write_whole(out, lambda unfinished: unfinished.write_text(page, "utf-8", "backslashreplace"))
-    print(f"{out}: {len(flight.queries)} queries, flight {flight.number} of {flight.flights} in {args.log}")
+    page = page_of(flight, _ground(args.map or flight.map_path, bool(args.map)), frames, references)
+    write_out(args.out, args.log, lambda out: out.write(page))
+    print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0
 
 
 def run_export(args: Namespace) -> int:
     """Run `export`: write the points of a flight (matches, fixes, places) as GeoJSON, CSV or KML."""
-    from edgevpr.core.files import require_folder, write_whole
     from edgevpr.review.export import WRITERS, features_of
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
-    features = features_of(_read(args))
-    write = WRITERS[form]
+    features = features_of(_read(args.log))
     if target == "-":
-        write(features, sys.stdout)
-        return 0
-    out = _out(target, args.log)
-    require_folder(out)
-
-    def written(unfinished: Path) -> None:
-        with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as handle:
-            write(features, handle)
-
-    write_whole(out, written)
-    print(f"{out}: {len(features)} points")
+        WRITERS[form](features, sys.stdout)
+    else:
+        write_out(target, args.log, partial(WRITERS[form], features))
+        print(f"{target}: {len(features)} points")
     return 0
 
 
-def _read(args: Namespace) -> "LoggedFlight":
+def _read(log: str) -> "LoggedFlight":
     from edgevpr.review.logged import read_flight
 
-    flight = read_flight(args.log, args.flight)
+    flight = read_flight(log)
     if flight.missing:
         _log.warning("%s", flight.missing)
     return flight
 
 
-def _out(target: str, log: str) -> Path:
-    out = Path(target)
-    if out.exists() and Path(log).exists() and out.samefile(log):
-        raise UsageError(f"{out} is the flight log itself: give another name.")
-    return out
-
-
-def _ground(given: str | None, flight: "LoggedFlight") -> "MapGround":
-    """Read the places of the map `given` or, if that is None, of the map that the log names. That one may be missing on
-    this machine: the result then says so."""
+def _ground(path: str | None, must_exist: bool) -> "MapGround":
+    """Read the places of the map at `path`. One that the log names may be missing here: the result then says so."""
     from edgevpr.review.overhead import MapGround, read_ground
 
-    if given:
-        return read_ground(given)
-    if flight.map_path is None:
+    if path is None:
         return MapGround(trouble="The log does not name a map: give it with --map.")
     try:
-        return read_ground(flight.map_path)
+        return read_ground(path)
     except (MapError, UsageError) as error:
+        if must_exist:
+            raise
         return MapGround(trouble=f"The map of the flight is not drawn: {error} Its place can be given with --map.")
+
+
+def run_replay(args: Namespace) -> int:
+    """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs from
+    the flight, but 0 with --config."""
+    from edgevpr.review.compare import beside, compare
+    from edgevpr.review.replay import recorded, replay
+
+    flight = recorded(args.log)
+    with _unheard(getattr(args, "debug", False)):
+        again = replay(flight, _say, args.map, path_of(args.config))
+    waiting("")
+    end = {"guessed": again.guessed, "why_ended": again.why_ended}
+    if args.config:
+        show({**beside(flight.lines, again.lines), **end}, args.json)
+        return 0
+    lines, packets = compare(flight.lines, again.lines), again.packets
+    is_same = not (lines.others or packets.others or packets.renumbered)
+    show({"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}, args.json)
+    return 0 if is_same else 1
+
+
+def _say(done: int, total: int) -> None:
+    waiting(f"replaying  {done}/{total}")
+
+
+@contextmanager
+def _unheard(debug: bool) -> Iterator[None]:
+    """Context manager: print only errors of the replayed flight (all with `debug`); its messages are in its journal."""
+    log = logging.getLogger("edgevpr")
+    before = log.level
+    if not debug:
+        log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)

@@ -19,12 +19,6 @@ def guarded_output() -> Iterator[None]:
         yield
 
 
-def erase_lines(count: int) -> None:
-    """Move the cursor `count` lines up, and clear the terminal from there. Only works inside `guarded_output`."""
-    if count and isinstance(sys.stdout, _Guarded):
-        sys.stdout.erase(count)
-
-
 class LineFormatter(logging.Formatter):
     """Formats each log message as one line, so that a file name with a line break cannot fake a second message. The
     traceback that follows an unexpected error keeps its lines."""
@@ -37,8 +31,7 @@ class LineFormatter(logging.Formatter):
 
 
 class _Guarded(io.TextIOBase):
-    """Text stream that passes what is written through `shown`, then to `stream`. It has the methods that `print`, the
-    progress lines and `erase_lines` use."""
+    """Text stream that passes what is written through `shown`, then to `stream`, for `print` and progress lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -50,9 +43,6 @@ class _Guarded(io.TextIOBase):
         except UnicodeEncodeError:  # a terminal that is not set to UTF-8
             self._stream.write(safe.encode("ascii", "backslashreplace").decode("ascii"))
         return len(text)
-
-    def erase(self, lines: int) -> None:
-        self._stream.write(f"\x1b[{lines}F\x1b[J")
 
     def flush(self) -> None:
         self._stream.flush()

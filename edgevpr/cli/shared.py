@@ -3,21 +3,20 @@
 import json
 import sys
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from edgevpr.core.config import Config, keys_of, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
 
-if TYPE_CHECKING:
-    from edgevpr.core.types import Frame
-    from edgevpr.frames.source import Source
-
 T = TypeVar("T")
 _KEY = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
-_RECORDING = "a folder of images or a video file"
+_UNITS = {
+    "s": " s", "ms": " ms", "m": " m", "mb": " MB", "bytes": " bytes", "c": " °C", "deg": "°", "mah": " mAh", "w": " W"
+}  # fmt: skip
 
 
 def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
@@ -47,7 +46,14 @@ def add_json(parser: ArgumentParser) -> None:
 
 def add_recording(parser: ArgumentParser, required: bool = True) -> None:
     """Add the flags for the images or the video that frames come from, and for their positions."""
-    parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=_RECORDING)
+    parser.add_argument(
+        "--images",
+        "--source",
+        dest="source",
+        required=required,
+        metavar="SOURCE",
+        help="a folder of images or a video file",
+    )
     add_positions(parser)
 
 
@@ -104,33 +110,60 @@ def path_of(text: str | None) -> Path | None:
     return Path(text) if text else None
 
 
-def frames_of(source: "Source", label: str, unusable: list[ImageError]) -> "Iterator[Frame]":
-    """Yield every frame of a source that ends (files, no camera), and show progress with `label`. An image that cannot
-    be used is left out: it is reported, and its error added to `unusable`."""
-    from edgevpr.core.text import progress
-    from edgevpr.frames.source import read_to_end
-
-    frames = read_to_end(source, lambda error: leave_out(error, unusable))
-    return (frame for frame in progress(frames, source.total, label) if frame is not None)
-
-
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
     """Report that an image cannot be used, and add the error to `unusable`."""
-    print(f"edgevpr: {shown(str(error))}", file=sys.stderr)
+    report(str(error))
     unusable.append(error)
 
 
 def exit_code(unusable: list[ImageError]) -> int:
     """Return the exit code: 1 if any image could not be used, and then print how many; else 0."""
     if unusable:
-        count = sum(error.count for error in unusable)
-        print(f"edgevpr: {count} images could not be used (named above).", file=sys.stderr)
+        report(f"{sum(error.count for error in unusable)} images could not be used (named above).")
     return 1 if unusable else 0
 
 
-def print_json(value: Any) -> None:
-    """Print a result as JSON, for programs."""
-    print(json.dumps(value, indent=2, default=str))
+def show(value: Any, as_json: bool, text: str | None = None) -> None:
+    """Print a result, a dataclass or a dictionary: as JSON for programs, or for people as `text` (None: a line for each
+    field)."""
+    fields = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+    if as_json:
+        print(json.dumps(fields, indent=2, default=str))
+    else:
+        print("\n".join(map(shown, lines_of(fields))) if text is None else text)
+
+
+def lines_of(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Yield a line of text for each field that is known: its name, and its value with the unit that ends the name. The
+    lines of a field that has fields itself are indented; a list of lists has one line for each."""
+    for name, value in fields.items():
+        words, _, ending = name.rpartition("_")
+        unit = _UNITS.get(ending, "") if words else ""
+        label = (words if unit else name).replace("_", " ")
+        for each in value if value and isinstance(value, list | tuple) and not _is_plain(value[0]) else [value]:
+            if isinstance(each, dict) and each:
+                yield f"{indent}{label}:"
+                yield from lines_of(each, f"{indent}  ")
+            elif each not in (None, "", (), [], {}):
+                yield f"{indent}{label:<18} {_worded(each)}{unit}"
+
+
+def _is_plain(value: Any) -> bool:
+    return not isinstance(value, dict | list | tuple)
+
+
+def _worded(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_worded, value))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def report(*sentences: str) -> None:
+    """Print sentences to stderr, each after the name of the program."""
+    for sentence in sentences:
+        print(f"edgevpr: {shown(sentence)}", file=sys.stderr)
 
 
 def positive(text: str) -> float:
@@ -141,8 +174,26 @@ def positive(text: str) -> float:
     return value
 
 
-def watched(label: str) -> "Callable[[Iterable[T], int], Iterator[T]]":
-    """Return a function that takes an iterable and its length, and yields its items while it shows progress."""
-    from edgevpr.core.text import progress
+def count(text: str) -> int:
+    """Read a whole number above zero, as the `type` of a flag. Raises ValueError for other texts."""
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
 
-    return lambda things, total: progress(things, total, label)
+
+def write_out(target: str, source: str, write: Callable[[TextIO], T]) -> T:
+    """Write the file `target`, whole or not at all, by calling `write` with it as an open text file, and return what
+    that returns. Raises UsageError if it is the file `source`, which was read, or has no folder."""
+    from edgevpr.core.files import require_folder, write_whole
+
+    path = Path(target)
+    if path.exists() and path.samefile(source):
+        raise UsageError(f"{target} is what was read: give another name.")
+    require_folder(path)
+
+    def written(unfinished: Path) -> T:
+        with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as out:
+            return write(out)
+
+    return write_whole(path, written)

@@ -2,11 +2,10 @@
 demonstrate all steps from map to match."""
 
 from argparse import Namespace
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, print_json
+from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, show
 from edgevpr.core.errors import UsageError
 
 # The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
@@ -71,10 +70,7 @@ def simulate_autopilot(args: Namespace) -> int:
         gps=has_gps,
         parameters=parameters_of(args.param, _PARAMETER),
     )
-    if args.json:
-        print_json(asdict(summary))
-    else:
-        print(summary)
+    show(summary, args.json, str(summary))
     return 0
 
 

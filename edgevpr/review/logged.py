@@ -1,7 +1,8 @@
 """Reads a flight log into checked values, for the report and the exports. A field that a log lacks, or that is damaged
 or of another type, becomes None."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ class FixOutcome(Enum):
     KEPT = "fix not sent"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class LoggedFix:
     """The fix of a query: its outcome, `why` it was not sent or not taken (None: no reason is given), its position `at`
     (None: there was nothing to send), and the time until the autopilot's answer, `latency_ms` (None: unknown)."""
@@ -84,14 +85,12 @@ class Remark:
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
-    """One flight of a log, which has `flights` of them; `number` counts from 1. `start` and `end` are its first and
-    last line ({}: missing). `unusable` are times (seconds after the start) of frames that never became queries,
-    `learnt` the positions of places learnt in flight. `missing` is a sentence about files of the flight that are not
-    there (None: all are). `span_s` is the length of the flight."""
+    """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `unusable` are times
+    (seconds after the start) of frames that never became queries, `learnt` the positions of places learnt in flight.
+    `missing` is a sentence about files of the flight that are not there (None: all are). The flight began at `start_s`
+    on its monotonic clock (None: unknown), and is `span_s` long."""
 
     path: Path
-    number: int
-    flights: int = 0
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)
@@ -99,6 +98,7 @@ class LoggedFlight:
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
     missing: str | None = None
+    start_s: float | None = None
     span_s: float = 0.0
 
     @property
@@ -106,138 +106,108 @@ class LoggedFlight:
         """The path of the map in the first line; None if there is none."""
         return text(self.start, "map")
 
-    @property
-    def recording(self) -> str | None:
-        """The folder of the recording in the first line; None if there is none."""
-        return text(self.start, "recording")
+    def since_start(self, t_mono_s: float | None) -> float:
+        """Return the seconds from the start to `t_mono_s`; None stands for the latest time so far."""
+        if t_mono_s is None:
+            return self.span_s
+        self.start_s = t_mono_s if self.start_s is None else self.start_s
+        return max(0.0, t_mono_s - self.start_s)
 
 
-def read_flight(path: str | Path, number: int | None = None) -> LoggedFlight:
-    """Read one flight of a log: that of `number` (1, 2, ...; None: the last in the file). If it began in an earlier
-    file of the log, that is read too. `wholeflight.flight_of` explains this, and what is raised."""
-    lines = flight_of(path, number)
-    flight = LoggedFlight(path=lines.path, number=lines.number, flights=lines.flights, missing=lines.missing)
+def read_flight(path: str | Path) -> LoggedFlight:
+    """Read the last flight of a log. `wholeflight.flight_of` explains this, and what is raised."""
+    lines = flight_of(path)
+    flight = read_lines(lines, lines.path)
+    flight.missing = lines.missing
     if lines.missing:
-        flight.remarks.append(Remark(0.0, "missing", lines.missing))
-    reading = _Reading(flight)
-    for line in lines:
-        reading.read(line["kind"], line)
+        flight.remarks.insert(0, Remark(0.0, "missing", lines.missing))
     return flight
 
 
-class _Reading:
-    """Fills a `LoggedFlight` from the lines of its log, given one by one in their order."""
-
-    def __init__(self, flight: LoggedFlight) -> None:
-        self.flight = flight
-        self._at: dict[str, int] = {}  # the number of a query by its name
-        self._cpu_s = self._elapsed_s = 0.0
-        self._start_s: float | None = None
-
-    def read(self, kind: str, line: dict[str, Any]) -> None:
-        """Add one line of this `kind` to the flight."""
-        flight, t_s = self.flight, self._since_start(number(line, "t_mono_s"))
+def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
+    """Read a flight from the lines of its log, in their order."""
+    flight, queries = LoggedFlight(path=path), dict[str, LoggedQuery]()
+    before = 0.0, 0.0
+    for line in lines:
+        kind, t_s = line.get("kind"), flight.since_start(number(line, "t_mono_s"))
         flight.span_s = max(flight.span_s, t_s)
         if kind == "start":
             flight.start = line
         elif kind == "end":
             flight.end = line
         elif kind == "query":
-            self._take_answer(line, "last_fix", "answer")
-            self._at[text(line, "query") or ""] = len(flight.queries)
-            flight.queries.append(self._query(line, t_s))
+            now = number(line, "totals", "process_cpu_s"), number(line, "totals", "elapsed_s")
+            cores = None
+            if now[0] is not None and now[1] is not None and now[1] > before[1]:
+                cores = max(0.0, (now[0] - before[0]) / (now[1] - before[1]))
+                before = now[0], now[1]
+            query = queries[text(line, "query") or ""] = _query(line, flight, cores)
+            flight.queries.append(query)
         elif kind == "answer":
-            self._take_answer({"answer": line}, "answer", "result")
+            _take_answer(queries.get(text(line, "query") or ""), line)
         elif kind == "unusable":
             flight.unusable.append(t_s)
         elif kind == "learnt":
             flight.learnt += filter(None, [point(line, "position")])
         else:
-            flight.remarks.append(Remark(t_s, kind, _words(line)))
+            flight.remarks.append(Remark(t_s, str(kind), _words(line)))
+    return flight
 
-    def _since_start(self, t_mono_s: float | None) -> float:
-        """Return the seconds from the first line with a time to `t_mono_s`; None stands for the latest time so far."""
-        if t_mono_s is None:
-            return self.flight.span_s
-        if self._start_s is None:
-            self._start_s = t_mono_s
-        return max(0.0, t_mono_s - self._start_s)
 
-    def _take_answer(self, line: dict[str, Any], key: str, answer: str) -> None:
-        """Update the fix of an earlier query. `key` is the object in `line` that tells of it; its field `answer` is the
-        autopilot's answer."""
-        at, told = self._at.get(text(line, key, "query") or ""), value(line, key)
-        if at is None or not isinstance(told, dict):
-            return
-        query = self.flight.queries[at]
-        if query.fix is None or (query.fix.outcome is not FixOutcome.UNANSWERED and key == "last_fix"):
-            return  # a line of kind "answer" has said more
-        fix = replace(
-            query.fix,
-            outcome=_outcome(told, told.get(answer)),
-            why=text(told, "why") or query.fix.why,
-            latency_ms=number(told, "latency_ms") or query.fix.latency_ms,
-        )
-        self.flight.queries[at] = replace(query, fix=fix)
+def _take_answer(query: LoggedQuery | None, line: dict[str, Any]) -> None:
+    """Note in the fix of a query what became of it."""
+    if query and query.fix:
+        query.fix.outcome = _outcome(line, line.get("result"))
+        query.fix.why = text(line, "why") or query.fix.why
+        query.fix.latency_ms = number(line, "latency_ms")
 
-    def _query(self, line: dict[str, Any], t_s: float) -> LoggedQuery:
-        t_frame_s = number(line, "t_frame_s")
-        accepted = line.get("accepted") is True
-        at = point(line, "located") or point(line, "position") if accepted else None
-        gps_at = _gps_at(line, t_frame_s)
-        is_heard = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
-        autopilot_at = point(line, "vehicle") if is_heard else None
-        # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
-        truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
-        # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
-        confidences = number(line, "confidence"), number(line, "followed", "confidence")
-        encode_s, match_s = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
-        place, latency_s = number(line, "place"), number(line, "totals", "latency_s")
-        return LoggedQuery(
-            name=text(line, "query") or "",
-            t_s=t_s if t_frame_s is None else self._since_start(t_frame_s),
-            time=text(line, "time") or "",
-            accepted=accepted,
-            reason=text(line, "reason") or "no reason is given",
-            confidence=max((known for known in confidences if known is not None), default=None),
-            score=number(line, "score"),
-            place=None if place is None else int(place),
-            reference_image=text(line, "reference_image"),
-            at=at,
-            accuracy_m=number(line, "accuracy_m"),
-            place_at=point(line, "position"),
-            autopilot_at=autopilot_at,
-            gps_at=gps_at,
-            off_m=float(distance_m(*truth, *at)) if truth and at else None,
-            fix=_fix(line),
-            wall_ms=None if encode_s is None or match_s is None else 1e3 * (encode_s + match_s),
-            latency_ms=None if latency_s is None else 1e3 * latency_s,
-            cores=self._cores(line),
-            rss_mb=number(line, "costs", "rss_mb"),
-            temperature_c=number(line, "board", "temperature_c"),
-            used_mah=number(line, "totals", "used_mah"),
-            has_link=is_heard if "vehicle" in line else None,
-        )
 
-    def _cores(self, line: dict[str, Any]) -> float | None:
-        cpu_s, elapsed_s = number(line, "totals", "process_cpu_s"), number(line, "totals", "elapsed_s")
-        if cpu_s is None or elapsed_s is None or elapsed_s <= self._elapsed_s:
-            return None
-        busy = (cpu_s - self._cpu_s) / (elapsed_s - self._elapsed_s)
-        self._cpu_s, self._elapsed_s = cpu_s, elapsed_s
-        return max(0.0, busy)
+def _query(line: dict[str, Any], flight: LoggedFlight, cores: float | None) -> LoggedQuery:
+    t_frame_s = number(line, "t_frame_s")
+    accepted = line.get("accepted") is True
+    at = point(line, "located") or point(line, "position") if accepted else None
+    gps_at = _gps_at(line, t_frame_s)
+    is_heard = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
+    autopilot_at = point(line, "vehicle") if is_heard else None
+    # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
+    truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
+    # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
+    confidences = number(line, "confidence"), number(line, "followed", "confidence")
+    encode_s, match_s = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
+    place, latency_s = number(line, "place"), number(line, "totals", "latency_s")
+    return LoggedQuery(
+        name=text(line, "query") or "",
+        t_s=flight.since_start(number(line, "t_mono_s") if t_frame_s is None else t_frame_s),
+        time=text(line, "time") or "",
+        accepted=accepted,
+        reason=text(line, "reason") or "no reason is given",
+        confidence=max((known for known in confidences if known is not None), default=None),
+        score=number(line, "score"),
+        place=None if place is None else int(place),
+        reference_image=text(line, "reference_image"),
+        at=at,
+        accuracy_m=number(line, "accuracy_m"),
+        place_at=point(line, "position"),
+        autopilot_at=autopilot_at,
+        gps_at=gps_at,
+        off_m=float(distance_m(*truth, *at)) if truth and at else None,
+        fix=_fix(line),
+        wall_ms=None if encode_s is None or match_s is None else 1e3 * (encode_s + match_s),
+        latency_ms=None if latency_s is None else 1e3 * latency_s,
+        cores=cores,
+        rss_mb=number(line, "costs", "rss_mb"),
+        temperature_c=number(line, "board", "temperature_c"),
+        used_mah=number(line, "totals", "used_mah"),
+        has_link=is_heard if "vehicle" in line else None,
+    )
 
 
 def _fix(line: dict[str, Any]) -> LoggedFix | None:
     told = value(line, "fix")
     if not isinstance(told, dict):
         return None
-    return LoggedFix(
-        outcome=_outcome(told, told.get("answer")),
-        why=text(told, "why"),
-        at=point(told),
-        accuracy_m=number(told, "accuracy_m"),
-    )
+    outcome = _outcome(told, told.get("answer"))
+    return LoggedFix(outcome=outcome, why=text(told, "why"), at=point(told), accuracy_m=number(told, "accuracy_m"))
 
 
 def _outcome(told: dict[str, Any], answer: object) -> FixOutcome:

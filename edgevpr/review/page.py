@@ -112,7 +112,7 @@ def _known(flight: LoggedFlight) -> Iterator[str]:
     ):
         if known:
             yield f"{name} {known}"
-    yield f"{flight.path}, flight {flight.number} of {flight.flights}"
+    yield str(flight.path)
 
 
 def _figures(flight: LoggedFlight) -> str:

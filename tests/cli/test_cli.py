@@ -59,7 +59,7 @@ def test_map_info_tells_what_is_inside(capsys, valley):
     assert info["places"] == info["with_position"] == 6
     assert info["spec"]["name"] == "cohog"
     assert main(["map", "info", str(valley)]) == 0
-    assert "6 with" in capsys.readouterr().out
+    assert "with position      6\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -79,12 +79,6 @@ def test_match_finds_every_place_and_says_what_it_cost(capsys, flight, valley):
 
 
 @pytest.mark.slow
-def test_a_match_below_the_threshold_is_not_accepted(capsys, flight, valley):
-    found = run_json(capsys, "match", valley, "--images", flight / "query", "--min-score", "0.9999", "--json")
-    assert not any(each["accepted"] for each in found)
-
-
-@pytest.mark.slow
 def test_more_precision_accepts_no_more(capsys, flight, valley):
     def accepted(precision):
         flags = ("--images", flight / "query", "--accept-precision", precision, "--json")
@@ -93,20 +87,8 @@ def test_more_precision_accepts_no_more(capsys, flight, valley):
         return {each["query"] for each in found if each["accepted"]}
 
     assert accepted("0.999999") <= accepted("0.99") <= accepted("0.5")
-
-
-@pytest.mark.parametrize("precision", ["0.4", "1", "nan"])
-def test_a_precision_that_nothing_can_have_is_refused(capsys, flight, valley, precision):
-    code, said = refused(capsys, "match", valley, "--images", flight / "query", "--accept-precision", precision)
-    assert code == 2
-    assert "`match.accept_precision` is" in said
-
-
-@pytest.mark.slow
-def test_a_setting_of_the_technique_is_used_for_matching(capsys, flight, valley):
-    by_flag = run_json(capsys, "match", valley, "--images", flight / "query", "--matching", "thesis", "--json")
-    by_param = run_json(capsys, "match", valley, "--images", flight / "query", "--param", "matching=thesis", "--json")
-    assert [each["score"] for each in by_param] == [each["score"] for each in by_flag]
+    found = run_json(capsys, "match", valley, "--images", flight / "query", "--min-score", "0.9999", "--json")
+    assert not any(each["accepted"] for each in found)
 
 
 @pytest.mark.slow
@@ -163,11 +145,7 @@ def test_a_broken_off_map_is_continued(capsys, flight, tmp_path):
     run_json(capsys, "map", "build", path, "--images", half, "--technique", "cohog", "--json")
     built = run_json(capsys, "map", "build", path, "--images", flight / "ref", "--append", "--json")
     assert (built["added"], built["already_here"], built["places"]) == (3, 3, 6)
-
-
-def test_another_flight_whose_camera_starts_its_numbers_anew_is_added(capsys, flight, tmp_path):
-    path = tmp_path / "m.gpkg"
-    run_json(capsys, "map", "build", path, "--images", flight / "ref", "--technique", "cohog", "--json")
+    # Another flight, whose camera starts its numbers anew, is added too.
     built = run_json(capsys, "map", "build", path, "--images", flight / "query", "--append", "--json")
     assert (built["added"], built["already_here"], built["places"]) == (6, 0, 12)
 
@@ -248,6 +226,7 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", ""], "no MAVLink link"),
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
+        (["match", valley, "--images", query, "--accept-precision", "nan"], "`match.accept_precision` is"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
         (["match", valley, "--images", query, "--battery", "lots"], "battery pack `lots`"),
         (["run", "--config", config], "did you mean `match`"),

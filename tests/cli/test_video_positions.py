@@ -21,7 +21,7 @@ def test_a_map_of_a_video_has_the_positions_of_its_table(flight, tmp_path, capsy
     path = tmp_path / "valley.gpkg"
     command = ["map", "build", str(path), "--images", str(video), "--technique", "hog", "--rate-hz", "2.5"]
     assert main([*command, "--positions", str(table)]) == 0
-    assert "8 in all" in capsys.readouterr().out
+    assert "places             8\n" in capsys.readouterr().out
     with PlaceMap.open(path) as place_map:
         placed = [place for place in place_map.places() if place.position]
     assert [round(place.position.lon_deg, 9) for place in placed] == [8.0006, 8.0014, 8.0022, 8.003]

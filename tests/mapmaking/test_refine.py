@@ -112,8 +112,8 @@ def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
     main(["map", "refine", str(map_path)])
     assert positions() == first
     said = capsys.readouterr().out
-    assert "28 of 28" in said
-    assert "amiss       place 10 (009.jpg): recorded 2" in said
+    assert "refined            28\n" in said
+    assert "contradictory      10, 009.jpg, 2" in said
 
 
 def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
@@ -163,13 +163,13 @@ def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir"]
     assert main(["map", "build", str(path), *flags]) == 0
-    assert "28 of 28" in capsys.readouterr().out
+    assert "  refined            28\n" in capsys.readouterr().out
     with PlaceMap.open(path) as place_map:
         poses = [place.pose for place in place_map.places()]
     assert [pose.footprint_m for pose in poses] == pytest.approx([FOOTPRINT_M] * 28, rel=0.15)
     assert all(pose.recorded for pose in poses)
     assert main(["map", "info", str(path)]) == 0
-    assert "of 28 places" in capsys.readouterr().out
+    assert "with pose          28\n" in capsys.readouterr().out
 
 
 def some_of(built, path, numbers, position=lambda number, place: place.position):
@@ -240,7 +240,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
 def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
-    assert "refined, by" not in capsys.readouterr().out, "a map of another kind is built as it was"
+    assert "refined" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert main(["map", "refine", str(path)]) == 2
     assert "--camera nadir" in capsys.readouterr().err
 

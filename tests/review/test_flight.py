@@ -42,22 +42,12 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
     assert flight.queries[1].fix.why == "denied"
 
 
-def test_the_next_query_knows_of_an_answer_too(tmp_path):
-    later = query("b", last_fix=query("a")["fix"] | {"answer": "FAILED"})
-    flight = read_flight(write_log(tmp_path / "log", ("query", query("a")), ("query", later)))
-    assert outcomes(flight) == [FixOutcome.REFUSED, FixOutcome.UNANSWERED]
-
-
-def test_the_last_of_several_flights_is_taken_unless_another_is_asked_for(tmp_path):
+def test_the_last_of_several_flights_is_taken(tmp_path):
     log, newer = write_log(tmp_path / "log", ("query", query("a")), end=False), tmp_path / "newer"
     write_log(newer, ("query", query("b")), ("query", query("c")))
     with open(log, "ab") as handle:
         handle.write(newer.read_bytes())
     assert [each.name for each in read_flight(log).queries] == ["b", "c"]
-    first = read_flight(log, 1)
-    assert ([each.name for each in first.queries], first.end, first.flights) == (["a"], {}, 2)
-    with pytest.raises(UsageError, match="1 to 2"):
-        read_flight(log, 3)
 
 
 def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark(tmp_path):
@@ -94,7 +84,7 @@ def test_a_log_without_a_first_line_is_a_flight(tmp_path):
     log = tmp_path / "log"
     log.write_text(json.dumps({"kind": "query", "t_mono_s": 5.0} | query("a")) + "\n")
     flight = read_flight(log)
-    assert (flight.start, len(flight.queries), flight.flights) == ({}, 1, 1)
+    assert (flight.start, len(flight.queries)) == ({}, 1)
 
 
 def test_values_of_a_wrong_type_are_unknown(tmp_path):

@@ -158,10 +158,9 @@ def test_places_of_a_map_are_read(flown):
 @pytest.mark.parametrize(
     ("argv", "code", "said"),
     [
-        (["LOG", "--out", "LOG"], 2, "is the flight log itself"),
+        (["LOG", "--out", "LOG"], 2, "give another name"),
         (["LOG", "--out", "no/such/out.html"], 2, "there is no such folder: make it first"),
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
-        (["LOG", "--out", "out.html", "--flight", "2"], 2, "holds 1: give 1 to 1"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
         (["LOG", "--out", "out.html", "--images", "gone"], 2, "there is no such folder"),
         (["empty", "--out", "out.html"], 1, "holds no line of a flight log"),

@@ -142,13 +142,6 @@ def test_a_wrong_request_gets_one_sentence(out, tmp_path, monkeypatch, capsys, a
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize("count", ["0", "-1", "x", "1000"])
-def test_a_wrong_number_of_workers_is_refused(count, capsys):
-    with pytest.raises(SystemExit):
-        run("--data", "x", "--out", "y", "--workers", count)
-    assert "256" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("flags", [[], ["--out", "results"]])
 def test_a_camera_that_nobody_has_named_is_said_to_look_ahead(tmp_path, monkeypatch, capsys, flags):
     monkeypatch.chdir(tmp_path)

@@ -322,19 +322,6 @@ def test_only_root_may_change_the_system():
     assert [line.split()[:2] for line in done.stdout.splitlines()] == 2 * [["Only", "root"]]
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--dry-run"], "--dry-run"),
-        (["install", "--board", "rpi-5"], "--board"),
-        (["uninstall", "--config", "x.yaml"], "--config"),
-    ],
-)
-def test_flags_that_would_be_passed_over_are_refused(words, named, capsys):
-    assert main(["service", *words]) == 2
-    assert capsys.readouterr().err.startswith(f"edgevpr: {named} ")
-
-
 def test_the_program_that_was_installed_installs_itself_elsewhere_without_a_network(installed, system, packages):
     """From the wheel's layout, where the shipped folders lie inside, as from a checkout."""
     script = (

@@ -1,6 +1,5 @@
 """The status of a flight that is a process of its own, and `edgevpr top` on a terminal and off it."""
 
-import json
 import os
 import pty
 import re
@@ -62,8 +61,6 @@ def test_a_flight_tells_its_status_opens_no_port_and_removes_its_file(fly, tmp_p
     for label in ("edgevpr", "frames", "rate", "queries", "CPU", "RAM", "heat", "charge", "match", "newest", "link"):
         assert shown[label]
     assert re.search(r"place \d+ \(\d\d\.png\), confidence 0\.9\d+|confidence 1\.0000", shown["match"])
-    assert main(["top", "--file", str(path), "--once", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["accepted"] >= 1
     run.terminate()
     said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, said
@@ -127,10 +124,9 @@ def test_on_a_terminal_it_draws_over_what_it_drew_and_within_its_size(fly, tmp_p
         run.terminate()
         run.communicate(timeout=PATIENCE_S)
         wait_for_words("no flight tells", times=seen.count("no flight tells") + 1)
-    blocks = re.split(r"\x1b\[\d+F\x1b\[J", seen)
+    blocks = re.split(r"\x1b\[H\x1b\[J", seen)
     assert len(blocks) > 3
     assert "\x1b" not in "".join(blocks)
     for block in blocks:
         assert len(block.splitlines()) <= 11
         assert all(len(line) < 60 for line in block.splitlines())
-    assert "\x1b[11F\x1b[J" in seen
