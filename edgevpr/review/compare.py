@@ -4,6 +4,7 @@ by byte, and the queries. In names here, "then" is the flight and "now" its repl
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,7 +24,7 @@ _COMPARED = ("accepted", "reason", "place", "confidence", "at", "off_m")  # of a
 PROGRAM = "version", "machine", "python", "libraries"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
     """A line that differs: its kind, its time and the name of its query (None: it is about no query). `fields` has the
     fields that differ, by dotted name (like "fix.sent"). `only_in` is "flight" or "replay" if the other log has no such
@@ -32,7 +33,7 @@ class Difference:
     kind: str
     t_mono_s: float
     query: str | None
-    fields: Changes
+    fields: Changes = field(default_factory=dict)
     only_in: str | None = None
 
 
@@ -51,26 +52,26 @@ def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
     """Compare the lines of a flight's log with those of its replay. If a full disk has cost the flight lines (its log
     then has a line of kind "gap"), lines that only the replay has are no differences."""
     before, after, found = _keyed(then), _keyed(now), Lines()
+    has_gaps = any(kind == "gap" for kind, *_ in before)
     last_s = max((t_s for _, t_s, *_ in after), default=0.0)
-    for key, line in before.items():
+    for key in before | after:
         kind, t_s, query, _ = key
-        if kind == "gap":
-            continue
-        if key not in after:
+        differs = partial(Difference, kind=kind, t_mono_s=t_s, query=query)
+        if key not in before:
+            found.others += [] if has_gaps else [differs(only_in="replay")]
+        elif key not in after:
             if t_s > last_s:
-                found.after += 1
-            else:
-                found.others.append(Difference(kind, t_s, query, {}, "flight"))
-            continue
-        fields = dict(_differing(line, after[key]))
-        if kind == "start":
-            found.program = {name: each for name, each in fields.items() if name.partition(".")[0] in PROGRAM}
-        if others := {name: each for name, each in fields.items() if name not in found.program}:
-            found.others.append(Difference(kind, t_s, query, others))
+                found.after += kind != "gap"
+            elif kind != "gap":
+                found.others.append(differs(only_in="flight"))
         else:
-            found.alike += 1
-    if not any(kind == "gap" for kind, *_ in before):
-        found.others += [Difference(key[0], key[1], key[2], {}, "replay") for key in after if key not in before]
+            fields = dict(_differing(before[key], after[key]))
+            if kind == "start":
+                found.program = {name: each for name, each in fields.items() if name.partition(".")[0] in PROGRAM}
+            if others := {name: each for name, each in fields.items() if name not in found.program}:
+                found.others.append(differs(fields=others))
+            else:
+                found.alike += 1
     return found
 
 

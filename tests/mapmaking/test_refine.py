@@ -240,7 +240,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
 def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
-    assert "refined" not in capsys.readouterr().out, "a map of another kind is built as it was"
+    assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert main(["map", "refine", str(path)]) == 2
     assert "--camera nadir" in capsys.readouterr().err
 
