@@ -16,13 +16,16 @@ from edgevpr.cli.shared import (
     add_parameters,
     command,
     config_of,
+    count,
     parameters_of,
     positive,
+    report,
+    show,
     value_of,
 )
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.core.text import shown
+from edgevpr.core.text import progress, require_picture, shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
@@ -41,7 +44,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on there"
     )
-    parser.add_argument("--workers", type=_count, metavar="N", help="with --out: processes at work (all cores)")
+    parser.add_argument("--workers", type=count, metavar="N", help="with --out: processes at work (all cores)")
     video = (
         "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and FLIGHT.csv: time,lat,lon[,...])"
     )
@@ -90,15 +93,12 @@ def evaluate(args: Namespace) -> int:
 
 def _measure_many(args: Namespace) -> int:
     """Measure many rows on many sets, and write the results to --out. Rows that an earlier run measured are reused."""
-    from edgevpr.core.text import progress
     from edgevpr.lab.evaluate.many import measure
     from edgevpr.lab.evaluate.page import as_json, write_results
     from edgevpr.lab.evaluate.tables import quality_text
 
-    if args.plot:
-        raise UsageError("--plot goes without --out: the page in that folder has the curves.")
-    if value_of(args, "salience.use"):
-        raise UsageError("--salience goes without --out: measure it on one set at a time.")
+    if args.plot or value_of(args, "salience.use"):
+        raise UsageError("--plot and --salience go without --out: its page has curves, and --salience takes one set.")
     plan = _plan(args)
     _say_cameras(plan)
     out = Path(args.out)
@@ -106,30 +106,23 @@ def _measure_many(args: Namespace) -> int:
     outcome = measure(plan, out, args.workers or len(os.sched_getaffinity(0)), progress)
     write_results(out, outcome)
     for dataset in outcome.sets.values():
-        _say(*dataset.notes)
-    if args.json:
-        print_json(as_json(outcome))
-    else:
-        for name in outcome.sets:
-            if rows := outcome.rows_of(name):
-                print(f"{shown(name)}\n\n{quality_text([row.result for row in rows])}\n")
-        print(f"{out / 'index.html'}: look at it.")
-    _say(*(f"{name}, {row} was not measured: {why}" for (name, row), why in outcome.failed.items()))
+        report(*dataset.notes)
+    measured = [(name, [row.result for row in outcome.rows_of(name)]) for name in outcome.sets]
+    tables = [f"{shown(name)}\n\n{quality_text(results)}\n" for name, results in measured if results]
+    show(as_json(outcome), args.json, "\n".join([*tables, f"{out / 'index.html'}: look at it."]))
+    report(*(f"{name}, {row} was not measured: {why}" for (name, row), why in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
 def _measure_techniques(args: Namespace) -> int:
     """Measure techniques on one set, and print the results. Files are written only for --plot."""
-    from edgevpr.core.text import progress, require_picture
     from edgevpr.lab.evaluate import evaluate as evaluation
     from edgevpr.lab.evaluate.tables import plot, results_text
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.techniques import create
 
-    if args.sets or args.workers:
-        raise UsageError("Name a folder for the results with --out.")
-    if args.data and len(args.data) > 1:
-        raise UsageError("Several sets need a folder for the results: name it with --out.")
+    if args.sets or args.workers or len(args.data or ()) > 1:
+        raise UsageError("--sets, --workers and several sets need a folder for the results: name it with --out.")
     if args.plot:
         require_picture(Path(args.plot))
     plan = _plan(args)
@@ -147,7 +140,7 @@ def _measure_techniques(args: Namespace) -> int:
     ((name, chosen),) = plan.sets.items()
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as videos:
         dataset = chosen.open(Path(videos), progress)
-        _say(*dataset.notes)
+        report(*dataset.notes)
         _say_cameras(plan)
         measured = [
             evaluation.evaluate(row.technique, dataset, row.settings(None), row, progress, gate) for row in rows
@@ -155,16 +148,12 @@ def _measure_techniques(args: Namespace) -> int:
     results = evaluation.compare(measured)
     if args.plot:
         plot({name: results}, Path(args.plot))
-    if args.json:
-        print_json(evaluation.as_json(results))
-    else:
-        print(results_text(results))
-    _say(*(f"{technique} was not measured: {error}" for technique, error in errors.items()))
+    show(evaluation.as_json(results), args.json, results_text(results))
+    report(*(f"{technique} was not measured: {error}" for technique, error in errors.items()))
     return 1 if errors else 0
 
 
 def _measure_similarities(args: Namespace) -> int:
-    from edgevpr.core.text import require_picture
     from edgevpr.lab.evaluate.dataset import names_in
     from edgevpr.lab.evaluate.similarity import measure, read_similarities, truth_of
     from edgevpr.lab.evaluate.tables import plot, quality_text
@@ -180,10 +169,8 @@ def _measure_similarities(args: Namespace) -> int:
         results.append(measure(Path(file).stem, scores, *truth_of(args.ground_truth, scores, queries, references)))
     if args.plot:
         plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
-    if args.json:
-        print_json({"similarities": {result.technique: asdict(result) for result in results}})
-    else:
-        print(quality_text(results))
+    found = {"similarities": {result.technique: asdict(result) for result in results}}
+    show(found, args.json, quality_text(results))
     return 0
 
 
@@ -255,7 +242,7 @@ def _say_cameras(plan: "EvaluationPlan") -> None:
     for name, of in plan.sets.items():
         rows = ((techniques.parameters(row.technique), row.settings(of.camera)) for row in plan.rows.values())
         if any("camera" in known and "camera" not in settings for known, settings in rows):
-            _say(
+            report(
                 f"{name} is taken to look ahead: where its camera looks straight down, say `--camera nadir` "
                 "(`camera: nadir` in a file of sets)"
             )
