@@ -5,8 +5,7 @@ from contextlib import closing
 import pytest
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.core.errors import LinkAddressError
-from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
+from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
@@ -61,16 +60,6 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     assert names.count("COMMAND_INT") == 2
 
 
-def test_what_the_link_itself_has_to_say_is_said_on_the_ground_too(two, clock):
-    flight, autopilot, _, station = two
-    for _ in range(5):
-        sending = flight.send_fix(Fix(50.0, 14.0, 25.0, clock()))
-        wait_until(lambda sending=sending: sending.sent)
-    clock.now_s += 2.0
-    autopilot.heartbeat()
-    assert station.expect("STATUSTEXT").text == "edgevpr: fixes unanswered: signing? system id?"
-
-
 def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):
     with closing(UdpPort()) as port:
         flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), LinkSettings(clock=clock))
@@ -82,29 +71,6 @@ def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock
             clock.now_s += 6.0
             flight.announce(Severity.INFO, "link back", "link")
             station.expect_text("edgevpr: link back")
-
-
-def test_a_text_is_said_once_on_each_link(two, clock):
-    flight, autopilot, _, station = two
-    flight.announce(Severity.INFO, "once")
-    for peer in (autopilot, station):
-        peer.expect_text("edgevpr: once")
-    clock.now_s += 5.0
-    flight.announce(Severity.INFO, "then")
-    for peer in (autopilot, station):
-        assert "edgevpr: once" not in [getattr(each, "text", "") for each in peer.expect_text("edgevpr: then")]
-
-
-def test_the_ground_hears_that_the_autopilot_is_silent_and_that_it_is_back(two, clock):
-    flight, autopilot, _, station = two
-    clock.now_s += 6.0
-    flight.send(text("wake up"))
-    station.expect_text("edgevpr: autopilot is silent")
-    clock.now_s += 6.0
-    autopilot.heartbeat(system_id=7)
-    wait_until(flight.listens)
-    flight.send(text("wake up"))
-    station.expect_text("edgevpr: autopilot is back")
 
 
 def test_both_ends_hear_the_same_vehicle_component_and_health(two, clock):
@@ -178,8 +144,3 @@ def test_the_ground_is_spoken_to_with_the_same_key_and_another_link_id(clock, tm
             peer.receiver._parser_of(None).signing.secret_key = bytes(32)
             heartbeat = peer.expect("HEARTBEAT")
             assert (heartbeat.get_signed(), heartbeat.get_link_id()) == (True, TO_GROUND)
-
-
-def test_a_link_to_the_ground_alone_is_refused():
-    with pytest.raises(LinkAddressError, match="second"):
-        parse_links(None, "udpout:127.0.0.1:14550")

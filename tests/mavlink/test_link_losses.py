@@ -4,12 +4,10 @@ import os
 import pty
 import socket
 import tty
-from contextlib import closing
 
 import pytest
 import serial
-from fakes import FakeClock
-from mavlink_peers import UdpPort, free_port, link_to, wait_until
+from mavlink_peers import free_port, link_to, wait_until
 
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
@@ -52,18 +50,6 @@ def test_a_tcp_server_of_pymavlink_closes_refuses_and_comes_back(mavutil):
             wait_until(lambda times=times: link.stats().reopened == times, "coming back")
     other.close()
     other.listen.close()
-
-
-def test_a_program_of_pymavlink_cannot_take_our_port_away(mavutil):
-    """Two of pymavlink's own bind to one port without a word, and the first then hears nothing."""
-    number = free_port()
-    url = f"udpin:127.0.0.1:{number}"
-    with link_to(url, clock=FakeClock()) as link, closing(UdpPort(to=number)) as port:
-        for everywhere in (url, url.replace("127.0.0.1", "0.0.0.0")):
-            with pytest.raises(OSError, match="in use"):
-                mavutil.mavlink_connection(everywhere)
-        port.send(BEAT.pack(mavlink.MAVLink(None, 7, 1)))
-        wait_until(link.listens, "hearing the autopilot")
 
 
 def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tmp_path):

@@ -89,7 +89,7 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     assert (fix.sent, fix.why) == (False, THROWN_AWAY)
     got = drained(far)
     assert got
-    assert b"the fix" not in got
+    assert b"the fix" not in got, "closing throws away what cannot leave"
 
 
 def test_a_fix_that_the_port_does_not_take_in_time_is_never_written(line, clock):
@@ -109,15 +109,6 @@ def test_a_fix_that_the_port_does_not_take_in_time_is_never_written(line, clock)
     got = drained(far)
     assert [b"fix %04d" % number in got for number, _ in enumerate(fixes, 1)] == [fix.sent is True for fix in fixes]
     assert fixes[-1].sent is False
-
-
-def test_closing_throws_away_what_cannot_leave(line):
-    line, far = line
-    hold_up(line)
-    line.put(b"the end", None)
-    line.write()
-    line.close()
-    assert b"the end" not in drained(far)
 
 
 def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_server):

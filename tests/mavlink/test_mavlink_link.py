@@ -1,7 +1,6 @@
 """One link, real sockets, and an autopilot worked by hand at the other end."""
 
 import math
-import random
 import re
 import socket
 import threading
@@ -44,11 +43,7 @@ def test_the_heartbeat_comes_once_a_second_with_the_current_health(link, peer, c
     assert peer.expect_text("nor now") == []
     clock.now_s += 0.1
     peer.expect("HEARTBEAT")
-
-
-def test_a_main_loop_that_falls_silent_is_not_reported_as_healthy(link, peer, clock):
-    link.set_health(Health.ACTIVE)
-    clock.now_s += 10.1
+    clock.now_s += 8.1  # the main loop has fallen silent
     assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_CRITICAL
     link.set_health(Health.ACTIVE)
     clock.now_s += 1.0
@@ -65,17 +60,6 @@ def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(li
     assert (fix.target_system, fix.target_component) == (7, 1)
     assert (fix.x, math.isnan(fix.z)) == (501234567, True)
     assert (fix.param1, fix.param2) == (pytest.approx(clock.now_s), 0.5)
-
-
-def test_only_the_first_autopilot_counts(link, peer, clock):
-    peer.heartbeat(component_id=190)  # a ground station's component
-    peer.send(mavlink.MAVLink_heartbeat_message(18, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3), system_id=3)
-    heard(link, peer)
-    peer.heartbeat(system_id=9)
-    wait_until(lambda: link.stats().received.get("HEARTBEAT") == 4)
-    assert link.stats().autopilot_system_id == 7
-    link.send_fix(fix_at(clock.now_s))
-    assert peer.expect("COMMAND_INT").target_system == 7
 
 
 def test_events_and_figures_go_to_anyone_but_a_fix_waits_for_an_autopilot(link, peer, clock):
@@ -96,54 +80,23 @@ def test_a_fix_that_waited_too_long_is_never_sent(link, peer, clock):
     assert link.stats().dropped_stale_fixes == 1
 
 
-def test_a_fix_from_an_old_frame_is_never_sent(link, peer, clock):
+def test_a_fix_from_an_old_frame_or_to_a_silent_autopilot_is_never_sent(link, peer, clock):
     heard(link, peer)
     link.send_fix(fix_at(clock.now_s - 5.1, 1.0))
     link.send_fix(fix_at(clock.now_s - 4.9, 2.0))
     assert peer.expect("COMMAND_INT").x == 20_000_000
     assert link.stats().dropped_stale_fixes == 1
-
-
-def test_no_fix_goes_to_an_autopilot_that_has_fallen_silent(link, peer, clock):
-    heard(link, peer)
     clock.now_s += 5.1
-    link.send_fix(fix_at(clock.now_s))
+    link.send_fix(fix_at(clock.now_s))  # the autopilot has fallen silent
     link.send(text("end"))
     assert "COMMAND_INT" not in [m.get_type() for m in peer.expect_text("end")]
     assert not link.stats().autopilot_heard
-
-
-def test_noise_between_messages_is_counted_and_the_link_goes_on(link, peer):
-    rng = random.Random(3)
-    heard(link, peer)
-    for _ in range(50):
-        peer.port.send(rng.randbytes(rng.randrange(1, 400)))
-        for _ in range(15):  # more than one beginning of a message can swallow
-            peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
-    wait_until(lambda: link.stats().acks.get("ACCEPTED", 0) > 50, "answers among the noise")
-    assert link.stats().bad_bytes > 0
-    link.send(text("alive"))
-    peer.expect_text("alive")
 
 
 def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, clock, caplog):
     link.send(*named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
     assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
     assert "NAMED_VALUE_INT" in caplog.text
-
-
-def test_a_udp_peer_that_goes_and_comes_back_is_served_again(clock):
-    port = UdpPort()
-    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
-        Peer(port).expect("HEARTBEAT")
-        port.close()
-        for _ in range(5):
-            link.send(text("to nobody"))
-        wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 5)
-        port = UdpPort(port.number)
-        link.send(text("again"))
-        Peer(port).expect_text("again")
-        port.close()
 
 
 def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_new_port(clock):
@@ -167,20 +120,6 @@ def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_n
         peer.expect_text("at the new port")
         port.close()
         assert link.stats().connected
-
-
-def test_a_listening_link_keeps_to_the_autopilot_when_others_speak(clock):
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
-        port, stranger = UdpPort(to=number), UdpPort(to=number)
-        peer = Peer(port)
-        heard(link, peer)
-        stranger.send(b"hello")
-        wait_until(lambda: link.stats().bad_bytes >= 5)
-        link.send(text("to you"))
-        peer.expect_text("to you")
-        port.close()
-        stranger.close()
 
 
 def test_a_sending_link_hears_nobody_but_its_peer(clock):
@@ -300,6 +239,7 @@ def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
     link.send(text("late"))
     link.close()
     assert not link.stats().connected
+    link_to("udpout:127.0.0.1:14550").close()  # never started
 
 
 def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
@@ -313,10 +253,6 @@ def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
     peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
     closing_link.join()
     assert link.stats().acks == {"ACCEPTED": 1}
-
-
-def test_a_link_that_was_never_started_can_be_closed():
-    link_to("udpout:127.0.0.1:14550").close()
 
 
 def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):

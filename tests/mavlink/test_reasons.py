@@ -57,11 +57,6 @@ def test_every_answer_has_its_reason(result, state, reason):
     assert state.why(result, 0.0) == reason
 
 
-def test_silence_is_explained_by_whether_other_commands_are_answered():
-    assert "signed" in EMPTY.why_silent().sentence
-    assert "43003" in Readiness(answers_others=True).why_silent().sentence
-
-
 def test_every_reason_fits_a_status_text():
     known = [each for each in vars(reasons).values() if isinstance(each, Reason)]
     assert len(known) > 10

@@ -129,13 +129,6 @@ def test_a_packet_is_in_the_log_when_the_port_has_taken_all_of_it():
         reader.join()
 
 
-def test_a_log_that_is_there_is_appended_to(path):
-    record(path, range(3))
-    record(path, range(3, 5))
-    assert numbers(path) == [0, 1, 2, 3, 4]
-    assert os.stat(path).st_mode & 0o777 == 0o640
-
-
 @pytest.mark.slow
 def test_what_comes_after_a_cut_packet_is_read(path):
     record(path, range(20))
@@ -160,12 +153,6 @@ def test_a_full_disk_ends_the_log_is_said_once_and_leaves_whole_packets(path, ca
     assert kept == [packet(number) for number in range(len(kept))]
     assert len(caplog.records) == 1
     assert "(File too" in caplog.text
-
-
-def test_a_device_without_room_ends_it_too(caplog):
-    with Tlog("/dev/full") as log:
-        log.record(packet(0))
-    assert "(No space" in caplog.text
 
 
 def test_the_last_of_a_disk_is_left_to_the_flight_log(path, caplog, monkeypatch):
@@ -200,22 +187,11 @@ def test_a_slow_disk_keeps_nobody_waiting_and_fills_no_memory(path, caplog, monk
     assert f"misses {20_000 - len(found)}" in caplog.text
 
 
-def test_a_disk_that_hangs_does_not_keep_the_program_from_ending(path, caplog, monkeypatch):
-    go_on, append = threading.Event(), tlog.append
-    monkeypatch.setattr(tlog, "append", lambda *each: go_on.wait(60) and append(*each))
-    monkeypatch.setattr(tlog, "CLOSE_S", 0.05)
-    log = Tlog(path)
-    log.record(packet(0))
-    log.close()
-    assert "too slow" in caplog.text
-    go_on.set()
-    log._thread.join()
-
-
 def test_there_are_never_more_than_two_files_of_the_largest_size(path, monkeypatch):
     monkeypatch.setattr(tlog, "MOST_BYTES", 1000)
     for first in range(0, 200, 10):
         record(path, range(first, first + 10))
+    assert os.stat(path).st_mode & 0o777 == 0o640
     older = path.with_name("flight.1.tlog")
     assert sorted(path.parent.iterdir()) == [older, path]
     assert max(path.stat().st_size, older.stat().st_size) <= 1000
