@@ -12,7 +12,7 @@ from edgevpr.core.text import progress, require_picture
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
     from edgevpr.runtime.preflight.estimate import FlightPlan
-    from edgevpr.runtime.preflight.trial import Offer
+    from edgevpr.runtime.preflight.trial import Trial
 
 
 def add(commands: Any) -> None:
@@ -89,7 +89,7 @@ def profile(args: Namespace) -> int:
     return 0
 
 
-def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Offer, ...]]":
+def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Trial, ...]]":
     """Return, from the flags, the plan of the flight, the technique of --map, and what to try, in all its forms."""
     from edgevpr import techniques
     from edgevpr.core.config import load_config
@@ -143,7 +143,6 @@ def _measure(args: Namespace, quiet: bool) -> None:
     from edgevpr.power.boards import load_board
     from edgevpr.power.speed import micro_benchmark
     from edgevpr.runtime.preflight import stored
-    from edgevpr.runtime.preflight.presentation import format_stored
     from edgevpr.runtime.preflight.trial import offers, try_each
 
     path = Path(args.out) if args.out else stored.default_path()
@@ -157,5 +156,7 @@ def _measure(args: Namespace, quiet: bool) -> None:
     except EdgevprError as error:
         own, power = None, str(error)
     if not (args.json and quiet):
+        unusable = dict.fromkeys(trial.problem for trial in figures.trials if trial.problem)
+        kept = f"{len(figures.trials)} trials are kept in {path}: `--places N` uses them."
         known = {**asdict(figures), "file": str(path), "profile": own and str(own), "power": power}
-        show(known, args.json, f"{format_stored(figures)}\nKept in {path}.\n{power}")
+        show(known, args.json, "\n".join([*unusable, kept, power]))

@@ -16,7 +16,6 @@ from edgevpr.power import machine, sensors, speed
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.preflight import accuracy, trial
 from edgevpr.runtime.preflight.probe import TechniqueCosts
-from edgevpr.runtime.preflight.trial import Trial
 
 COSTS = TechniqueCosts(
     encode=StageCost(0.1, 0.1),
@@ -50,11 +49,10 @@ def tried(monkeypatch):
     asked = []
 
     def answer(module, job, limit_s, what):
-        asked.append(job["label"])
-        if job["name"] == "calc":
+        asked.append(job["trial"]["label"])
+        if job["trial"]["name"] == "calc":
             raise EdgevprError("There is no model `calc`.")
-        costs = HOG if job["name"] == "hog" else COSTS
-        return asdict(Trial(label=job["label"], name=job["name"], settings=job["settings"], costs=costs))
+        return {**job["trial"], "costs": asdict(HOG if job["trial"]["name"] == "hog" else COSTS)}
 
     monkeypatch.setattr(trial, "ask_child", answer)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
@@ -140,7 +138,7 @@ def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch)
     said = run(capsys, "--measure")
     assert "measuring techniques" in said.err
     kept = tmp_path / "data/edgevpr/measured.json"
-    assert f"Kept in {kept}.\n{sensors.NO_METER}" in said.out
+    assert f"kept in {kept}: `--places N` uses them.\n{sensors.NO_METER}" in said.out
     fields = json.loads(kept.read_text())
     assert [trial["label"] for trial in fields["trials"]] == ["cohog", "seqslam"]
     assert fields["trials"][0]["costs"]["encode"]["cpu_s"] > 0
@@ -179,7 +177,7 @@ def test_figures_are_kept_where_one_says_and_can_be_had_as_json(capsys, tmp_path
 
 def test_measuring_and_planning_go_together(capsys, tmp_path, tried):
     said = run(capsys, "--measure", "--places", 100)
-    assert said.out.index("Kept in ") < said.out.index("100 places")
+    assert said.out.index(" kept in ") < said.out.index("100 places")
     assert tried.count("cohog") == 1, "what was just measured is not tried again"
     assert json.loads(run(capsys, "--measure", "--places", 100, "--json").out)["measured_on"]
 

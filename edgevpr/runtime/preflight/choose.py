@@ -6,6 +6,7 @@ A technique that accepted a wrong place on the image sets is never chosen automa
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -46,7 +47,7 @@ class Fit:
     process_ram_mb: float
     reachable_hz: float
     shortfalls: tuple[str, ...]
-    remedies: tuple[str, ...]
+    remedies: tuple[str, ...] = ()
 
     @property
     def misfit(self) -> str | None:
@@ -141,40 +142,43 @@ def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float 
 
 def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     """Check whether a technique fits: index into the budget, process into the board's memory, queries into the CPU
-    time.
+    time. If it does not, look for what would make it fit.
 
     A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
     the share `cpu_share` of the cores.
     """
-    rate_hz, budget_mb = demand.rate_hz, demand.budget_mb
+    found = _fit(board, costs, demand)
+    if not found.shortfalls:
+        return found
+
+    def would_fit(**change: float) -> bool:
+        return not _fit(board, costs, replace(demand, **change)).shortfalls  # type: ignore[arg-type]  # a field's type
+
+    most_places = bisect_left(range(1, demand.places), True, key=lambda places: not would_fit(places=places))
+    rate_hz, budget_mb = _rounded_down(found.reachable_hz), math.ceil(found.map_ram_mb)
+    remedies = {
+        f"with up to {most_places} places": most_places > 0,
+        f"at up to {rate_hz:g} Hz": rate_hz >= LOWEST_RATE_HZ and would_fit(rate_hz=rate_hz),
+        f"with a budget of {budget_mb} MB": would_fit(budget_mb=budget_mb),
+    }
+    return replace(found, remedies=tuple(remedy for remedy, helps in remedies.items() if helps))
+
+
+def _fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     usable_cores = board.cores * board.cpu_share
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
     query = costs.encode + costs.match(demand.places)
     reachable_hz = min(1 / query.wall_s, usable_cores / query.cpu_s)
-
-    shortfalls, remedies = [], []
-    if map_ram_mb > budget_mb:
-        shortfalls.append(f"its map takes {map_ram_mb:.1f} MB of RAM and {budget_mb:.1f} are allowed")
+    shortfalls = []
+    if map_ram_mb > demand.budget_mb:
+        shortfalls.append(f"its map takes {map_ram_mb:.1f} MB of RAM and {demand.budget_mb:.1f} are allowed")
     if process_ram_mb > board.memory_max_mb:
         shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
-    if reachable_hz < rate_hz:
-        shortfalls.append(f"it reaches {_rounded_down(reachable_hz):g} Hz of {rate_hz:g}")
+    if reachable_hz < demand.rate_hz:
+        shortfalls.append(f"it reaches {_rounded_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
     if query.wall_s > FIX_MAX_AGE_S:
         shortfalls.append(too_late(query.wall_s))
-    if shortfalls:
-        wall_s = min(1 / rate_hz, FIX_MAX_AGE_S) - costs.encode.wall_s
-        most_places = min(
-            min(budget_mb, board.memory_max_mb - costs.process_mb) * 1e6 / costs.ram_bytes_per_place,
-            costs.places_within(wall_s, usable_cores / rate_hz - costs.encode.cpu_s),
-        )
-        if most_places >= 1:
-            remedies.append(f"with up to {int(most_places)} places")
-        if process_ram_mb <= board.memory_max_mb and query.wall_s <= FIX_MAX_AGE_S:
-            if map_ram_mb <= budget_mb and reachable_hz >= LOWEST_RATE_HZ:
-                remedies.append(f"at up to {_rounded_down(reachable_hz):g} Hz")
-            elif reachable_hz >= rate_hz:
-                remedies.append(f"with a budget of {math.ceil(map_ram_mb)} MB")
     return Fit(
         t_query_s=query.wall_s,
         cpu_s=query.cpu_s,
@@ -183,7 +187,6 @@ def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
         shortfalls=tuple(shortfalls),
-        remedies=tuple(remedies),
     )
 
 

@@ -1,4 +1,4 @@
-"""Estimates and stored figures for people: tables of at most 120 columns with a line per technique, notes, and a
+"""Estimates for people: tables of at most 120 columns with a line per technique, notes, and a
 picture (which needs matplotlib, extra `plots`)."""
 
 from collections.abc import Mapping, Sequence
@@ -6,9 +6,8 @@ from pathlib import Path
 
 from edgevpr.core.text import aligned, figure, wrapped
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
-from edgevpr.runtime.preflight.stored import StoredFigures
 
-# The columns of each table: (heading, format of a cell), where {0} is a TechniqueEstimate or, of the last, a Trial.
+# The columns of each table: (heading, format of a cell), where {0} is a TechniqueEstimate.
 _NEEDS = (
     ("technique", "{0.option.label}"), ("fits", "{fits}"), ("B/place", "{0.option.costs.ram_bytes_per_place}"),
     ("map MB", "{0.option.fit.map_ram_mb:.1f}"), ("disk MB", "{0.option.fit.map_disk_mb:.1f}"),
@@ -29,12 +28,6 @@ _DRAWS = (
     ("of pack", "{0.flight_pack_frac:.1%}"),
 )  # fmt: skip
 _LOSES = (("min lost", "{0.lost_min:.2f}"), ("marginal", "{0.lost_marginal_min:.3f}"))
-_MEASURED = (
-    ("technique", "{0.label}"), ("encode s", "{0.costs.encode.wall_s:.5f}"), ("CPU s", "{0.costs.encode.cpu_s:.5f}"),
-    ("place s", "{0.costs.match_per_place.wall_s:.2e}"), ("CPU s", "{0.costs.match_per_place.cpu_s:.2e}"),
-    ("scan s", "{0.costs.scan_per_place.wall_s:.2e}"), ("peak MB", "{0.costs.process_mb:.1f}"),
-    ("RAM B", "{0.costs.ram_bytes_per_place}"), ("disk B", "{0.costs.disk_bytes_per_place}"),
-)  # fmt: skip
 _Columns = Sequence[tuple[str, str]]
 
 
@@ -63,22 +56,6 @@ def format_table(estimate: FlightEstimate) -> str:
         notes.append(f"Not among the stored figures, and tried now: {', '.join(tried_now)}.")
     notes.append(f"Recommended: {estimate.reason}")
     return "\n".join([heading, "", *tables, *(line for note in notes for line in wrapped(note))])
-
-
-def format_stored(figures: StoredFigures) -> str:
-    """Format the figures stored on this machine, with a line for each technique and form. The time of matching is that
-    of one place: of its full comparison if the technique scans all places before, else of the scan."""
-    unusable = {trial.label: trial.problem for trial in figures.trials if trial.problem}
-    rows = [_cells(_MEASURED, trial) for trial in figures.trials if trial.costs]
-    score = figures.score
-    lines = [
-        f"{figures.identity['machine']}, {figures.identity['cores']} cores: measured on {figures.date}",
-        *_table(_MEASURED, [*rows, *([name, "n/a"] for name in unusable)]),
-        *(line for sentence in _unusable(unusable) for line in wrapped(sentence)),
-        f"Beside one core of the reference: products {score.products:g}, passes {score.passes:g}, all cores "
-        f"{score.multi:g} (single {score.single:g}).",
-    ]
-    return "\n".join(lines)
 
 
 def plot(estimate: FlightEstimate, path: Path) -> None:

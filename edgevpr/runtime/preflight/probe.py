@@ -72,18 +72,6 @@ class TechniqueCosts:
         full = self.compare_once * min(1.0, compared / self.in_full)
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
-    def places_within(self, wall_s: float, cpu_s: float) -> float:
-        """Return how many places a map may have if matching may take `wall_s` wall seconds and `cpu_s` CPU-seconds."""
-        once = self.scan_once + self.compare_once
-        wall_s, cpu_s = wall_s - once.wall_s, cpu_s - once.cpu_s
-        full, scan = self.match_per_place, self.scan_per_place
-        both = full + scan
-        in_full = max(0.0, min(wall_s / both.wall_s, cpu_s / both.cpu_s))
-        if self.candidates is None or in_full < self.candidates:
-            return in_full
-        rest_wall_s, rest_cpu_s = wall_s - self.candidates * full.wall_s, cpu_s - self.candidates * full.cpu_s
-        return min(rest_wall_s / scan.wall_s, rest_cpu_s / scan.cpu_s) if scan.wall_s else math.inf
-
 
 def noise(count: int) -> list[Image]:
     """Return `count` random pictures, uint8 (480, 640). Every region has structure, so that matching costs the most it

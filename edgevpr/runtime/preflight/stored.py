@@ -25,7 +25,7 @@ from edgevpr.power import machine
 from edgevpr.power.boards import Board, MachineSpeed, own_profile, profile_text
 from edgevpr.power.speed import micro_benchmark
 from edgevpr.runtime.preflight.scale import is_same
-from edgevpr.runtime.preflight.trial import Offer, Trial, model_of, trial_of
+from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of
 
 _FORMAT = 4  # another one for each change of `Trial` or `TechniqueCosts`
 _MAX_FILE_BYTES = 10_000_000
@@ -47,7 +47,7 @@ class StoredFigures:
     score: MachineSpeed
     trials: tuple[Trial, ...]
 
-    def of(self, offer: Offer) -> Trial | None:
+    def of(self, offer: Trial) -> Trial | None:
         """Return the stored trial of an offer. None if it was not measured, could not be used then, or has another
         network now."""
         for trial in self.trials:
@@ -165,7 +165,7 @@ def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, s
     )
 
 
-def _same_settings(trial: Trial, offer: Offer) -> bool:
+def _same_settings(trial: Trial, offer: Trial) -> bool:
     """Tell whether an offer asks for the settings that were tried. A setting that is not named has its default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}

@@ -5,7 +5,7 @@ library that crashes on this processor fails only its own trial.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from edgevpr import techniques
@@ -20,21 +20,13 @@ _TRIED_S = 1.0  # pictures are tried again for so long; the check before a fligh
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
-    """A technique to try, with its settings, one of which may be its form. `label` tells it from other offers."""
-
-    label: str
-    name: str
-    settings: dict[str, Any]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """Result of trying an offer: its `costs`, or the `problem`, a sentence that says why it cannot be used here.
+    """A technique to try, with its settings, one of which may be its form. `label` tells it from others.
 
-    `settings`: those of the offer. `parameters`: all that the technique then had. `model`: fingerprint of its network.
-    `weights`: name of the network's weights (both None: no network). `measured`: the costs were stored earlier.
+    Once it was tried, it has its `costs`, or the `problem`, a sentence that says why it cannot be used here.
+    `parameters`: all that the technique then had. `model`: fingerprint of its network. `weights`: name of the network's
+    weights (both None: no network). `measured`: the costs were stored earlier.
     """
 
     label: str
@@ -50,26 +42,24 @@ class Trial:
 
 def offers(
     names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
-) -> tuple[Offer, ...]:
-    """Return an offer for each technique in each of `forms`; one only if it has no forms or its `settings` name one.
-
-    `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a card that is incomplete.
-    """
+) -> tuple[Trial, ...]:
+    """Return a trial to make for each technique in each of `forms`; one only if it has no forms or its `settings` name
+    one. `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a card that is
+    incomplete."""
     listed = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
-        if "form" in own or "form" not in techniques.parameters(name):
-            listed.append(Offer(techniques.labelled(name, own.get("form")), name, own))
-        else:
-            listed += [Offer(techniques.labelled(name, form), name, {**own, "form": form}) for form in forms]
+        is_one = "form" in own or "form" not in techniques.parameters(name)
+        for each in (own,) if is_one else ({**own, "form": form} for form in forms):
+            listed.append(Trial(label=techniques.labelled(name, each.get("form")), name=name, settings=each))
     return tuple(listed)
 
 
 def try_each(
-    wanted: Iterable[Offer], threads: int, known: Callable[[Offer], Trial | None] = lambda offer: None
+    wanted: Iterable[Trial], threads: int, known: Callable[[Trial], Trial | None] = lambda offer: None
 ) -> Iterator[Trial]:
-    """Yield the trial of each offer: the one that is `known`, else one made now in a child process. An unusable
-    technique has one result, under its name. `threads` are those of a network."""
+    """Yield each of the `wanted` trials with its result: the one that is `known`, else one made now in a child process.
+    An unusable technique has one result, under its name. `threads` are those of a network."""
     refused = set()
     for offer in wanted:
         if trial := known(offer):
@@ -77,11 +67,11 @@ def try_each(
         elif offer.name not in refused:
             try:
                 model_of(offer.name, offer.settings)  # raises if the card already shows that it cannot be used
-                job = {**asdict(offer), "threads": threads}
-                yield trial_of(ask_child(__name__, job, _LIMIT_S, f"Trying {offer.label}"))
+                job = {"threads": threads, "trial": asdict(offer)}
+                yield trial_of(ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}"))
             except EdgevprError as error:
                 refused.add(offer.name)
-                yield Trial(label=offer.name, name=offer.name, settings=offer.settings, problem=str(error))
+                yield replace(offer, label=offer.name, problem=str(error))
 
 
 def model_of(name: str, settings: dict[str, Any]) -> str | None:
@@ -98,13 +88,11 @@ def trial_of(fields: dict[str, Any]) -> Trial:
 
 
 def _try_here(job: dict[str, Any]) -> dict[str, Any]:
-    offer = Offer(job["label"], job["name"], job["settings"])
+    offer = trial_of(job["trial"])
     technique = made_for(job["threads"], offer.name, offer.settings)
-    costs = probe(technique, tried_s=_TRIED_S)
-    model, spec = model_of(offer.name, offer.settings), technique.spec
-    return asdict(
-        Trial(**asdict(offer), costs=costs, model=model, weights=weights_of(spec), parameters=spec.parameters)
-    )
+    costs, spec = probe(technique, tried_s=_TRIED_S), technique.spec
+    model, weights = model_of(offer.name, offer.settings), weights_of(spec)
+    return asdict(replace(offer, costs=costs, model=model, weights=weights, parameters=spec.parameters))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from edgevpr.power.boards import MachineSpeed, load_board, own_profile
 from edgevpr.power.sensors import Meter, MeterError
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight import trial
-from edgevpr.runtime.preflight.presentation import format_stored
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.stored import (
     default_path,
@@ -24,7 +23,7 @@ from edgevpr.runtime.preflight.stored import (
     save,
     write_profile,
 )
-from edgevpr.runtime.preflight.trial import Offer, Trial
+from edgevpr.runtime.preflight.trial import Trial
 
 COSTS = TechniqueCosts(
     encode=StageCost(0.1, 0.2),
@@ -123,9 +122,11 @@ def test_another_version_of_the_file_is_said_and_no_file_is_nothing_to_say(kept)
 
 def test_settings_that_are_the_defaults_are_the_same_and_others_are_not(kept):
     stored, _ = load(kept)
-    assert stored.of(Offer("cohog", "cohog", {"gt": 0.4})) == replace(COHOG, measured=True)
-    assert stored.of(Offer("calc", "calc", {})) is None, "what could not be used then is tried again"
-    assert stored.of(Offer("cohog", "cohog", {"gt": 0.7})) is None
+    assert stored.of(Trial(label="cohog", name="cohog", settings={"gt": 0.4})) == replace(COHOG, measured=True)
+    assert stored.of(Trial(label="calc", name="calc", settings={})) is None, (
+        "what could not be used then is tried again"
+    )
+    assert stored.of(Trial(label="cohog", name="cohog", settings={"gt": 0.7})) is None
 
 
 def test_figures_of_another_network_are_not_used(kept, monkeypatch):
@@ -134,9 +135,9 @@ def test_figures_of_another_network_are_not_used(kept, monkeypatch):
     path = kept
     save(gathered([Trial(label="calc", name="calc", settings={}, costs=COSTS, model="old")], 1, SCORE), path)
     stored, _ = load(path)
-    assert stored.of(Offer("calc", "calc", {})) is not None
+    assert stored.of(Trial(label="calc", name="calc", settings={})) is not None
     fingerprints["calc"] = "new"
-    assert stored.of(Offer("calc", "calc", {})) is None
+    assert stored.of(Trial(label="calc", name="calc", settings={})) is None
 
 
 def test_a_file_is_replaced_as_a_whole_or_stays_as_it_was(kept, monkeypatch):
@@ -178,18 +179,6 @@ def test_the_score_that_is_scaled_from_is_measured_unless_both_are_published(mon
     measured_there = replace(other, benchmark_score=SCORE)
     assert measured.scaled_from(pi, measured_there, stored).benchmark_score == SCORE
     assert measured.scaled_from(x86, x86, None) == x86
-
-
-def test_the_table_names_machine_date_and_every_technique(kept):
-    found, _ = load(kept)
-    first, heads, cohog, hog, calc, _, why, score = format_stored(found).splitlines()
-    assert first.startswith(found.identity["machine"])
-    assert first.endswith(f"measured on {found.date}")
-    assert cohog.split() == ["cohog", "0.10000", "0.20000", "4.00e-03", "5.00e-03", "2.00e-06", "88.5", "90", "31776"]
-    assert (hog.split()[:2], calc.split()) == (["hog", "1bit"], ["calc", "n/a"])
-    assert why.startswith("calc cannot")
-    assert score.endswith("products 0.1, passes 0.4, all cores 0.7 (single 0.2).")
-    assert max(len(heads), len(cohog)) <= 120
 
 
 def meter_at(held, watts, title="INA3221 (hwmon1), channel VDD_IN", certain=True):

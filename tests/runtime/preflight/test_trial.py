@@ -97,8 +97,8 @@ def test_a_technique_without_a_network_has_no_fingerprint_and_one_with_it_that_o
 
 def test_what_is_known_is_not_tried_again_and_what_is_not_is(monkeypatch):
     def answer(module, job, limit_s, what):
-        asked.append(job["label"])
-        return asdict(Trial(label=job["label"], name=job["name"], settings=job["settings"], problem=None))
+        asked.append(job["trial"]["label"])
+        return job["trial"]
 
     asked = []
     monkeypatch.setattr(trying, "ask_child", answer)
