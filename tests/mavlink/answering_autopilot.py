@@ -1,52 +1,17 @@
 """An autopilot that answers questions, over UDP or a serial cable, in a thread of its own; it notes what it is told."""
 
 import math
-import os
 import select
-import socket
 import struct
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 
+from edgevpr.mavlink.address import parse_link
+from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 BEAT_S = 0.05  # twenty times as fast as a real one, so that nothing is waited for
-
-
-class UdpEnd:
-    def __init__(self, to: int) -> None:
-        self._to = ("127.0.0.1", to)
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind(("127.0.0.1", 0))
-        self._sock.settimeout(BEAT_S)
-
-    def read(self) -> bytes:
-        with suppress(TimeoutError, ConnectionRefusedError):
-            data, self._to = self._sock.recvfrom(65_536)
-            return data
-        return b""
-
-    def write(self, data: bytes) -> None:
-        self._sock.sendto(data, self._to)
-
-    def close(self) -> None:
-        self._sock.close()
-
-
-class SerialEnd:
-    def __init__(self, device: Path) -> None:
-        self._file = os.open(device, os.O_RDWR | os.O_NOCTTY)
-
-    def read(self) -> bytes:
-        return os.read(self._file, 4096) if select.select([self._file], [], [], BEAT_S)[0] else b""
-
-    def write(self, data: bytes) -> None:
-        os.write(self._file, data)
-
-    def close(self) -> None:
-        os.close(self._file)
 
 
 class AnsweringAutopilot:
@@ -74,7 +39,8 @@ class AnsweringAutopilot:
         self._receiver = PacketReader(lambda message: not wants_signed or message.get_signed())
         if wants_signed:
             self._receiver._parser_of(None).signing.secret_key = key
-        self._port = UdpEnd(to) if isinstance(to, int) else SerialEnd(to)
+        is_udp = isinstance(to, int)
+        self._port = open_port(parse_link(f"udpout:127.0.0.1:{to}" if is_udp else f"serial:{to}:57600"))
         self._lost = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -100,7 +66,8 @@ class AnsweringAutopilot:
                 self._send(mavlink.MAVLink_heartbeat_message(self._vehicle, self._firmware, 1, 0, 4, 3))
                 if self._noise:
                     self._port.write(self._noise)
-            for message in self._receiver.feed(self._port.read()):
+            is_readable = select.select([self._port], [], [], BEAT_S)[0]
+            for message in self._receiver.feed(self._port.read() if is_readable else b""):
                 self.heard.append(message)
                 if not self._is_mute and not self._is_lost(message):
                     self._answer(message)

@@ -230,29 +230,3 @@ def test_a_link_that_is_lost_and_a_flight_that_ends_take_the_answers_along(clock
                     wait_until(lambda: sending.outcome)  # noqa: B023
                     assert sending.outcome == FixAnswer(None, "the link was lost before its answer came", None)
         assert sending.outcome == FixAnswer(None, "the flight ended before its answer came", None)
-
-
-@pytest.mark.network
-@pytest.mark.slow
-def test_a_peer_that_stops_reading_for_a_minute_finds_a_few_fixes_and_not_all(clock):
-    """The autopilot goes on beating, and its system takes what it does not read."""
-    number = free_port(socket.SOCK_STREAM)
-    with closing(TcpServer(number)) as server, link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
-        peer, sent_s = Peer(server.accept(), 7), []
-        for _ in range(180):
-            clock.now_s += 1 / 3
-            beat(link, peer)
-            sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
-            sending.wait(60)
-            sent_s += [clock.now_s] if sending.sent else []
-        peer.port.settimeout(1.0)
-        found = []
-        try:
-            while True:
-                peer.read()
-                found += [m.param1 for m in peer.seen if m.get_type() == "COMMAND_INT"]
-                peer.seen.clear()
-        except TimeoutError:
-            pass
-        assert found == pytest.approx(sent_s, abs=0.01)
-        assert len(found) == 10, "five, and one every ten seconds"

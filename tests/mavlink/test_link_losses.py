@@ -68,22 +68,3 @@ def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tm
         assert link.stats().trouble is None
     os.close(master)
     os.close(slave)
-
-
-def test_a_device_that_comes_back_under_another_number_is_found_by_its_name(tmp_path):
-    """A flight controller that restarts may become ttyACM1; its name in by-id leads there, and the old one is gone."""
-    device = tmp_path / "usb-ArduPilot-if00"
-    with link_to(f"serial:{device}:57600") as link:
-        for system_id in (7, 7, 7):
-            master, slave = pty.openpty()
-            tty.setraw(slave)
-            fresh = tmp_path / "fresh"
-            fresh.symlink_to(os.ttyname(slave))
-            fresh.replace(device)
-            wait_until(lambda: link.stats().connected, "opening it")
-            os.write(master, BEAT.pack(mavlink.MAVLink(None, system_id, 1)))
-            wait_until(link.listens, "hearing the autopilot")
-            os.close(master)
-            os.close(slave)
-            wait_until(lambda: not link.listens(), "noticing the loss")
-        assert link.stats().received["HEARTBEAT"] == 3

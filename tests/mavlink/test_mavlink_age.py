@@ -92,25 +92,6 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     assert b"the fix" not in got, "closing throws away what cannot leave"
 
 
-def test_a_fix_that_the_port_does_not_take_in_time_is_never_written(line, clock):
-    line, far = line
-    hold_up(line)
-    fixes = []
-    while not line.is_writing:
-        fixes.append(sending(clock))
-        line.put(b"fix %04d" % len(fixes), fixes[-1])
-        line.write()
-    clock.now_s += 1.01
-    far.setblocking(False)
-    with pytest.raises(ConnectionError, match="too long"):
-        line.departed()
-    line.close()
-    far.setblocking(True)
-    got = drained(far)
-    assert [b"fix %04d" % number in got for number, _ in enumerate(fixes, 1)] == [fix.sent is True for fix in fixes]
-    assert fixes[-1].sent is False
-
-
 def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_server):
     number = narrow_server._listener.getsockname()[1]
     with link_to(f"tcp:127.0.0.1:{number}", max_fix_age_s=0.2) as link:

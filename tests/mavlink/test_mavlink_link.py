@@ -1,7 +1,6 @@
 """One link, real sockets, and an autopilot worked by hand at the other end."""
 
 import math
-import re
 import socket
 import threading
 from contextlib import closing
@@ -99,7 +98,7 @@ def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, 
     assert "NAMED_VALUE_INT" in caplog.text
 
 
-def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_new_port(clock):
+def test_a_listening_link_speaks_when_spoken_to(clock):
     number = free_port()
     with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
@@ -108,18 +107,8 @@ def test_a_listening_link_speaks_when_spoken_to_and_follows_the_autopilot_to_a_n
         peer = Peer(port)
         heard(link, peer)
         peer.expect_text("waits for somebody")
-        port.close()
-        port = UdpPort(to=number)
-        peer = Peer(port)
-        clock.now_s += 25.0
-        for beats in range(2, 8):
-            clock.now_s += 1.0
-            peer.heartbeat()
-            wait_until(lambda beats=beats: link.stats().received["HEARTBEAT"] == beats)
-        link.send(text("at the new port"))
-        peer.expect_text("at the new port")
-        port.close()
         assert link.stats().connected
+        port.close()
 
 
 def test_a_sending_link_hears_nobody_but_its_peer(clock):
@@ -144,15 +133,6 @@ def test_a_udp_port_in_use_is_said_at_the_start(clock):
         second = link_to(f"udpin:0.0.0.0:{number}", clock=clock)
         with pytest.raises(LinkError, match=f"{number}"):
             second.start()
-
-
-@pytest.mark.parametrize(
-    ("kind", "host"),
-    [("udpout", "no-such-host.invalid"), ("udpout", "a..b"), ("udpin", "a..b"), ("tcp", "a" * 64 + ".example")],
-)
-def test_an_unknown_host_is_said_at_the_start(kind, host):
-    with pytest.raises(LinkError, match=re.escape(f"no host '{host}'")):
-        link_to(f"{kind}:{host}:14550").start()
 
 
 def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):

@@ -83,11 +83,6 @@ def test_closing_sends_what_waits(line):
     assert receiver.bad_bytes == 0
 
 
-def test_a_device_in_use_is_said_at_the_start(terminal):
-    with link_to(f"serial:{terminal}:57600"), pytest.raises(LinkError, match="in use"):
-        link_to(f"serial:{terminal}:115200").start()
-
-
 def test_a_device_that_this_user_may_not_open_is_said_at_the_start(terminal):
     os.chmod(terminal, 0)
     user = os.geteuid()
