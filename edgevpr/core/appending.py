@@ -1,8 +1,9 @@
-"""Log files that grow in flight: each write is done completely or not at all, and a full file is renamed.
+"""Log files that grow in flight: each write is done completely or not at all, and a full file is renamed. All functions
+raise OSError.
 
 Renamed files are called NAME-0001.jsonl, NAME-0002.jsonl, ... in the folder of NAME.jsonl ("numbered files" below). A
-new number is one more than the highest, so numbers show the order. Names have no dates: the clock of an aircraft may
-be wrong. Symbolic links are followed: the numbered files are in the folder of the link's target.
+new number is one more than the highest, so numbers show the order: the clock of an aircraft may be wrong. Symbolic
+links are followed: the numbered files are in the folder of the link's target.
 """
 
 import errno
@@ -23,7 +24,7 @@ _NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 def open_appending(path: str | Path) -> FileIO:
     """Open a file, or a character device, for appending and reading, without blocking. A new file gets the mode 0640.
-    The result has no buffer: a write that has returned is safe even if this process is killed next. Raises OSError."""
+    The result has no buffer: a write that has returned is safe even if this process is killed next."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
         descriptor, is_new = os.open(path, flags | os.O_EXCL, MODE), True
@@ -43,7 +44,7 @@ def open_appending(path: str | Path) -> FileIO:
 
 
 def append(file: BinaryIO, data: bytes) -> None:
-    """Append all of `data`. If that fails, cut the file back to its old length, where possible, and raise OSError."""
+    """Append all of `data`. If that fails, cut the file back to its old length, where possible."""
     end = file.seek(0, os.SEEK_END)
     try:
         rest = memoryview(data)
@@ -59,7 +60,7 @@ def append(file: BinaryIO, data: bytes) -> None:
 
 
 def sync(file: BinaryIO) -> None:
-    """Flush a regular file's data from the system's cache to the disk; do nothing for a device. Raises OSError."""
+    """Flush a regular file's data from the system's cache to the disk; do nothing for a device."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         os.fdatasync(file.fileno())
 
@@ -96,28 +97,26 @@ def is_at(file: BinaryIO, path: str | Path) -> bool:
 
 
 def keep_as_earlier(path: str | Path) -> None:
-    """Rename the full file NAME.jsonl to NAME.1.jsonl in its folder, replacing an older one. Raises OSError."""
+    """Rename the full file NAME.jsonl to NAME.1.jsonl in its folder, replacing an older one."""
     path = Path(os.path.realpath(path))
     os.replace(path, path.with_name(f"{path.stem}.1{path.suffix}"))
     sync_folder(path)
 
 
 def numbered(path: str | Path) -> list[Path]:
-    """List the numbered files of `path` (see the module), the lowest number first. Raises OSError."""
+    """List the numbered files of `path` (see the module), the lowest number first."""
     return [file for _, file in _numbered(Path(os.path.realpath(path)))]
 
 
 def relatives(path: str | Path) -> list[Path]:
-    """List the numbered files of `path`. If `path` is a numbered file itself (NAME-0003.jsonl), list those of
-    NAME.jsonl as well. Raises OSError."""
+    """List the numbered files of `path`. If `path` is a numbered file itself, list those of NAME.jsonl as well."""
     path = Path(os.path.realpath(path))
     match = _NUMBERED.fullmatch(path.stem)
     return numbered(path) + (numbered(path.with_name(match[1] + path.suffix)) if match else [])
 
 
 def claim(path: str | Path) -> Path:
-    """Create an empty file with the next number, so that no other process takes the number. Return its path. Raises
-    OSError."""
+    """Create an empty file with the next number, so that no other process takes the number. Return its path."""
     path = Path(os.path.realpath(path))
     for number in range(max((number for number, _ in _numbered(path)), default=0) + 1, _MOST_NUMBER + 1):
         claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
@@ -128,7 +127,7 @@ def claim(path: str | Path) -> Path:
 
 
 def set_aside(path: str | Path) -> Path:
-    """Rename a file to a numbered file with the next number, and return its new path. Raises OSError."""
+    """Rename a file to a numbered file with the next number, and return its new path."""
     target = claim(path)  # FAT has no hard links, and a plain rename would replace what is there
     try:
         os.replace(os.path.realpath(path), target)
@@ -140,30 +139,22 @@ def set_aside(path: str | Path) -> Path:
 
 
 def keep_within(path: str | Path, most_bytes: float) -> list[Path]:
-    """Delete numbered files of `path`: the smallest of more than `MOST_FILES`, then the oldest until the others take
-    at most `most_bytes` together. A file that a process has locked (see `try_lock`) stays. Return the paths of the
-    deleted files. Raises OSError."""
+    """Delete numbered files of `path`: the smallest of more than `MOST_FILES`, then the oldest until the others take at
+    most `most_bytes` together. A file that a process has locked stays. Return the paths of the deleted files."""
     sizes, deleted = {}, []
     for file in numbered(path):
         with suppress(FileNotFoundError):  # another process deletes as well
             status = os.lstat(file)
             if stat.S_ISREG(status.st_mode):
                 sizes[file] = status.st_size
-
-    def delete(file: Path) -> None:
-        if _is_free(file):
+    # Among files of about the same size the oldest goes first. The newest stays: its number would be used again.
+    smallest = sorted(list(sizes)[:-1], key=lambda file: sizes[file].bit_length())
+    too_many = smallest[: max(0, len(sizes) - MOST_FILES)]
+    for file in (*too_many, *sizes.copy()):
+        if file in sizes and (file in too_many or sum(sizes.values()) > most_bytes) and _is_free(file):
             file.unlink(missing_ok=True)
             del sizes[file]
             deleted.append(file)
-
-    # Among files of about the same size the oldest goes first. The newest stays: its number would be used again.
-    smallest = sorted(list(sizes)[:-1], key=lambda file: sizes[file].bit_length())
-    for file in smallest[: max(0, len(sizes) - MOST_FILES)]:
-        delete(file)
-    for file in list(sizes):
-        if sum(sizes.values()) <= most_bytes:
-            break
-        delete(file)
     return deleted
 
 

@@ -26,6 +26,7 @@ SOURCES = (
     "a folder of images, a video file, a camera (/dev/video0) or a stream (rtsp://, udp://, tcp://, http://, FILE.sdp)"
 )
 
+_LARGEST = 2**63
 _SHOWN = 80  # characters of a wrong value in a message
 
 T = TypeVar("T", bound="DataclassInstance")
@@ -188,9 +189,8 @@ class Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
-    """A configuration key: its dotted name ("source.rate_hz"), the type of its value (besides None), its lowest and
-    highest value, its flags on the command line (empty: none), the placeholder of their value (None: argparse's own),
-    and, as in `key`, their help text, the allowed values, and what a boolean flag sets."""
+    """A configuration key: its dotted name ("source.rate_hz"), the type of its value (besides None), its flags on the
+    command line (empty: none), the placeholder of their value (None: argparse's own), and the rest as in `key`."""
 
     name: str
     kind: type
@@ -219,10 +219,8 @@ def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
     """Load the shipped defaults, replace values by those of the file `path` (None: no file), then by `overrides`
-    ({"source.rate_hz": 2.0}; None values are ignored).
-
-    Raises ConfigError, whose message names the file, the key and what to do.
-    """
+    ({"source.rate_hz": 2.0}; None values are ignored). Raises ConfigError, which names the file, the key and what to
+    do."""
     defaults_path = shipped("deploy") / "config.yaml"
     merged = read_yaml(defaults_path)
     if path is not None:
@@ -300,6 +298,8 @@ def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key:
         return build(wanted, value, where, f"{key}.")
     if value is None:
         raise ConfigError(f"{where}: `{key}` has no value: write one.")
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        raise ConfigError(f"{where}: `{key}` is a number of too many digits: write a smaller one.")
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str):
@@ -315,8 +315,8 @@ def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key:
 
 
 def require_sayable(text: str, what: str) -> None:
-    """Check that `text` can be a file name and be printed. Raises ConfigError for a NUL character or half a character
-    (a lone surrogate). `what` is the beginning of the message, such as the file and the key."""
+    """Raise ConfigError if `text` cannot be a file name and be printed, for a NUL character or half a character (a lone
+    surrogate). `what` is the beginning of the message, such as the file and the key."""
     problem = "a NUL character" if "\0" in text else None
     try:
         os.fsencode(text)

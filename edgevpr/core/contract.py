@@ -1,8 +1,5 @@
 """The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place.
-
-A technique recognises places. It splits a picture into regions and scores hypotheses, such as rotations of the query.
-All of edgevpr uses techniques only through these types; `edgevpr/techniques` implements them.
-"""
+All of edgevpr uses techniques only through these types; `edgevpr/techniques` implements them."""
 
 import math
 from collections.abc import Sequence
@@ -167,9 +164,8 @@ class Technique(Protocol):
         turned_deg: np.ndarray | None = None,
         height_ratio: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places of the index, given as `rows` (N, *row.shape). Returns
-        * the scores, float32 (N,), and
-        * the score of each hypothesis that `match` can try, float32 (N, H), -inf if it is ruled out; None: no choice.
+        """Score all places of the index, given as `rows` (N, *row.shape). Returns the scores, float32 (N,), and the
+        score of each hypothesis that `match` can try, float32 (N, H), -inf if it is ruled out (None: no choice).
 
         `mean`: mean coarse part of the map, for a technique that packs (else None).
         `turned_deg`: expected `FineMatch.rotation_deg` of each place, float (N,), NaN: unknown. Other rotations are
@@ -185,7 +181,6 @@ class Technique(Protocol):
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Compare only a part of the query's regions with one place; arguments as of `match`. Returns
-        * an estimate of the score that `match` would give, and
-        * the best of the hypotheses, as the list for `match` (None: there is nothing to choose)."""
+        """Compare only a part of the query's regions with one place; arguments as of `match`. Returns an estimate of
+        the score that `match` would give, and the best of the hypotheses, as the list for `match` (None: no choice)."""
         ...

@@ -1,5 +1,5 @@
-"""Files: the shipped and the user's own folders; safe reading of files of any origin, which must be regular files of
-limited size; and writing of files that are complete or not there at all."""
+"""Files: the shipped and the user's own folders; safe reading of regular files of limited size; and writing of files
+that are complete or not there at all."""
 
 import errno
 import hashlib
@@ -35,7 +35,7 @@ def own_folder() -> Path:
 
 def own_models() -> Path:
     """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
-    models in the user's own folder."""
+    models in the user's own folder (`edgevpr` in XDG_DATA_HOME or ~/.local/share)."""
     return Path(os.environ.get("EDGEVPR_MODELS") or own_folder() / "models")
 
 
@@ -50,11 +50,9 @@ def find_model(file: str) -> Path | None:
 
 
 def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
-    """Open a regular file of at most `most_bytes` for reading, without blocking.
-
-    Raises OSError, with a `strerror` that fits into a sentence, also for a larger file, for a pipe, which would wait
-    for a writer, and for a device, which may never end.
-    """
+    """Open a regular file of at most `most_bytes` for reading, without blocking. Raises OSError, with a `strerror` that
+    fits into a sentence, also for a larger file, for a pipe, which would wait for a writer, and for a device, which may
+    never end."""
     handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
         status = os.fstat(handle.fileno())
@@ -110,12 +108,9 @@ def require_folder(path: Path) -> None:
 
 
 def write_whole(path: Path, write: Callable[[Path], T], instead: bool = True) -> T:
-    """Write a file completely or not at all. Call `write` with the path of a temporary file that it must write, flush
-    that to the disk, and rename it to `path`. Return the result of `write`.
-
-    If anything fails, as on a full disk, the temporary file is deleted. With `instead`, an existing file is replaced;
-    without it, FileExistsError is raised.
-    """
+    """Write a file completely or not at all: call `write` with the path of a temporary file that it must write, flush
+    that to the disk, and rename it to `path`. Return the result of `write`. If anything fails, the temporary file is
+    deleted. With `instead`, an existing file is replaced; without it, FileExistsError is raised."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         result = write(unfinished)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from difflib import get_close_matches
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
@@ -71,17 +72,11 @@ def meant(name: str, known: Iterable[str], otherwise: str) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Format rows of cells as a table, one line for each row. The first `left` columns are flush left, the others flush
-    right. Rows may have fewer cells than others."""
-    columns = range(max(len(row) for row in rows))
-    widths = [max(len(row[column]) for row in rows if column < len(row)) for column in columns]
-    return [
-        "  ".join(
-            cell.ljust(width) if column < left else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=False))
-        ).rstrip()
-        for row in rows
-    ]
+    """Format rows of cells as a table, one line for each row (which may be shorter than others). The first `left`
+    columns are flush left, the others flush right."""
+    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
+    lines = ([f"{cell:{'<' if at < left else '>'}{widths[at]}}" for at, cell in enumerate(row)] for row in rows)
+    return ["  ".join(line).rstrip() for line in lines]
 
 
 def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
@@ -130,9 +125,9 @@ def progress(
     stream: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[T]:
-    """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and
-    an estimate of the remaining time. `label` begins the line. On a terminal the line is redrawn; elsewhere a new line
-    is written for every tenth of the work (of unknown total: for every 100 items)."""
+    """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and an
+    estimate of the remaining time. On a terminal the line, which `label` begins, is redrawn; elsewhere a new line is
+    written for every tenth of the work (of unknown total: for every 100 items)."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     last_step, width, began_s = None, 0, clock()
@@ -162,8 +157,7 @@ def _time_left(passed_s: float, done: int, total: int) -> str:
 
 
 def waiting(text: str, stream: TextIO | None = None) -> None:
-    """Show on a terminal what the program waits for, in a line that the next call replaces; "" clears the line. If
-    `stream` (None: stderr) is no terminal, write nothing."""
+    """Show on a terminal what the program waits for, in a line that the next call replaces; "" clears the line."""
     stream = stream or sys.stderr
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")
@@ -171,10 +165,8 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
 
 
 def require_picture(path: Path) -> None:
-    """Check, before the work, that a figure can be written to `path` (.png, .pdf or .svg).
-
-    Raises UsageError for a wrong file name or a missing folder, EdgevprError if matplotlib is missing.
-    """
+    """Check, before the work, that a figure can be written to `path`. Raises UsageError for a wrong file name or a
+    missing folder, EdgevprError if matplotlib is missing."""
     if path.suffix.lower() not in _PICTURE_ENDINGS:
         raise UsageError(f"{path}: a picture's name ends in {', '.join(_PICTURE_ENDINGS)}: choose one of these.")
     require_folder(path)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -244,28 +244,16 @@ class FixReport:
 T = TypeVar("T")
 
 
-class Tape(Protocol):
-    """Records all values that enter a flight from outside, or plays a recording back. Values are JSON types or bytes.
-    `kind` is the name of the input, such as "frame"."""
+class Tape:
+    """Records all values that enter a flight from outside, or plays a recording back. This base class does neither.
+    Values are JSON types or bytes. `kind` is the name of the input, such as "frame"."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
         """Call `look` and record and return its result; in a replay, return the recorded result instead."""
-        ...
-
-    def note(self, kind: str, *values: Any) -> None:
-        """Record values that came without being asked for through `read`, also from another thread."""
-        ...
-
-
-class NoTape:
-    """A `Tape` that records nothing and replays nothing."""
-
-    def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Call `look` and return its result."""
         return look()
 
     def note(self, kind: str, *values: Any) -> None:
-        """Do nothing."""
+        """Record values that came without being asked for through `read`, also from another thread."""
 
 
-NO_TAPE = NoTape()
+NO_TAPE = Tape()

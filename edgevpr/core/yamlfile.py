@@ -1,5 +1,5 @@
-"""Reading of YAML files of any origin; the only module that imports PyYAML. Aliases and duplicate keys are errors, and
-size, depth and digits are limited, so that time and memory grow only with the length of the file."""
+"""Reading of YAML files of any origin; the only module that imports PyYAML. Aliases and duplicate keys are errors, so
+that time and memory grow only with the length of the file, which is limited."""
 
 from copy import deepcopy
 from functools import cache, lru_cache
@@ -10,21 +10,19 @@ from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import read_file
 
 MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads some 100,000 a second
-_MOST_LEVELS = 20
-_LARGEST_NUMBER = 2**63
-_MERGE = "tag:yaml.org,2002:merge"
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML mapping; an empty file gives {}. Raises ConfigError for a file that is missing, unreadable, too large
-    or not a mapping, for a duplicate key, and for aliases (`*name`, `<<`), which can make a small file huge."""
+    or not a mapping, for a duplicate key, and for aliases (`*name`), which can make a small file huge."""
     import yaml  # not at the top: the command line lists its flags without it
 
     try:
         content = deepcopy(_content(read_file(path, MAX_FILE_BYTES).decode("utf-8-sig")))
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # an impossible date is a ValueError
+    # An impossible date or a number of 5000 digits is a ValueError, deep nesting a RecursionError.
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or str(error)
@@ -39,7 +37,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 # Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
 @lru_cache(maxsize=32)
 def _content(text: str) -> Any:
-    """Parse a YAML text. Cached: the caller must not change the result. Raises YAMLError, ValueError, OverflowError."""
+    """Parse a YAML text. Cached: the caller must not change the result."""
     import yaml
 
     return yaml.load(text, _loader())
@@ -51,27 +49,17 @@ def _loader() -> type:
     import yaml
 
     class StrictLoader(yaml.SafeLoader):
-        """Loader that refuses aliases, merges, duplicate keys, deep nesting and huge whole numbers."""
-
-        levels = 0
+        """Loader that refuses aliases and duplicate keys."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
             if isinstance(event, yaml.AliasEvent):
                 raise _problem(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
-            if self.levels > _MOST_LEVELS:
-                raise _problem(f"more than {_MOST_LEVELS} levels", event.start_mark)
-            self.levels += 1
-            try:
-                return super().compose_node(parent, index)
-            finally:
-                self.levels -= 1
+            return super().compose_node(parent, index)
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
             lines: dict[str, int] = {}
             for key, _ in node.value:
-                if key.tag == _MERGE:
-                    raise _problem("the merge `<<`: write its keys out", key.start_mark)
                 if isinstance(key, yaml.ScalarNode):
                     if key.value in lines:
                         said = f"the key `{key.value}` stands in line {lines[key.value]} already"
@@ -79,15 +67,7 @@ def _loader() -> type:
                     lines[key.value] = key.start_mark.line + 1
             return super().construct_mapping(node, deep)
 
-        def construct_yaml_int(self, node: Any) -> int:
-            value = super().construct_yaml_int(node)
-            if abs(value) > _LARGEST_NUMBER:
-                raise _problem("a number of too many digits", node.start_mark)
-            return value
-
     def _problem(said: str, mark: Any) -> yaml.YAMLError:
         return yaml.constructor.ConstructorError(None, None, said, mark)
 
-    # PyYAML looks constructors up by tag, not by name.
-    StrictLoader.add_constructor("tag:yaml.org,2002:int", StrictLoader.construct_yaml_int)
     return StrictLoader

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import Tape
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.line import LOST
@@ -127,7 +128,7 @@ class ReplayedSigning(NotSigning):
         return reason is None
 
 
-class Playback:
+class Playback(Tape):
     """A tape that is played back. `links` has, by the name of a link, the function that performs its turns; they are
     performed in the order of the tape. `packets` compares the packets sent. `link` and `ground` are the classes of the
     links that a replay uses.
@@ -171,9 +172,6 @@ class Playback:
         if _is_moment(kind):
             self.t_s = max(self.t_s, found)
         return cast(T, found)
-
-    def note(self, kind: str, *values: Any) -> None:
-        """Do nothing: a replay is not recorded."""
 
     def sleep(self, seconds: float) -> None:
         """Return at once: the time comes from the tape."""

@@ -4,30 +4,29 @@ Map building, flights and evaluations make every technique here; its module is i
 package, is Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*.
 """
 
-import importlib
 import inspect
 from collections.abc import Callable
 from functools import partial
+from pkgutil import resolve_name
 from typing import Any
 
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import meant
 
-# Each technique of edgevpr itself: its module, the class or function there that makes it, and the output of its network
-# that it uses (None: it has no network).
-_OWN: dict[str, tuple[str, str, str | None]] = {
-    "cohog": ("cohog", "CoHog", None),
-    "hog": ("vectors", "Hog", None),
-    "seqslam": ("seqslam", "SeqSlam", None),
-    "calc": ("network", "calc", "descriptor"),
-    "alexnet": ("network", "alexnet", "features"),
-    "amosnet": ("network", "amosnet", "features"),
-    "hybridnet": ("network", "hybridnet", "features"),
-    "netvlad": ("network", "netvlad", "features"),
-    "rmac": ("regions", "rmac", "features"),
-    "region_vlad": ("network", "region_vlad", "features"),
-    "cross_region_bow": ("regions", "cross_region_bow", "features"),
+# The class or function that makes each technique of edgevpr itself.
+_OWN = {
+    "cohog": "cohog:CoHog",
+    "hog": "vectors:Hog",
+    "seqslam": "seqslam:SeqSlam",
+    "calc": "network:calc",
+    "alexnet": "network:alexnet",
+    "amosnet": "network:amosnet",
+    "hybridnet": "network:hybridnet",
+    "netvlad": "network:netvlad",
+    "rmac": "regions:rmac",
+    "region_vlad": "network:region_vlad",
+    "cross_region_bow": "regions:cross_region_bow",
 }
 # Chosen without being asked for: the first that fits the board. Networks must be asked for: they need onnxruntime in
 # RAM, and weights that a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
@@ -37,12 +36,16 @@ _WORDS = {int: "a whole number", float: "a number", str: "a word"}
 
 def names() -> tuple[str, ...]:
     """Return the names of all techniques: those of edgevpr, then the networks whose cards make a vector by themselves.
+    A card that cannot be read is left out."""
+    from edgevpr.techniques.card import card_names, load_card
 
-    A card that cannot be read is left out. To `create` it by name raises an error that says what is wrong.
-    """
-    from edgevpr.techniques.card import card_names
+    def is_technique(card: str) -> bool:
+        try:
+            return load_card(card).is_technique
+        except EdgevprError:
+            return False
 
-    return (*_OWN, *(name for name in card_names() if not is_own(name) and _is_technique(name)))
+    return (*_OWN, *(name for name in card_names() if not is_own(name) and is_technique(name)))
 
 
 def is_own(name: str) -> bool:
@@ -64,15 +67,17 @@ def parameters(name: str) -> dict[str, Any]:
 
 
 def labelled(name: str, form: str | None) -> str:
-    """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The form is left out if
-    it is `float`, the default, or None (the technique has no forms)."""
+    """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The default form `float`,
+    and None (the technique has no forms), are left out."""
     return name if form in (None, "float") else f"{name} {form}"
 
 
 def network_output(name: str) -> str | None:
-    """Return the output of its network that the technique `name` uses, "features" or "descriptor". None for a technique
-    of edgevpr without a network, and for one made from a card alone."""
-    return _OWN[name][2] if is_own(name) else None
+    """Return the output of the network of its `model` that a technique of edgevpr uses, "features" or "descriptor".
+    None for a technique without such a parameter."""
+    if "model" not in parameters(name):
+        return None
+    return "descriptor" if name == "calc" else "features"
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
@@ -98,11 +103,9 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _maker(name: str) -> Callable[..., Any]:
-    """Return the class or function that makes the technique `name`. The parameters in its signature are those of the
-    technique. Raises as `parameters` does."""
+    """Return what makes the technique `name`; its signature has the parameters. Raises as `parameters` does."""
     if is_own(name):
-        module, maker, _ = _OWN[name]
-        own: Callable[..., Any] = getattr(importlib.import_module(f"edgevpr.techniques.{module}"), maker)
+        own: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_OWN[name]}")
         return own
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")
@@ -114,12 +117,3 @@ def _maker(name: str) -> Callable[..., Any]:
     from edgevpr.techniques.network import of_card
 
     return partial(of_card, card)
-
-
-def _is_technique(card: str) -> bool:
-    from edgevpr.techniques.card import load_card
-
-    try:
-        return load_card(card).is_technique
-    except EdgevprError:
-        return False

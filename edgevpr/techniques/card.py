@@ -101,8 +101,7 @@ def digest_of(values: list[Any]) -> str:
 
 
 def _used(part: InputRule | Outputs) -> dict[str, Any]:
-    """Return a section of a card as a dict, without keys that were added to cards later and are not used here: words
-    and maps made before then keep their fingerprint."""
+    """Return a section of a card as a dict, without unused keys that were added later: fingerprints stay the same."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 

@@ -3,16 +3,17 @@
 A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
 uses only its *good* blocks, those of high entropy. Each of them finds its most similar block in the place. In the
 thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the
-displacement of the picture, and the score is the share of votes that agree (`matching: displacement`, see
-`displacement`). With a forward camera the score of the scan counts too.
+displacement of the picture, and the score is the share of votes that agree (see `displacement`). With a forward camera
+the score of the scan counts too.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
-places that are compared in full. With a forward camera it is the same blocks averaged over a grid, 144 bytes (see
-`placecode`). With a nadir camera (one that looks straight down) it is a hundred words, 200 bytes (see `placewords`).
+places that are compared in full: 144 bytes with a forward camera (see `placecode`), 200 bytes with a nadir camera, one
+that looks straight down (see `placewords`).
 """
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,7 @@ _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
+_MATCHINGS = ("displacement", "thesis")
 _CANDIDATES = {"forward": 42, "nadir": 50}
 # Places compared in full, those with the best `glance`. On corridor, the seasons and nordland_tiny 12 of 42, and on all
 # aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full (of
@@ -64,8 +66,8 @@ class CoHog:
 
     `entropy` is "shannon" or "filled_bins". With `camera` "nadir" the picture is put into a square with its proportions
     kept, so that a rotated picture shows the same ground. A query is tried from five heights (with `matching` "thesis"
-    from one) in 24 rotations, and `words` is the file of words (see `placewords.load`). The map records `camera` and
-    `words`. It does not record `matching`, "displacement" or "thesis": both read the same map.
+    from one) in 24 rotations, and `words` is the file of words. The map records all but `matching`: either reads the
+    same map.
     """
 
     w1: int = 512
@@ -91,36 +93,33 @@ class CoHog:
         self._query: Descriptor | None = None
         self._views: Views | None = None
         self._regions_of: dict[int, ViewRegions] = {}
-        numbers = {"w1": self.w1, "w2": self.w2, "bins": self.bins, "gt": self.gt}
-        self.spec = TechniqueSpec(
-            name="cohog",
-            parameters={**numbers, "entropy": self.entropy, "camera": self.camera},
-            coarse=PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1"),
-            fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
-            packed=PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
-            scan_counts=self._votes,
-            in_full=_IN_FULL[self.camera] if self._votes else None,
-        )
+        heights: dict[str, Any] = {}
         if self._is_nadir:
             self._vocabulary = placewords.load(self.words)
             # The thesis's score does not tell which of two heights is right.
             whole = range(len(HEIGHT_RATIOS) * ROTATIONS)
             self._hypotheses = whole if self._votes else whole[as_it_is : as_it_is + ROTATIONS]
-            self.spec = replace(
-                self.spec,
-                parameters={**self.spec.parameters, "words": self.words},
-                coarse=PartSpec((placewords.SIDE**2,), placewords.DTYPE),
-                packed=None,
-                scan_counts=False,  # it adds nothing
-                heading_within_deg=_HEADING_WITHIN_DEG,
-                cells=self.w1 // self.w2 if self._votes else None,
-                height_ratios=HEIGHT_RATIOS if self._votes else (),
-            )
+            heights = {"heading_within_deg": _HEADING_WITHIN_DEG}
+            if self._votes:
+                heights |= {"cells": self.w1 // self.w2, "height_ratios": HEIGHT_RATIOS}
+        code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
+        recorded = ("w1", "w2", "bins", "gt", "entropy", "camera", *(("words",) if self._is_nadir else ()))
+        self.spec = TechniqueSpec(
+            name="cohog",
+            parameters={key: getattr(self, key) for key in recorded},
+            coarse=PartSpec((placewords.SIDE**2,), placewords.DTYPE) if self._is_nadir else code,
+            fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
+            packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
+            scan_counts=self._votes and not self._is_nadir,
+            in_full=_IN_FULL[self.camera] if self._votes else None,
+            **heights,
+        )
 
     def _require_parameters(self) -> None:
-        _require("entropy", self.entropy, _DEFAULT_GT)
-        _require("camera", self.camera, _VOTES_COUNT)
-        _require("matching", self.matching, ("displacement", "thesis"))
+        allowed: dict[str, Collection[str]] = {"entropy": _DEFAULT_GT, "camera": _VOTES_COUNT, "matching": _MATCHINGS}
+        for what, values in allowed.items():
+            if (value := getattr(self, what)) not in values:
+                raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(values))}.")
         w1, w2, bins = self.w1, self.w2, self.bins
         if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
@@ -157,12 +156,8 @@ class CoHog:
         )
 
     def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Compute the blocks of a square picture in cells of `cell_px` pixels (`allowed` None: all pixels are). Returns
-
-        * the blocks float32 (n, n, 4 bins),
-        * which of them lie on allowed pixels only, bool (n, n),
-        * which of these are good, bool (n, n).
-        """
+        """Compute the blocks float32 (n, n, 4 bins) of a square picture, and which of them are seen, and good: bool (n,
+        n)."""
         blocks = normalised_blocks(oriented_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             seen = np.ones(blocks.shape[:2], bool)
@@ -185,11 +180,10 @@ class CoHog:
         """Score all places. With a forward camera `rows` are place codes uint8 (N, B), compared under shifts. With a
         nadir camera they are words uint16 (N, 100), compared from the one of five heights that is nearest to
         `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera since each place was mapped:
-        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Returns
+        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all).
 
-        * scores float32 (N,) in 0..1,
-        * the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried. None with
-          a forward camera.
+        Returns scores float32 (N,) in 0..1 and, with a nadir camera, the score of each hypothesis, float32 (N, 120): 24
+        rotations from each height, -inf if not tried.
         """
         views = self._views_of(query)
         if not self._is_nadir:
@@ -216,16 +210,15 @@ class CoHog:
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
         """Return the slow patterns float32 (G, 20) of the good regions of a view of the query (see `views`), and their
-        numbers int (G,) on its grid. The view has the height ratio `ratio` and a rotation of `turn` steps of 15
-        degrees."""
+        numbers int (G,) on its grid. `turn` is its rotation in steps of 15 degrees."""
         view = self._views_of(query).regions(ratio, turn, self._patterns)
         return view.regions, view.numbers
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
-        regions of the query and B those of the place, then the score by `matching`. Without a good region the score is
-        0. A nadir query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The best one counts,
-        and `align` refines its shift, rotation and height."""
+        regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
+        query is tried under `hypotheses` (None: all). The best counts, and `align` refines its shift, rotation and
+        height."""
         reference = self._reference(fine)
         matches = {each: self._matched(self._view(query, each), reference) for each in self._tried(hypotheses)}
         best = max(matches, key=lambda each: matches[each].score)
@@ -254,10 +247,7 @@ class CoHog:
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
         """Estimate the score of `match` from a quarter of the good regions or, at other heights, about as many. Returns
-
-        * the estimated score,
-        * the hypothesis of that score, as a list of one. None with a forward camera.
-        """
+        it and, with a nadir camera, the hypothesis of that score, as a list of one."""
         reference = self._reference(fine)
         scores = {}
         for number in self._tried(hypotheses):
@@ -296,8 +286,7 @@ class CoHog:
         return self._views
 
     def _comparable(self, blocks: Singles) -> Singles:
-        """Convert blocks float32 (N, 4 bins) to the form in which they are compared, each of length 1. For the
-        displacement vote that is their slow patterns (N, patterns); for the thesis's score they stay as they are."""
+        """Convert blocks float32 (N, 4 bins) to the vectors of length 1 that `matching` compares."""
         return self._patterns(blocks) if self._votes else unit_rows(blocks)
 
     def _patterns(self, regions: Singles) -> Singles:
@@ -321,14 +310,8 @@ class CoHog:
         )
 
 
-def _require(what: str, value: str, allowed: Collection[str]) -> None:
-    if value not in allowed:
-        raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(allowed))}.")
-
-
 def _middle(per_block: Array, seen: Bools) -> Array:
-    """Cut out the middle square (n, n, ...), n at least 12, of values per block (side, side, ...), so that it holds no
-    border where the picture was put into a larger square. `seen` bool (side, side) is True where there is picture."""
+    """Cut out the middle square, at least 12 wide, of values per block, so that it holds no border of the picture."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), placecode.SIDE)
     start = (len(seen) - n) // 2
     return per_block[start : start + n, start : start + n]

@@ -2,11 +2,11 @@
 
 Every good region of the query finds its most similar region of the place, the *reference*. The shift between the two,
 in cells, is its vote. If the place is the same, the votes pile up on one shift; if it is another place, they scatter.
-The score is the share of the votes at the peak: it says how many regions agree, which a mean of cosines does not.
+The score is the share of the votes at the peak.
 
-A picture of another kind (a screen, a test card, a view ahead in a map made looking down) has many regions that
-resemble the same few regions of the place: a line here and a line there. Their votes can pile up as well. So the
-regions of the place that the agreeing votes lead to are counted, each once. Regions are numbered row by row.
+A picture of another kind (a screen, a test card) has many regions that resemble the same few regions of the place.
+Their votes can pile up as well. So the regions of the place that the agreeing votes lead to are counted, each once.
+Regions are numbered row by row.
 """
 
 import math
@@ -89,10 +89,9 @@ def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float,
 def support(
     asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
 ) -> Support:
-    """Measure how all regions of query and place support the shift that a vote has found (see `Support`). `asking` int
-    (G,) and `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side
-    * side, P) are all regions of the place, `best` int (G,) the most similar of them for each. The grids have one
-    size."""
+    """Measure how all regions of query and place support the shift that a vote has found. `asking` int (G,) and
+    `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side * side,
+    P) are all regions of the place, `best` int (G,) the most similar of them for each. The grids have one size."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
@@ -113,9 +112,8 @@ def support(
 
 
 def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
-    """Rank all regions of the place, `reference`, by similarity to each of `regions` float32 (n, P). Return the mean
-    natural logarithm of the rank of the region expected at column `x` and row `y`, int (n,), or of the most similar of
-    the eight around it, from 0 (always the most similar). Positions that are not on the grid are left out."""
+    """Return the mean logarithm of the rank, by similarity to each region (n, P), of the best of the 3x3 at `x`,
+    `y`."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
@@ -129,12 +127,7 @@ def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int)
 
 
 def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> tuple[Ints, Singles, Array]:
-    """Count the votes by shift; `room` is one less than the number of `counts`. Returns
-
-    * the number of the shift of each vote, int (G,),
-    * the votes of each shift, float32 (W, W),
-    * the weighted sum around each possible shift, float32 (W - 2 room, W - 2 room).
-    """
+    """Return the number of the shift of each vote, the votes of each shift, and the weighted sums around each shift."""
     # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
     # border around the possible shifts leaves room for the square around the peak.
     room = len(counts) - 1
@@ -178,8 +171,8 @@ def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Align
     grid. Only pairs that agree on the shift `shift_cells` are used. Returns None if fewer than 8 agree, or if the
     rotation or scale found belongs to another hypothesis.
 
-    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis. This error makes
-    regions far from the middle miss. So the fit is repeated, each time with the regions that agree with the last one.
+    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis, so regions far from
+    the middle miss. So the fit is repeated, each time with the regions that agree with the last one.
     """
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)

@@ -1,8 +1,8 @@
 """Entropy of an image around each pixel, and the blocks of high entropy: the good blocks of CoHOG (thesis 6.2.1).
 
 There are two entropy maps, both in 0..1. Both take the histogram of the intensities inside a disc around each pixel (81
-pixels for radius 5), counting only pixels inside the image. They divide the result by 8 bits, the most that 256
-intensities can have. `cohog` asks only which blocks are good, and `good_blocks` answers mostly without computing a map.
+pixels for radius 5), counting only pixels inside the image, and divide the result by 8 bits, the most that 256
+intensities can have. `good_blocks` mostly answers without computing a map.
 """
 
 from collections.abc import Callable
@@ -64,9 +64,9 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
     """Tell which blocks are good (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result
     equals `block_means(filled_bins(grey), cell_px) >= threshold`, or that of `shannon`, as `which` names.
 
-    Cheap bounds of the entropy decide nearly every block; they cost a tenth of the map. Only the pixels under the other
-    blocks are computed exactly. `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
-    (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
+    Cheap bounds of the entropy decide nearly every block, and only the pixels under the others are computed exactly.
+    `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1),
+    False where `among`, bool of this shape, is False (True: consider all).
     """
     bounds = _BOUNDS[which](grey, cell_px)
     low = bounds.low
@@ -82,9 +82,8 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bounds:
-    """Lower and upper bounds `low` and `high` of an entropy, float32 (h, w), at the points of a grid over the image.
-    The means over the blocks are `down` @ values @ `across`.T, with `down` (rows, h) and `across` (columns, w) nowhere
-    negative. `exact` computes the entropy at the True points of a bool (h, w), one value each."""
+    """Bounds `low` and `high` of an entropy, float32 (h, w), on a grid over the image. Their means over the blocks are
+    `down` @ values @ `across`.T. `exact` computes the entropy at the True points of a bool (h, w), one value each."""
 
     low: Array
     high: Array
@@ -98,17 +97,14 @@ class _Bounds:
 
 
 def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*.
-
-    n different intensities never have more than n different endings. If all intensities around a pixel lie within 64 k
-    values, at most k of them share an ending.
-    """
+    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*."""
     r = DISC_RADIUS_PX
     padded = _replicated(grey, r)
     at_least = np.empty(grey.shape, np.uint8)
     for top in range(0, len(grey), _STRIP_ROWS):
         endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
         at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
+    # n intensities have at most n endings; of those within 64 k values at most k share one.
     at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # saturates at 255
 
     def exact(cells: Bools) -> Singles:
@@ -126,12 +122,10 @@ def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
 
 
 def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound `shannon` at each pixel of its 100x100 copy, from the last four bits of the intensities, their *endings*.
-
-    The entropy of the endings is never more than that of the whole intensities. If all intensities around a pixel lie
-    within 16 k values, the other bits add at most log2 k bits.
-    """
+    """Bound `shannon` at each pixel of its 100x100 copy, from the last four bits of the intensities, their
+    *endings*."""
     small = _shannon_copy(grey)
+    # The entropy of the endings is at most that of all bits; within 16 k values the others add at most log2 k.
     low = _shannon_of(small & 15, DISC_RADIUS_PX)
     high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
@@ -160,8 +154,8 @@ def _pairs(cells: int) -> Array:
 
 @lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
-    """Return the matrix float32 (cells - 1, 100) that does three things to a row of the copy: enlarge it to `side_px`
-    pixels, average it in cells of `cell_px` pixels, and average each cell and the next one."""
+    """Return the matrix float32 (cells - 1, 100) that enlarges a row of the copy and averages it over `_pairs` of
+    cells."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
@@ -175,8 +169,8 @@ def _range(grey: Bytes) -> Array:
 
 
 def _replicated(grey: Bytes, radius_px: int) -> Array:
-    """Pad `grey` with copies of its border. This adds no intensity to any disc: a pixel outside takes the value of the
-    nearest pixel inside, which is nearer to the middle of the disc."""
+    """Pad `grey` with copies of its border, which add no intensity to any disc: the pixel copied is nearer the
+    middle."""
     r = radius_px
     return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
 
@@ -188,10 +182,8 @@ def _bit(grey: Bytes) -> NDArray[np.uint64]:
 
 
 def _different(padded: Bytes, radius_px: int) -> Array:
-    """Count the different intensities in each disc: uint8 (..., H + 2r, W + 2r) to int16 (..., H, W).
-
-    A set of intensities is 256 bits in four words. The union of the sets of a disc's pixels has one bit per intensity.
-    """
+    """Count the different intensities in each disc, by unions of sets of 256 bits: (..., H + 2r, W + 2r) to (..., H,
+    W)."""
     bit, word_of = _bit(padded), padded >> 6
     unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
@@ -233,11 +225,7 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
 
 
 def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
-    """Combine each plane over discs by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W).
-
-    The disc is a stack of rows. Each row is widened once for all rows of the disc that have its width. All planes are
-    treated as one flat array, in which a row runs on into the next. This gives wrong values in the padding only.
-    """
+    """Combine each plane over discs by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W)."""
     r, pitch = radius_px, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]
     flat = planes.ravel()

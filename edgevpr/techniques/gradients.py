@@ -41,11 +41,8 @@ _KEPT = (
 
 
 def grey_square(image: Image, side_px: int) -> Array:
-    """Convert a uint8 image, (H, W) grey or (H, W, 3) BGR, to float32 grey (side_px, side_px), 0 to 255.
-
-    The values are not rounded to grey levels. A small picture that is enlarged has values between the levels, which
-    processors round differently, and a map must work on any of them.
-    """
+    """Convert a uint8 image, (H, W) grey or (H, W, 3) BGR, to float32 grey (side_px, side_px), 0 to 255. The values are
+    not rounded to grey levels: processors would round those between two levels differently."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
 
@@ -63,11 +60,8 @@ def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
 
 
 def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Put a picture into the middle of a square, its border repeated outwards. Returns
-
-    * the square,
-    * bool (side, side), True for pixels of the picture that `mask` allows (None: all).
-    """
+    """Put a picture into the middle of a square, its border repeated outwards. Returns it, and bool (side, side), True
+    for pixels of the picture that `mask` allows (None: all)."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
@@ -129,9 +123,8 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
     orientation of the diagonal gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the
     x axis if g < 0. v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi) need no angle, and g = v (_P m + _R u) / (_Q m +
-    u) to 2e-6 m. The signs of dx and dy tell the diagonal, of four, and the direction of an axis. So each plane is
-    summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums and
-    differences of these sums are the orientations.
+    u) to 2e-6 m. Each plane is summed over the cells once as it is, and once with its sign bits flipped by those of dx,
+    dy or both, which tell diagonal and direction. Sums and differences of these sums are the orientations.
     """
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
@@ -204,10 +197,9 @@ def slow_patterns(bins: int) -> Singles:
     """Return the patterns of low frequency, which hold most of the information of a block of 2x2 cells of `bins`
     orientations. They are orthonormal: float32 (4 bins, patterns), one pattern per column.
 
-    A block is written as waves over the cells (their mean, left against right, top against bottom, and diagonal against
-    diagonal) and over the orientations (the frequencies of a Fourier series). Most of its power lies in the low
-    frequencies. Of the 32 patterns of 8 orientations, the 20 with the most power on the data sets used for tuning are
-    kept. This shortens the product that compares all blocks with all blocks by as much, and recall does not fall.
+    A block is written as waves over the cells (mean, left against right, top against bottom, diagonal against diagonal)
+    and over the orientations (the frequencies of a Fourier series). Of the 32 patterns of 8 orientations, the 20 with
+    the most power on the data sets used for tuning are kept: comparing blocks is faster, and recall does not fall.
     """
     frequency = _frequencies(bins)
     return np.vstack(
@@ -223,8 +215,7 @@ def slow_patterns(bins: int) -> Singles:
 @lru_cache
 def waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
-    1. The constant comes first, then cosine and sine of each frequency. The highest of an even number has a cosine
-    only."""
+    1. The constant comes first, then cosine and sine of each frequency (the highest of an even number: cosine only)."""
     turn = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))

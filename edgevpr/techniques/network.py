@@ -81,11 +81,9 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
     L1 difference.
 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
-    `conv5` of a network trained on the places of SPED, with spatial pyramid pooling. A network is AMOSNet only with its
-    weights, trained from scratch: give their card as `model`.
-
-    The vector is divided by its sum. The L1 difference then compares the distribution of the activations, not their
-    total, and lies in 0..2. On corridor and aerial_caliterra, the data sets used for tuning, this finds more places.
+    `conv5` of a network trained from scratch on the places of SPED (give its card as `model`), with spatial pyramid
+    pooling. The vector is divided by its sum: the L1 difference then compares the distribution of the activations, not
+    their total, and finds more places on the data sets used for tuning.
     """
     return _pyramid("amosnet", model, form, threads, levels)
 
@@ -106,9 +104,9 @@ def netvlad(
     by cosine. The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1. The paper trains words and network together, for VGG-16. Here the words are learned afterwards
-    (`edgevpr train words`), which is how the paper starts (its section 3.1). The vector is whitened only if the file of
-    the words holds a whitening.
+    thesis 4.2.1. The paper trains words and network together. Here the words are learned afterwards (`edgevpr train
+    words`), which is how the paper starts (its section 3.1). The vector is whitened only if the file of the words holds
+    a whitening.
     """
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
@@ -132,8 +130,8 @@ def region_vlad(
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length
-    1 (see `regions`), and so has each word's part of the vector. The authors' code takes the signed square root of
-    these parts instead; on corridor and aerial_caliterra, the data sets used for tuning, that finds fewer places.
+    1, and so has each word's part of the vector. The authors' code takes the signed square root of these parts instead,
+    which finds fewer places on the data sets used for tuning.
     """
     backbone = region_backbone("region_vlad", model, threads, regions)
     learned = load_words(model, "regions", words)
@@ -147,10 +145,8 @@ def region_vlad(
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of its network. It has no parameters, since the model hash in a map
-    covers them.
-
-    The margins of its wrong matches are unknown: no match is accepted until the configuration sets a minimum margin.
-    """
+    covers them. The margins of its wrong matches are unknown: nothing is accepted until the configuration sets a
+    minimum."""
     backbone = backbone_of(card, "descriptor", threads)
     sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)

@@ -1,10 +1,9 @@
 """The coarse stage of `cohog` for a camera that looks ahead: a place is 144 bytes, found even if the camera has moved.
 
 The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean grid is subtracted. The L
-orientations of each cell are written as a Fourier series of L numbers, and only their signs are kept, one bit each.
-Without the series the signs would repeat half of their information, since neighbouring orientations rise and fall
-together. A query is compared under every shift of its grid. Each such *hypothesis* is one row of a matrix, the places
-of the map are another matrix, and one product compares them all.
+orientations of each cell are written as a Fourier series of L numbers, since neighbouring orientations rise and fall
+together, and only their signs are kept, one bit each. A query is compared under every shift of its grid. Each such
+*hypothesis* is one row of a matrix, the places of the map are another matrix, and one product compares them all.
 """
 
 from functools import lru_cache
@@ -43,11 +42,8 @@ def grid(blocks: Singles) -> Singles:
 
 
 def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Returns
-
-    * the grid float32 (12, 12, L),
-    * bool (12, 12), True where at least half of the cell is seen.
-    """
+    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Returns the grid float32 (12, 12, L), and
+    bool (12, 12), True where at least half of the cell is seen."""
     n, bins = len(blocks), blocks.shape[2] // 4
     source = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
     at = _sources(n)
@@ -57,8 +53,8 @@ def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
 
 
 def special(grids: Floats, mean: Floats) -> Array:
-    """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L), which leaves what sets a picture apart, and
-    write the orientations of each cell as a Fourier series. The result is float32 of the shape of `grids`."""
+    """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
+    Fourier series: float32 of the shape of `grids`."""
     apart: Array = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
     return apart
 
@@ -101,8 +97,8 @@ def scan(asked: Singles, codes: Bytes) -> Singles:
 
 
 def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
-    """Compare as `scan` does, but faster: all places under a quarter of the shifts, then the best 500 places under all.
-    Each shift of the quarter is averaged with those around it, so that none is missed."""
+    """Compare as `scan` does, but faster: all places under a quarter of the shifts, each averaged with those around it,
+    then the best 500 places under all."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
     scores = scan(_blurred() @ asked, codes)

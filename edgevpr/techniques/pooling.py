@@ -50,11 +50,10 @@ class Projection:
     """Gaussian random projection of n values to `length` values, in a form that fits a small board: `spectrum`
     complex128 (n // 2 + 1,), the conjugate Fourier transform of a Gaussian vector, and `signs` float32 (n,), -1 or 1.
 
-    A matrix of Gaussian values keeps the angles between vectors to about 1 / sqrt(dimensions). For the 43 008
-    activations of CALC and 1064 dimensions it takes 183 MB, and drawing it anew for each picture takes far longer than
-    the network. Here its rows are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
-    activation (Hinrichs and Vybíral 2011). Each row is still Gaussian, and angles are kept as well. The matrix is two
-    vectors (0.5 MB). The product is a correlation, which the Fourier transform computes in a twentieth of the time.
+    A matrix of Gaussian values keeps the angles between vectors. For the 43 008 activations of CALC and 1064 dimensions
+    it takes 183 MB. Here its rows are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
+    activation (Hinrichs and Vybíral 2011): angles are kept as well, and the product is a correlation, which the Fourier
+    transform computes in a twentieth of the time.
     """
 
     spectrum: Array
@@ -105,7 +104,7 @@ def square_regions(height: int, width: int) -> list[Square]:
 
     At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
     one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
-    Raises ModelError for a feature map so small that a square of the last scale is not one activation wide.
+    Raises ModelError for a feature map less than 2 wide.
     """
     short, long = min(height, width), max(height, width)
     if 2 * short // (_RMAC_SCALES + 1) < 1:
@@ -127,11 +126,8 @@ def square_regions(height: int, width: int) -> list[Square]:
 
 
 def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
-    """Return the largest activation of each channel in each of R squares, of length 1: (C, H, W) to float32 (R, C).
-
-    The signed square root is taken first, the power normalisation of the thesis (4.2). The paper whitens by PCA
-    instead, which would have to be learned.
-    """
+    """Return the largest activation of each channel in each of R squares, of length 1: (C, H, W) to float32 (R, C). The
+    signed square root is taken first, the power normalisation of the thesis (4.2); the paper whitens by PCA."""
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
     return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
 

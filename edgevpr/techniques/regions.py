@@ -58,7 +58,7 @@ class RegionTechnique(VectorTechnique):
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
         """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `mutual_score`). A descriptor that
-        was read from a map has no float regions, and scores 0. `hypotheses` are not used."""
+        was read from a map has no float regions, and scores 0."""
         return FineMatch(0.0 if query.regions is None else mutual_score(query.regions, from_bytes(fine)))
 
 
@@ -68,8 +68,8 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
     the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched
-    mutually, and the cosines of the mutual pairs are summed, without a check of geometry. The coarse part is the sum of
-    the squares' vectors, which the paper compares by cosine. The quality is the share of squares with any activation.
+    mutually, without a check of geometry. The coarse part is the sum of the squares' vectors, which the paper compares
+    by cosine. The quality is the share of squares with any activation.
     """
     backbone = open_backbone(model, "features", threads)
     squares = square_regions(*backbone.shape[1:])
@@ -110,8 +110,8 @@ def cross_region_bow(
 
 def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
     """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
-    ModelError for a feature map that is too small for regions or has no activation above zero, and UsageError for a
-    number of regions outside 1 to 10 000."""
+    ModelError for a feature map that is too small or has no activation above zero, UsageError for not 1 to 10 000
+    regions."""
     if not 1 <= regions <= 10_000:
         raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
     backbone = open_backbone(model, "features", threads)

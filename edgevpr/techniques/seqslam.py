@@ -1,8 +1,8 @@
-"""`seqslam`: small patch-normalised pictures, compared by their absolute differences, in sequences.
+"""`seqslam`: small patch-normalised pictures, compared by their absolute differences, in sequences (Milford and Wyeth
+2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights").
 
-Milford and Wyeth 2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights". This
-file computes the difference of one picture from every place and enhances its local contrast. `places.sequence` searches
-the trajectories, for this technique by default.
+This file computes the difference of one picture from every place and enhances its local contrast. `places.sequence`
+searches the trajectories, for this technique by default.
 """
 
 import math
@@ -48,10 +48,8 @@ class SeqSlam:
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse uint8 (height * width,): 128 + 28 times the deviation of a pixel from its
-        patch's mean, in standard deviations of the patch.
-
-        Pixels where `mask` is False count as their patch's mean. The quality is the share of patches that vary.
-        """
+        patch's mean, in standard deviations of the patch. Pixels where `mask` is False count as their patch's mean. The
+        quality is the share of patches that vary."""
         size = (self._width, self._height)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32))
@@ -73,11 +71,8 @@ class SeqSlam:
 
     def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
         """Score each place by how much better the query fits it than the places around it in the map: `rows` uint8 (N,
-        length) to float32 (N,) in 0..1, and None (no hypotheses). `mean` is not used.
-
-        0.5 means that it fits as well as they do. The score is linear in the enhanced difference, so the best mean
-        score of a trajectory (a run of places) is its least summed difference.
-        """
+        length) to float32 (N,) in 0..1, and None (no hypotheses). 0.5 means that it fits as well as they do. The score
+        is linear in the enhanced difference, so the best mean score of a trajectory is its least summed difference."""
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
@@ -87,11 +82,8 @@ class SeqSlam:
 
 def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
-    do not count) are float32 (patches, pixels). Returns
-
-    * float32 (patches, pixels), 0 where not allowed or where the patch is flat,
-    * the standard deviations float32 (patches,).
-    """
+    do not count) are float32 (patches, pixels). Returns the same, 0 where not allowed or where the patch is flat, and
+    the standard deviations float32 (patches,)."""
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)
@@ -100,11 +92,8 @@ def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
 
 def enhanced(differences: Array) -> Doubles:
     """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,),
-    in standard deviations of the window.
-
-    The mean of the differences up to five places away is subtracted from each difference, and the rest is divided by
-    their (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise.
-    """
+    in (sample) standard deviations of the differences up to five places away, less their mean; 0 where they are all
+    equal. Sums of whole numbers keep a long map precise."""
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)
     last = np.minimum(np.arange(len(whole)) + _WINDOW // 2 + 1, len(whole))

@@ -1,8 +1,6 @@
 """Running a network, from a picture to its outputs, for techniques, detectors and the commands for models. It is the
-only module that uses onnxruntime in flight, and imports it only with the first network.
-
-A model file is not trusted: it is run once before it may fly, and every result is checked.
-"""
+only module that uses onnxruntime in flight, and imports it only with the first network. A model file is not trusted: it
+is run once before it may fly, and every result is checked."""
 
 import os
 from dataclasses import dataclass
@@ -69,8 +67,7 @@ def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
     session = open_session(card, threads)
     # Noise, not a uniform picture: many a correct network gives only zeros for that.
     noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-    result = _run(card, output, session, noise)
-    return Backbone(card, output, result.shape, session)
+    return Backbone(card, output, _run(card, output, session, noise).shape, session)
 
 
 def open_session(card: Card, threads: int = 1) -> Any:
@@ -103,8 +100,6 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    # The arena stays on: without it the memory of the same network varied from 20 to 60 MB, depending on malloc, and
-    # was lower for few of six networks tried.
     options.log_severity_level = 4  # fatal messages only: edgevpr reports errors itself
     # Threads that wait for work by spinning draw power and do nothing.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -183,20 +178,26 @@ def _in_one_line(error: Exception) -> str:
 
 def prepare(image: Array, rule: InputRule) -> Singles:
     """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
-    width), or (1, height, width, C) for the layout NHWC.
-
-    Histogram equalisation is that of CALC: BGR to YUV, the histogram of Y equalised, back to BGR, all before the
-    picture is made grey and smaller. A grey picture has no U and V: its own histogram is equalised.
-    """
-    if rule.equalise:
-        image = _equalised(image)
+    width), or (1, height, width, C) for the layout NHWC. Histogram equalisation is that of CALC: the histogram of Y of
+    BGR as YUV is equalised before the picture is made grey and smaller."""
+    if rule.equalise and image.ndim == 2:
+        image = cv2.equalizeHist(image)
+    elif rule.equalise:
+        yuv: Array = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
+        yuv[..., 0] = cv2.equalizeHist(np.ascontiguousarray(yuv[..., 0]))
+        image = cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR)
     if rule.colour == "grey":
         image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     elif image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif rule.colour == "rgb":
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    image = _sized(image, rule)
+    across, down = shares(image, rule)
+    width, height = round(across * rule.width), round(down * rule.height)
+    image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
+    if rule.pad is not None:
+        border = (0, rule.height - height, 0, rule.width - width)
+        image = cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad,) * 3)
     values = np.multiply(image, np.float32(rule.scale), dtype=np.float32).reshape(rule.height, rule.width, -1)
     values -= np.array(rule.mean, np.float32)
     if rule.std is not None:
@@ -205,23 +206,12 @@ def prepare(image: Array, rule: InputRule) -> Singles:
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares of the input's width and of its height that `prepare` fills with the picture, without
-    padding."""
+    """Return the shares of the input's width and height that `prepare` fills with the picture, without padding."""
     if rule.pad is None:
         return 1.0, 1.0
     height, width = image.shape[:2]
     scale = min(rule.width / width, rule.height / height)
     return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
-
-
-def _sized(image: Array, rule: InputRule) -> Array:
-    across, down = shares(image, rule)
-    width, height = round(across * rule.width), round(down * rule.height)
-    image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
-    if (width, height) == (rule.width, rule.height):
-        return image
-    border = (0, rule.height - height, 0, rule.width - width)
-    return cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad or 0,) * 3)
 
 
 def without_masked(image: Image, mask: Mask | None) -> Array:
@@ -232,11 +222,3 @@ def without_masked(image: Image, mask: Mask | None) -> Array:
     filled = image.copy()
     filled[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else _NOTHING_ALLOWED
     return filled
-
-
-def _equalised(image: Array) -> Array:
-    if image.ndim == 2:
-        return cv2.equalizeHist(image)
-    yuv: Array = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
-    yuv[..., 0] = cv2.equalizeHist(np.ascontiguousarray(yuv[..., 0]))
-    return cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR)

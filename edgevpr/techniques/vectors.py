@@ -2,9 +2,8 @@
 of a vector in RAM, and the comparison of vectors. `hog` here needs no network.
 
 The map file keeps each vector in half precision. In RAM its *form* is `float` (half precision too), or one byte
-(`8bit`) or one bit (`1bit`) per number, after the mean of the map is subtracted. The mean is common to all places: it
-does not help to tell them apart, and takes most of the range of a byte. It changes while a map grows. So the file is
-independent of the form, and one map serves all forms.
+(`8bit`) or one bit (`1bit`) per number, after the mean of the map is subtracted: it does not help to tell places apart,
+and takes most of the range of a byte. The file is independent of the form, and one map serves all forms.
 """
 
 from typing import Any
@@ -121,12 +120,9 @@ class VectorTechnique:
         turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
     ) -> tuple[Singles, None]:
-        """Compare a query with all places, `rows` (N, *row shape). `mean` is the map's (D,), which the form `float`
-        does not need. `turned_deg` and `height_ratio` are ignored: these vectors know neither. Returns
-
-        * scores float32 (N,), all 0 for a query of zeros,
-        * None, since there are no hypotheses.
-        """
+        """Compare a query with all places, `rows` (N, *row shape): scores float32 (N,), all 0 for a query of zeros, and
+        None, since there are no hypotheses. `mean` is the map's (D,), which the form `float` does not need.
+        `turned_deg` and `height_ratio` are ignored."""
         vector = query.coarse.astype(np.float32)
         if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
@@ -147,9 +143,8 @@ class VectorTechnique:
         return scores, None
 
     def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
-        """Score n places against `vector` (D,): float32 (n,). `values` float32 (n, D) are overwritten. In the form
-        `8bit` a place less the map's mean is `values` times its step, and `beside` float32 (2, n) holds the steps and
-        the lengths. In `float`, `beside` is (0, n)."""
+        """Score n places, `values` float32 (n, D), overwritten; `beside` (2, n) or (0, n): their steps and lengths in
+        `8bit`."""
         if self._similarity == "cosine":
             scores: Singles = values @ vector
             if not len(beside):

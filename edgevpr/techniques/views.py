@@ -3,12 +3,10 @@
 A nadir query (of a camera that looks straight down) is compared with a place under each of several *hypotheses*: a
 height ratio (the camera's height above the ground over that when the place was mapped) and a rotation of the camera
 since then, in steps of 15 degrees. A view undoes both: the picture is scaled until a cell shows as much ground as a
-cell of the place, and turned back. A query from half the height has a quarter of the cells of a place, and one from
-twice the height four times as many.
+cell of the place, and turned back.
 
-Few regions agree by chance more easily than many, so the same share of agreeing votes is different evidence under
-different views. Factors make the shares comparable: they follow from the shares that foreign pictures reach under each
-view (measured between the two tuning sets from the air). A view from the mapped height keeps its share.
+Few regions agree by chance more easily than many. Factors make the shares of agreeing votes comparable: they follow
+from the shares that foreign pictures reach under each view (measured between the two tuning sets from the air).
 """
 
 from collections.abc import Callable
@@ -41,8 +39,8 @@ Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
     """The good regions of a view: their `numbers` int (G,), row by row on a grid of `side` x `side`, and `regions`
-    float32 (G, P), each of length 1. The share of agreeing votes, times the factor `worth`, is the score. For
-    `CoHog.glance` only every `step`-th region votes, and the factor is `worth_at_glance`."""
+    float32 (G, P), each of length 1. The share of agreeing votes, times `worth`, is the score. For `CoHog.glance` only
+    every `step`-th region votes, and the factor is `worth_at_glance`."""
 
     numbers: Ints
     regions: Singles
@@ -81,11 +79,8 @@ class Views:
         self._scaled: dict[float, tuple[Array, Array]] = {}
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
-        """Return the view of a height ratio and a rotation step. Returns
-
-        * its blocks float32 (n, n, 4 bins),
-        * which of them are good, bool (n, n).
-        """
+        """Return the blocks float32 (n, n, 4 bins) of the view of a height ratio and a rotation step, and which of them
+        are good, bool (n, n)."""
         quarters, within = divmod(turn, WITHIN_QUARTER)
         if (ratio, within) not in self._encoded:
             self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
@@ -116,14 +111,7 @@ class Views:
         )
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
-        """Return the picture of a view; `within` is its rotation in steps, less than a quarter turn. Returns
-
-        * the picture float32 (side, side),
-        * its allowed pixels bool (side, side),
-        * the pixels of a cell.
-
-        The picture is not enlarged, which would add no detail. For a ratio above 1 its cells are smaller instead.
-        """
+        """Return the picture of a view, rotated by `within` steps, its allowed pixels, and the pixels of a cell."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
         grey: Array

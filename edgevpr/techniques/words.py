@@ -1,8 +1,6 @@
-"""Learned visual words of a network's feature map, and the vectors made with them: VLAD and the bag of words.
-
-`edgevpr train words` writes the file of the words; the techniques in `network` and `regions` load it. VLAD sums, word
-by word, the differences between a picture's local descriptors and their words (Jégou et al., CVPR 2010).
-"""
+"""Learned visual words, and the vectors made with them: VLAD, which sums, word by word, the differences between a
+picture's local descriptors and their words (Jégou et al., CVPR 2010), and the bag of words. `edgevpr train words`
+writes the file of the words; the techniques in `network` and `regions` load it."""
 
 import hashlib
 from dataclasses import dataclass
@@ -66,10 +64,7 @@ def read_words(name: str, command: str) -> tuple[bytes, dict[str, Array], Single
 
 def load_words(model: str, kind: str, count: int) -> Words:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-
-    Raises ModelError as `read_words` does, and if they were learned on another network. Networks are told apart by
-    `Card.fingerprint`: weights, preparation of the picture, and outputs.
-    """
+    Raises ModelError as `read_words` does, and if they were learned on another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
     command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
     content, arrays, words = read_words(name, command)

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 from edgevpr.core.appending import append, open_appending, sync
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import without_passwords
+from edgevpr.core.types import Tape
 
 TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
 SPARED_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
@@ -37,7 +38,7 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
-class Recording:
+class Recording(Tape):
     """An open recording, which is also the flight's tape. `path` is its folder. `state` is None while it goes on, else
     a sentence that says why it has ended. Close it (it is a context manager)."""
 
