@@ -56,11 +56,17 @@ class Kind(Enum):
     OTHER = "vehicle"
 
 
+_MAV_TYPES = {
+    Kind.PLANE: (1, 19, 20, 21, 22, 23, 24, 25),
+    Kind.COPTER: (2, 3, 4, 13, 14, 15, 29, 35, 43),
+    Kind.ROVER: (10, 11, 46),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The channel chosen for an autopilot, and the `reason` for it in a few words. For GPS_INPUT, `receiver` is the
-    index of the GPS receiver that we replace (0: the first), and `lag_s` the age in seconds that the autopilot assumes
-    our positions to have."""
+    """The channel chosen for an autopilot, and the `reason` for it. For GPS_INPUT, `receiver` is the index of the GPS
+    receiver that we replace (0: the first), and `lag_s` the age that the autopilot assumes our positions to have."""
 
     channel: Channel
     reason: str
@@ -70,9 +76,8 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """Answers of an autopilot on which the choice of a channel depends: the `kind` of its vehicle, the `version` of its
-    firmware (major, minor; None: unknown), and the values of `parameters` by name, without those that it does not have.
-    """
+    """Answers of an autopilot on which the choice of a channel depends. `version`: of its firmware, major and minor
+    (None: unknown). `parameters`: values by name, without those that it does not have."""
 
     kind: Kind
     version: tuple[int, int] | None
@@ -139,22 +144,15 @@ def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
     return next((name for name in names if name in parameters), names[0])
 
 
-@dataclass(frozen=True, slots=True)
-class _Firmware:
-    """A firmware: the names of the `parameters` on which its channel depends, and the function that chooses the channel
-    from the answers (None: always command 43003)."""
-
-    name: str
-    parameters: tuple[str, ...] = ()
-    choose: Callable[[Answers], Choice] | None = None
-
-
-ARDUPILOT = _Firmware(
-    "ArduPilot", (*(name for names in _RECEIVERS + _DELAYS for name in names), _VISION), ardupilot_choice
-)
-PX4 = _Firmware("PX4", (CONTROL,), px4_choice)
-_UNKNOWN = _Firmware("unknown firmware")
-_FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT, mavlink.MAV_AUTOPILOT_PX4: PX4}
+ARDUPILOT_PARAMETERS = (*(name for names in _RECEIVERS + _DELAYS for name in names), _VISION)
+PX4_PARAMETERS = (CONTROL,)
+# Name, the parameters on which the channel depends, and the function that chooses it (None: always command 43003).
+_Firmware = tuple[str, tuple[str, ...], Callable[[Answers], Choice] | None]
+_UNKNOWN: _Firmware = ("unknown firmware", (), None)
+_FIRMWARES: dict[int, _Firmware] = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ARDUPILOT_PARAMETERS, ardupilot_choice),
+    mavlink.MAV_AUTOPILOT_PX4: ("PX4", PX4_PARAMETERS, px4_choice),
+}
 
 
 class Interview:
@@ -167,8 +165,7 @@ class Interview:
 
     def __init__(self) -> None:
         self.choice = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
-        self.kind = Kind.OTHER
-        self._firmware = _UNKNOWN
+        self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), Kind.OTHER
         self._version: tuple[int, int] | None = None
         self._parameters: dict[str, float] = {}
         self._asked, self._ask_s = 0, -math.inf
@@ -178,13 +175,12 @@ class Interview:
         """Process a message from the autopilot; most kinds are ignored."""
         match message.get_type():
             case "HEARTBEAT":
-                self._firmware = _FIRMWARES.get(message.autopilot, _UNKNOWN)
-                self.kind = kind_of(message.type)
+                self._autopilot, self._kind = message.autopilot, kind_of(message.type)
             case "AUTOPILOT_VERSION" if self._version is None:
                 self._is_over = False
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
             case "PARAM_VALUE" if message.param_id in self._missing():
-                value = parameter_value(message, bytewise=self._firmware is PX4)
+                value = parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
                     self._is_over = False
                     self._parameters[message.param_id] = value
@@ -205,20 +201,13 @@ class Interview:
             yield messages.parameter_request(target_system, name)
 
     def _missing(self) -> list[str]:
-        return [name for name in self._firmware.parameters if name not in self._parameters]
+        _, names, _ = _FIRMWARES.get(self._autopilot, _UNKNOWN)
+        return [name for name in names if name not in self._parameters]
 
     def _choose(self) -> None:
         self._is_over = True
-        if self._firmware.choose:
-            answers = Answers(kind=self.kind, version=self._version, parameters=self._parameters)
-            self.choice = self._firmware.choose(answers)
+        name, _, choose = _FIRMWARES.get(self._autopilot, _UNKNOWN)
+        if choose:
+            self.choice = choose(Answers(kind=self._kind, version=self._version, parameters=self._parameters))
         version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
-        name, reason = self._firmware.name, self.choice.reason
-        log.info("%s%s on a %s: positions go to it by %s", name, version, self.kind.value, reason)
-
-
-_MAV_TYPES = {
-    Kind.PLANE: (1, 19, 20, 21, 22, 23, 24, 25),
-    Kind.COPTER: (2, 3, 4, 13, 14, 15, 29, 35, 43),
-    Kind.ROVER: (10, 11, 46),
-}
+        log.info("%s%s on a %s: positions go to it by %s", name, version, self._kind.value, self.choice.reason)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import (
-    ARDUPILOT,
+    ARDUPILOT_PARAMETERS,
     CONTROL,
     FUSES_POSITION,
     MAVLINK_GPS,
-    PX4,
+    PX4_PARAMETERS,
     SECOND,
     Channel,
     Choice,
@@ -220,7 +220,7 @@ RULES = {
         name="ArduPilot",
         knows_fixes=(4, 5),  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
         parameters=(
-            *ARDUPILOT.parameters, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE",
+            *ARDUPILOT_PARAMETERS, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE",
             "AHRS_EKF_TYPE", "EK3_ENABLE",
             *(f"EK3_SRC{n}_{what}" for n in _SOURCE_SETS for what in ("POSXY", "VELXY")),
         ),
@@ -230,7 +230,7 @@ RULES = {
     "px4": FirmwareRules(
         name="PX4",
         knows_fixes=(1, 15),
-        parameters=(*PX4.parameters, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_OF_CTRL"),
+        parameters=(*PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_OF_CTRL"),
         findings=_px4_findings,
         # TELEM 2, the usual port for a companion.
         port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),
