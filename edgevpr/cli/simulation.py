@@ -14,10 +14,8 @@ _PARAMETER = "GPS2_TYPE=14"  # an example
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
 _NUMBERS = {
     "height_m": (None, 1.0, 10_000.0, "over the ground (default: that of the track)"),
-    "every_m": (20.0, 0.1, 1e6, "from picture to picture of a mission (20)"),
-    "speed_m_s": (10.0, 0.1, 1000.0, "over the ground (10)"),
+    "every_m": (20.0, 1.0, 1e6, "from picture to picture of a mission (20)"),
     "fov_deg": (66.0, 5.0, 120.0, "angle of view across the picture (66)"),
-    "sway_deg": (2.0, 0.0, 20.0, "most roll, pitch and yaw off the track (2)"),
 }
 
 
@@ -50,7 +48,6 @@ def add(commands: Any) -> None:
     )
     for name, (*_, text) in _NUMBERS.items():
         over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    over.add_argument("--light", choices=("clear", "hazy"), help="hazy adds veil, blur and noise (clear)")
     demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
 
@@ -79,7 +76,7 @@ def simulate_flight(args: Namespace) -> int:
     if args.seed < 0:
         raise UsageError(f"--seed is {args.seed}: give 0 or more.")
     if args.orthophoto is None:
-        if said := [name for name in ("track", "light", *_NUMBERS) if getattr(args, name) is not None]:
+        if said := [name for name in ("track", *_NUMBERS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
         from edgevpr.lab.simulate.generated import fly_and_write
 
@@ -93,7 +90,7 @@ def simulate_flight(args: Namespace) -> int:
 
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import WEATHERS, none_written, read_shots, write_rehearsal
+    from edgevpr.lab.simulate.rehearsal import read_shots, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
@@ -101,20 +98,9 @@ def _fly_over(args: Namespace) -> str:
         numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
         if value is not None and not least <= value <= most:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
-    orthophoto = Orthophoto(args.orthophoto)
-    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"], numbers["speed_m_s"])
-    taken = write_rehearsal(
-        Path(args.out),
-        orthophoto,
-        shots,
-        WEATHERS[args.light or "clear"],
-        fov_deg=numbers["fov_deg"],
-        sway_deg=numbers["sway_deg"],
-        seed=args.seed,
-    )
-    written = sum(name is not None for name in progress(taken, len(shots), "flying"))
-    if not written:
-        raise none_written(orthophoto, shots)
+    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
+    taken = write_rehearsal(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
+    written = sum(1 for _ in progress(taken, len(shots), "flying"))
     beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
     return (
         f"{args.out}: {written} images in images/, where they were taken in positions.csv"

@@ -65,11 +65,10 @@ def run_autopilot(
     """Simulate an autopilot at `link_url` until `duration_s` is over, `stop` is set, SIGINT or SIGTERM comes, or the
     link is lost. Its UTC is that of this machine.
 
-    With a `track` the vehicle flies along it from the first message of a companion that is more than a question, as a
-    flight sends and `check` and `doctor` do not, and stays at its end. Without one, its position is unknown and never
-    reported. With `gps` it has GPS, and accepts no fix. `parameters` (name to value as text) are set before the start.
-    Raises LinkError if the link cannot be opened, UsageError for an unknown vehicle or parameter, and for a wrong
-    value.
+    With a `track` the vehicle flies along it from the first message of a companion that is more than a question, and
+    stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS, and accepts no
+    fix. `parameters` (name to value as text) are set before the start. Raises LinkError if the link cannot be opened,
+    UsageError for an unknown vehicle or parameter, and for a wrong value.
     """
     motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
@@ -116,6 +115,7 @@ class _Conversation:
         self._waiting = b""
 
     def run(self, ended: Callable[[float], bool]) -> None:
+        """Advance by the clock and answer until `ended`, which is given the seconds since the start, is true."""
         start_s = time.monotonic()
         while not ended(t_s := time.monotonic() - start_s):
             self._say(self._controller.advance(t_s))
@@ -126,6 +126,7 @@ class _Conversation:
                     self._say(self._controller.hear(message))
 
     def summary(self) -> AutopilotSummary:
+        """Return what was received."""
         answers = Counter(self._controller.answers)
         accepted, denied = answers[mavlink.MAV_RESULT_ACCEPTED], answers[mavlink.MAV_RESULT_DENIED]
         return AutopilotSummary(
@@ -140,25 +141,21 @@ class _Conversation:
         )
 
     def _take(self, message: Message) -> None:
-        """Count a message, start the track if it is more than a question, and choose the receiver of our messages: the
-        last companion heard or, before there is one, any sender of heartbeats."""
+        """Count a message, start the track if it is more than a question, and answer the last companion heard or,
+        before there is one, any sender of heartbeats."""
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256
         if sender == self._companion and not _is_question(message):
             self._controller.begin()
-        if message.get_type() != "HEARTBEAT":
-            return
-        if message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER:
-            self._companion = sender
-            self._transport.answer_sender()
-        elif self._companion is None:
-            self._transport.answer_sender()
+        if message.get_type() == "HEARTBEAT":
+            is_companion = message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER
+            if is_companion or self._companion is None:
+                self._transport.answer_sender()
+            self._companion = sender if is_companion else self._companion
 
     def _say(self, messages: list[Message]) -> None:
-        if not self._transport.connected:
-            return
-        for message in messages:
+        for message in messages if self._transport.connected else ():
             packet = message.pack(self._packer)
             self._packer.seq = (self._packer.seq + 1) % 256
             if len(self._waiting) < _WAITING_BYTES:
@@ -167,7 +164,7 @@ class _Conversation:
 
 
 def _is_question(message: Message) -> bool:
-    """Return True if a message only requests information, and neither reports nor sets anything."""
+    """Return True if a message only requests information."""
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
         return bool(message.command == mavlink.MAV_CMD_REQUEST_MESSAGE)
     return message.get_type() in _QUESTIONS
@@ -175,12 +172,10 @@ def _is_question(message: Message) -> bool:
 
 @contextmanager
 def _set_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT set `stop`. No effect outside the main thread, which alone may handle
-    signals."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGTERM, signal.SIGINT)}
+    """Context manager: SIGTERM and SIGINT set `stop` (in the main thread, which alone may handle signals)."""
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGTERM, signal.SIGINT) if is_main else ()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
     try:
         yield
     finally:

@@ -94,23 +94,16 @@ def lit(scene: Scene, light: Light, seed: int) -> Image:
 
 
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
-    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun.
-
-    The sunlight of (x, y) is blocked if, for any k, the height k pixels towards the sun less k * drop exceeds height(x,
-    y). The maximum of these values over 2k pixels is the larger of the maximum over the first k pixels and that over
-    the next k: so eight passes look 256 pixels far.
-    """
+    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun."""
+    # The sunlight of (x, y) is blocked if, for any k, the height k pixels towards the sun less k * drop exceeds that of
+    # (x, y). The maximum over 2k pixels comes from those over the first and the next k: eight passes look 256 far.
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1
     while steps * scene.metres_per_pixel < _LONGEST_SHADOW_M:
         shift = np.array([[1, 0, steps * towards_sun[0]], [0, 1, steps * towards_sun[1]]])
-        farther: Array = cv2.warpAffine(
-            blocking,
-            shift,
-            blocking.shape[::-1],
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        size = blocking.shape[::-1]
+        farther: Array = cv2.warpAffine(blocking, shift, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         blocking = np.maximum(blocking, cv2.subtract(farther, np.array(steps * drop_cm), farther), out=farther)
         steps *= 2
     hidden = cv2.compare(blocking, cv2.add(scene.height_cm, np.array(25.0)), cv2.CMP_GT)

@@ -4,7 +4,6 @@ import json
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.core.types import Position
 from edgevpr.frames.images import read_image
-from edgevpr.frames.positions import find_positions, read_positions
+from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.camera import lit, view_on_ground
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
@@ -33,7 +32,6 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.wholeflight import flight_of
 
 _SEED = 1
@@ -46,6 +44,13 @@ _PICTURE_PX = (1600, 1050)
 # Colours (blue, green, red) of the places, of the later flight, and of the answers by their outcome.
 _MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
 _RIGHT, _WRONG, _REJECTED = (91, 191, 47), (59, 56, 229), (36, 165, 245)
+_LEGEND = {
+    "places of flight 1": _MAPPED,
+    "flight 2": _LATER,
+    "accepted": _RIGHT,
+    "accepted, wrong": _WRONG,
+    "rejected: no position is sent": _REJECTED,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,10 +69,6 @@ class JudgedAnswer:
     fix_off_m: float | None
 
     @property
-    def accepted(self) -> bool:
-        return self.fix_off_m is not None
-
-    @property
     def right(self) -> bool:
         return self.error_m <= RIGHT_M
 
@@ -76,32 +77,32 @@ class JudgedAnswer:
         """True where the map has a right place for the query."""
         return self.nearest_m <= RIGHT_M
 
+    @property
+    def colour(self) -> tuple[int, int, int]:
+        """The colour of its outcome in the picture."""
+        if self.fix_off_m is None:
+            return _REJECTED
+        return _RIGHT if self.right else _WRONG
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log. `messages`
-    counts, by name, the messages that the simulated flight controller decoded."""
+    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log; `heard` is the
+    summary of the simulated flight controller, by the names of `AutopilotSummary`."""
 
     places: int
     answers: list[JudgedAnswer]
     costs: dict[str, float]
-    used_mah: float
-    marginal_mah: float
-    messages: dict[str, int]
-    fixes_accepted: int
-    fixes_denied: int
-    wall_s: float
+    heard: dict[str, Any]
     picture: Path
 
     def __str__(self) -> str:
-        cost = self.costs
-        on_map = [answer for answer in self.answers if answer.on_map]
-        accepted = [answer for answer in self.answers if answer.accepted]
-        errors_m = [answer.fix_off_m for answer in accepted if answer.fix_off_m is not None] or [np.nan]
+        cost, on_map = self.costs, [answer for answer in self.answers if answer.on_map]
+        accepted = [answer for answer in self.answers if answer.fix_off_m is not None]
+        errors_m = [answer.fix_off_m or 0.0 for answer in accepted] or [np.nan]
         off_map = len(self.answers) - len(on_map)
-        off_map_rejected = sum(not answer.on_map and not answer.accepted for answer in self.answers)
+        off_map_rejected = off_map - sum(not answer.on_map for answer in accepted)
         recall = sum(answer.right for answer in on_map) / max(len(on_map), 1)
-        messages = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items()))
         return f"""
 places            {self.places} in the map
 queries           {len(self.answers)}: {len(on_map)} over the map, {off_map} beyond it
@@ -113,10 +114,7 @@ largest {max(errors_m):.1f} m \
 (of the accepted; places are 21 m apart)
 a query           {1000 * cost["cpu_s"]:.0f} ms of CPU (encode {1000 * cost["t_encode_s"]:.0f} ms, \
 match {1000 * cost["t_match_s"]:.0f} ms), {cost["rss_mb"]:.0f} MB of RAM
-battery           {self.used_mah:.3f} mAh, {self.marginal_mah:.3f} mAh of them for recognising
-flight controller {self.fixes_accepted} position fixes accepted, {self.fixes_denied} denied
-  it received     {messages}
-time              {self.wall_s:.0f} s
+flight controller {self.heard["fixes_accepted"]} position fixes accepted, {self.heard["fixes_denied"]} denied
 picture           {self.picture}"""
 
 
@@ -126,70 +124,51 @@ def run_demo(folder: str | Path) -> DemoSummary:
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails.
     """
-    begin_s = time.monotonic()
     folder = Path(folder)
     log_path, picture_path = folder / "flight.jsonl", folder / "demo.png"
-    first, second = folder / "flight-1", folder / "flight-2"
     for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
         old.unlink(missing_ok=True)
-
     scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
     mapping, later = mapping_flight(_SEED), later_flight(_SEED)
-    for path, flight, label in ((first, mapping, "flight 1, to map     "), (second, later, "flight 2, hours later")):
-        for _ in progress(write_flight(path, scene, flight), len(flight.poses), label):
+    for name, flight, label in (
+        ("flight-1", mapping, "flight 1, to map     "),
+        ("flight-2", later, "flight 2, hours later"),
+    ):
+        for _ in progress(write_flight(folder / name, scene, flight), len(flight.poses), label):
             pass
-    seen = _flown(folder, len(later.poses))
-
-    answers = read_answers(log_path, first / "images", second / "images")
+    heard = _flown(folder)
+    answers = read_answers(log_path, folder / "flight-1", folder / "flight-2")
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
-    lines = list(flight_of(log_path))
-    costs = [line["costs"] for line in lines if line["kind"] == "query"]
-    return DemoSummary(
-        places=len(mapping.poses),
-        answers=answers,
-        costs={name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]},
-        used_mah=lines[-1]["used_mah"],
-        marginal_mah=lines[-1]["marginal_mah"],
-        messages=seen["messages"],
-        fixes_accepted=seen["fixes_accepted"],
-        fixes_denied=seen["fixes_denied"],
-        wall_s=time.monotonic() - begin_s,
-        picture=picture_path,
-    )
+    costs = [line["costs"] for line in flight_of(log_path) if line["kind"] == "query"]
+    means = {name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]}
+    return DemoSummary(places=len(mapping.poses), answers=answers, costs=means, heard=heard, picture=picture_path)
 
 
-def _flown(folder: Path, queries: int) -> dict[str, Any]:
+def _flown(folder: Path) -> dict[str, Any]:
     """Map the first flight of a demonstration and fly the second one; return the report of the flight controller."""
-    map_path, log_path, port = folder / "map.gpkg", folder / "flight.jsonl", _free_udp_port()
+    map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
     # The flight controller is started first: it listens long before the map is built.
-    with _edgevpr("simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json") as autopilot:
+    with _edgevpr("simulate", "autopilot", "--link", f"udpin:{address}", "--json") as autopilot:
         build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
         with _edgevpr(*build) as building:
             _output(building)
-        flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log_path, "--rate-hz", _RATE_HZ)
+        flags = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
         with _edgevpr("run", "--map", map_path, "--source", second, *_CAMERA, *flags) as flying:
-            for _ in progress(_queries(log_path, flying), queries, "flying"):
-                pass
             _output(flying)
         autopilot.terminate()
-        seen: dict[str, Any] = json.loads(_output(autopilot))
-    return seen
-
-
-def _free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
+        heard: dict[str, Any] = json.loads(_output(autopilot))
+    return heard
 
 
 @contextmanager
 def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen[str]]:
     """Context manager: run the real program in a process of its own, which ends with the block at the latest."""
     command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    with process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
         finally:
@@ -209,20 +188,12 @@ def _output(process: subprocess.Popen[str]) -> str:
     return output
 
 
-def _queries(log_path: Path, flying: subprocess.Popen[str]) -> Iterator[int]:
-    """Follow the growing flight log until the flight ends, and yield the number of each query in it, from 0."""
-    seen, ended = 0, False
-    while not ended:
-        ended = flying.poll() is not None
-        done = sum(line["kind"] == "query" for line in read_log(log_path)) if log_path.exists() else 0
-        yield from range(seen, done)
-        seen = done
-        time.sleep(0.1)
-
-
-def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[JudgedAnswer]:
-    """Read the queries of a flight log, and judge them by the positions.csv of the two flights."""
-    places, taken = (_positions(images) for images in (map_images, query_images))
+def read_answers(log_path: Path, mapped: Path, flown: Path) -> list[JudgedAnswer]:
+    """Read the queries of a flight log, and judge them by the positions.csv in the folders of the two flights."""
+    places, taken = (
+        {name: tag.position for name, tag in read_positions(each / "positions.csv").items() if tag.position}
+        for each in (mapped, flown)
+    )
     answers = []
     for line in flight_of(log_path):
         if line["kind"] == "query":
@@ -240,12 +211,6 @@ def read_answers(log_path: Path, map_images: Path, query_images: Path) -> list[J
                 )
             )
     return answers
-
-
-def _positions(images: Path) -> dict[str, Position]:
-    table = find_positions(images)
-    tags = read_positions(table) if table else {}
-    return {name: tag.position for name, tag in tags.items() if tag.position}
 
 
 def _apart_m(one: Position, other: Position) -> float:
@@ -267,37 +232,32 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, answers: Sequence
     picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
     picture = np.where(seen[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
     places = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
-    taken = pixels([to_metres(answer.at.lat_deg, answer.at.lon_deg) for answer in answers])
-    named = pixels([to_metres(answer.named.lat_deg, answer.named.lon_deg) for answer in answers])
+    taken, named = (
+        pixels([to_metres(at.lat_deg, at.lon_deg) for at in each])
+        for each in ([answer.at for answer in answers], [answer.named for answer in answers])
+    )
     for track, colour in ((places, _MAPPED), (taken, _LATER)):
         cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
     for place in places:
         cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
     for answer, here, there in zip(answers, taken, named, strict=True):
-        cv2.line(picture, here, there, _colour(answer), 3 if answer.accepted else 1, cv2.LINE_AA)
-        cv2.circle(picture, here, 7, _colour(answer), -1, cv2.LINE_AA)
-    legend = {"places of flight 1": _MAPPED, "flight 2": _LATER, "accepted": _RIGHT, "accepted, wrong": _WRONG}
-    for row, (text, colour) in enumerate({**legend, "rejected: no position is sent": _REJECTED}.items()):
+        cv2.line(picture, here, there, answer.colour, 1 if answer.fix_off_m is None else 3, cv2.LINE_AA)
+        cv2.circle(picture, here, 7, answer.colour, -1, cv2.LINE_AA)
+    for row, (text, colour) in enumerate(_LEGEND.items()):
         cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
     cv2.imwrite(str(path), np.hstack([picture, _pairs(path.parent, answers)]))
 
 
 def _pairs(folder: Path, answers: Sequence[JudgedAnswer]) -> Image:
     """Draw ten queries, evenly spread over the flight, each beside the picture of its place: uint8 (H, W, 3) BGR."""
-    columns: list[list[Image]] = [[], []]
-    for number, index in enumerate(np.linspace(0, len(answers) - 1, 10).astype(int)):
+    pairs: list[Image] = []
+    for index in np.linspace(0, len(answers) - 1, 10).astype(int):
         answer = answers[index]
         files = (folder / "flight-1/images" / answer.reference_image, folder / "flight-2/images" / answer.query)
         place, query = (cv2.resize(read_image(file), (240, 180), interpolation=cv2.INTER_AREA) for file in files)
-        pair = cv2.copyMakeBorder(np.hstack([query, place]), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_colour(answer))
+        pair = cv2.copyMakeBorder(np.hstack([query, place]), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=answer.colour)
         said = f"{answer.fix_off_m:.1f} m off" if answer.fix_off_m is not None else "rejected"
         text = f"query, and its place: {said}, score {answer.score:.2f}"
         cv2.putText(pair, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-        columns[number // 5].append(pair.astype(np.uint8))
-    return np.hstack([np.vstack(column) for column in columns])
-
-
-def _colour(answer: JudgedAnswer) -> tuple[int, int, int]:
-    if not answer.accepted:
-        return _REJECTED
-    return _RIGHT if answer.right else _WRONG
+        pairs.append(pair.astype(np.uint8))
+    return np.hstack([np.vstack(pairs[:5]), np.vstack(pairs[5:])])

@@ -2,8 +2,7 @@
 the mapped land. `edgevpr simulate flight` writes them, and `demo` flies them."""
 
 import csv
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -62,8 +61,7 @@ def mapping_flight(seed: int) -> GeneratedFlight:
 
 def later_flight(seed: int) -> GeneratedFlight:
     """Plan 40 pictures on an afternoon with clouds and haze: back along the fourth leg, out along the third one and on
-    over land that is in no map. The flight drifts up to 8 m beside the legs, 10 % in height, 10 degrees in heading, and
-    tilts up to 3 degrees."""
+    over land that is in no map, with drifts in place, height, heading and tilt."""
     rng = np.random.default_rng((seed, 2))
     back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
     out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
@@ -95,35 +93,26 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
     """
     ground = lit(scene, flight.light, flight.seed)
     rng = np.random.default_rng((flight.seed, 3))
-    columns = ("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "roll_deg", "pitch_deg", "time")
-    with picture_table(Path(folder), columns) as write:
+    images = Path(folder) / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "roll_deg", "pitch_deg", "time"))
         for number, pose in enumerate(flight.poses):
             name, at = f"frame_{number:04d}.jpg", to_position(pose)
             taken = flight.start_utc + timedelta(seconds=number * flight.interval_s)
             where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
             attitude = (f"{pose.heading_deg % 360:.2f}", f"{pose.roll_deg:.2f}", f"{pose.pitch_deg:.2f}")
             frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
-            write(frame, flight.camera.jpeg_quality, (name, *where, *attitude, f"{taken:%Y:%m:%d %H:%M:%S}"))
+            write_jpeg(images / name, frame, flight.camera.jpeg_quality)
+            table.writerow((name, *where, *attitude, f"{taken:%Y:%m:%d %H:%M:%S}"))
             yield name
 
 
-@contextmanager
-def picture_table(folder: Path, columns: tuple[str, ...]) -> Iterator[Callable[[Image, int, tuple[str, ...]], None]]:
-    """Context manager: open `folder`/positions.csv with a header of `columns`. Yields the function write(picture,
-    quality, row). It saves a picture, uint8 (H, W, 3) BGR, as JPEG in `folder`/images, named row[0], and adds the row
-    to the table."""
-    images = folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    with open(folder / "positions.csv", "w", encoding="utf-8", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(columns)
-
-        def write(picture: Image, quality: int, row: tuple[str, ...]) -> None:
-            _, jpeg = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))
-            (images / row[0]).write_bytes(jpeg.tobytes())
-            table.writerow(row)
-
-        yield write
+def write_jpeg(path: Path, picture: Image, quality: int) -> None:
+    """Write a picture, uint8 (H, W, 3) BGR, as JPEG. Raises OSError where it cannot be written."""
+    _, jpeg = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))
+    path.write_bytes(jpeg.tobytes())
 
 
 def fly_and_write(folder: Path, which: str, seed: int) -> str:

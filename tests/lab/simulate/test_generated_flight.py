@@ -93,7 +93,7 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
         ("map", ("p0,50.0,8.0", "p1,50.001,8.0")),
         ("query", ("q0,50.0001,8.0", "q1,50.001,8.0", "q2,50.01,8.0")),
     ):
-        (tmp_path / folder / "images").mkdir(parents=True)
+        (tmp_path / folder).mkdir()
         (tmp_path / folder / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
     said = (("q0", "p0", 50.00005), ("q1", "p0", 50.0002), ("q2", "p1", None))
     with FlightLog(tmp_path / "log.jsonl") as log:
@@ -103,7 +103,7 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
             accepted = fix_deg is not None
             log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted, located=located)
         log.write("end")
-    answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map" / "images", tmp_path / "query" / "images")
+    answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map", tmp_path / "query")
     assert [(answer.on_map, answer.right) for answer in answers] == [(True, True), (True, False), (False, False)]
     assert answers[0].error_m == pytest.approx(11.12, abs=0.01)
     assert [answer.fix_off_m for answer in answers] == [
@@ -111,9 +111,9 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
         pytest.approx(88.96, abs=0.1),
         None,
     ]
-    nothing = {"places": 2, "costs": dict.fromkeys(("cpu_s", "t_encode_s", "t_match_s", "rss_mb"), 0.0), "messages": {}}
-    numbers = dict.fromkeys(("used_mah", "marginal_mah", "fixes_accepted", "fixes_denied", "wall_s"), 0)
-    said = str(DemoSummary(answers=answers, picture=tmp_path, **nothing, **numbers)).split("\n")
+    costs = dict.fromkeys(("cpu_s", "t_encode_s", "t_match_s", "rss_mb"), 0.0)
+    heard = {"fixes_accepted": 0, "fixes_denied": 0}
+    said = str(DemoSummary(places=2, answers=answers, costs=costs, heard=heard, picture=tmp_path)).split("\n")
     assert [re.findall(r"[\d.]+", line) for line in said[2:7]] == [
         ["3", "2", "1"],  # queries, on the map, beyond it
         ["1", "0.50", "55"],
