@@ -1,4 +1,4 @@
-"""A vehicle that starts on the ground and does what it is told: hovers, circles, lands; and the simulated
+"""A vehicle that starts on the ground and does what it is told: hovers and circles; and the simulated
 flight controller in it, which is armed and takes off. Plain kinematics: what matters here is where it is."""
 
 import cmath
@@ -8,7 +8,7 @@ from statistics import fmean
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.ardupilot_rules import _GPS, _NEED_POSITION
+from edgevpr.lab.simulate.ardupilot_rules import _GPS
 from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.firmware import FAILED, OK
 from edgevpr.lab.simulate.generated import ORIGIN
@@ -21,8 +21,6 @@ GRAVITY_M_S2 = 9.81
 AIRSPEED_M_S = 22.0  # of a plane
 CIRCLE_M = 80.0  # radius, where a plane waits
 _CLIMB_M_S = {"copter": 3.0, "plane": 4.0}
-_DESCENT_M_S = 0.5
-_TAKEOFF = 13  # a mode of a plane
 _COMMAND_GOOD_FOR_S = 3.0  # a copter that is told no velocity any more stops
 _CRUISE_DEG = 90.0  # the nose at the start
 
@@ -37,7 +35,6 @@ class FreeFlight(Motion):
         self._at_m, self._height_m, self._goal_m = 0j, 0.0, 0.0
         self._heading_deg = _CRUISE_DEG
         self._told: tuple[complex, float] = 0j, -math.inf
-        self._lands = False
 
     @property
     def is_flying(self) -> bool:
@@ -49,19 +46,15 @@ class FreeFlight(Motion):
 
     def take_off(self, height_m: float) -> None:
         """Climb to a height over home."""
-        self._goal_m, self._lands = height_m, False
+        self._goal_m = height_m
 
     def fly(self, velocity_m_s: complex, now_s: float) -> None:
         """Fly so for three seconds; a plane does not obey."""
         self._told = velocity_m_s, now_s
 
-    def land(self) -> None:
-        """Sink where it is, whatever it is told."""
-        self._lands, self._goal_m = True, 0.0
-
     def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move on by `dt_s`."""
-        most_m = (_DESCENT_M_S if self._lands else _CLIMB_M_S[self._kind]) * dt_s
+        most_m = _CLIMB_M_S[self._kind] * dt_s
         climb_m = max(-most_m, min(most_m, self._goal_m - self._height_m))
         self._height_m += climb_m
         roll_deg = 0.0
@@ -69,7 +62,7 @@ class FreeFlight(Motion):
             velocity, roll_deg = self._circled(dt_s)
         else:
             velocity, told_s = self._told
-            if not self.is_flying or self._lands or now_s - told_s > _COMMAND_GOOD_FOR_S:
+            if not self.is_flying or now_s - told_s > _COMMAND_GOOD_FOR_S:
                 velocity = 0j
         self._at_m += velocity * dt_s
         lat_deg, lon_deg = moved(self._home.lat_deg, self._home.lon_deg, self._at_m.real, self._at_m.imag)
@@ -97,7 +90,7 @@ class FreeFlight(Motion):
 
 
 class Piloted(FlightController):
-    """A flight controller that is armed, changes its mode and takes off, and says where it truly is (SIM_STATE). It has
+    """A flight controller that is armed and takes off, and says where it truly is (SIM_STATE). It has
     GPS at the start."""
 
     def __init__(self, vehicle: str, **parameters: float) -> None:
@@ -108,14 +101,6 @@ class Piloted(FlightController):
         self.reports[mavlink.MAVLINK_MSG_ID_SIM_STATE] = _truth
         for name, value in parameters.items():
             self.set(name, value)
-
-    def set_mode(self, mode: int) -> bool:
-        """Change the flight mode; of an ArduPilot, one that needs a position is refused without one."""
-        needs_position = self._is_ardupilot and self.kind == "copter" and mode in _NEED_POSITION
-        if needs_position and not self.brain.origin:
-            return False
-        self.brain.mode = mode
-        return True
 
     def why_not_arm(self) -> str | None:
         """The reason of the pre-arm checks of an ArduPilot, None where they pass."""
@@ -143,15 +128,11 @@ class Piloted(FlightController):
             self._vision_s = self.brain.now_s
         return super().hear(message)
 
-    def arm(self, is_armed: bool = True) -> None:
-        """Arm or disarm; a plane with ArduPilot whose mode is TAKEOFF then takes off."""
-        self.brain.is_armed = is_armed
-        if self._is_ardupilot and self.kind == "plane" and self.brain.mode == _TAKEOFF:
+    def arm(self) -> None:
+        """Arm; a plane with ArduPilot, whose mode is TAKEOFF, then takes off."""
+        self.brain.is_armed = True
+        if self.kind == "plane" and self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             self.motion.take_off(self.brain.parameters["TKOFF_ALT"])
-
-    @property
-    def _is_ardupilot(self) -> bool:
-        return self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 
     def _obey(self, command):
         match command.command:
@@ -164,7 +145,7 @@ class Piloted(FlightController):
                 self.motion.take_off(command.param7)
                 return OK, []
             case mavlink.MAV_CMD_DO_SET_MODE:
-                return (OK if self.set_mode(int(command.param2)) else FAILED), []
+                return OK, []
         return super()._obey(command)
 
 

@@ -13,7 +13,7 @@ from edgevpr.core.errors import ImageError
 from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
-from edgevpr.lab.simulate.motion import FlownTrack
+from edgevpr.lab.simulate.motion import TrueState
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.requests import Wish
@@ -104,7 +104,7 @@ def link(request):
     port = UdpPort()
     number = port.number
     port.close()
-    track = FlownTrack(t_s=[0.0], lat_deg=[50.0], lon_deg=[8.0], alt_m=[300.0], heading_deg=[float("nan")])
+    track = [TrueState(lat_deg=50.0, lon_deg=8.0, alt_m=300.0)]
     autopilot = AutopilotThread(f"udpin:127.0.0.1:{number}", track=track)
     ahead_s = clock.now_s - time.monotonic()
 

@@ -49,7 +49,7 @@ class Controlled:
         )
         self._packer, self._receiver = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._to, self._said, self._steps = None, 0, 0
-        self.sees, self.heard, self.texts, self.reports = True, [], [], []
+        self.sees, self.heard, self.reports = True, [], []
         self.link.want_position()
 
     def __enter__(self):
@@ -94,7 +94,7 @@ class Controlled:
             if condition():
                 return
             self.fly(1)
-        raise AssertionError(f"not in {seconds} s; {self.texts}")
+        raise AssertionError(f"not in {seconds} s")
 
     def _see(self):
         truth, now_s = self.controller.brain.truth, self.clock.now_s
@@ -105,8 +105,6 @@ class Controlled:
 
     def _say(self, messages):
         for message in messages:
-            if message.get_type() == "STATUSTEXT":
-                self.texts.append(message.text)
             self._sock.sendto(message.pack(self._packer), self._to)
             self._packer.seq = (self._packer.seq + 1) % 256
             self._said += 1

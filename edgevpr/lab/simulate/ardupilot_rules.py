@@ -1,8 +1,8 @@
-"""The simulated ArduPilot: the rules of 4.7-dev (October 2025) for its filter NavEKF3, its failsafe and command 43003.
+"""The simulated ArduPilot: the rules of 4.7-dev (October 2025) for its filter NavEKF3 and command 43003.
 Used by `controller`.
 
 Times and limits are from the source code: AP_NavEKF3.h (deadReckonDeclare_ms, posRetryTimeNoVel_ms,
-posRetryTimeUseVel_ms, tiltDriftTimeMax_ms), AP_NavEKF3_PosVelFusion.cpp (setLatLng), ekf_check.cpp, AP_Arming.cpp. The
+posRetryTimeUseVel_ms, tiltDriftTimeMax_ms), AP_NavEKF3_PosVelFusion.cpp (setLatLng). The
 behaviour of a copter without GPS was observed in ArduPilot's own simulator.
 """
 
@@ -10,7 +10,7 @@ import math
 
 from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, SD_GROWS_M_S, Firmware
 from edgevpr.lab.simulate.motion import Motion
-from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
+from edgevpr.lab.simulate.sensors import FIX_3D, Origin, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 _DEAD_RECKONING_S = 1.0
@@ -19,15 +19,11 @@ _AIDING_LOST_S = 15.0
 _OLDEST_FIX_S = 5.0
 _POSITION_NOISE_M = 0.5  # EK3_POSNE_M_NSE
 _ALIGNED_AFTER_S, _AGAIN_AFTER_S = 5.0, 0.5  # of GPS, at the start and later; a real one needs half a minute
-_BAD_FOR_S = 1.0  # ten checks of the filter in a row, ten a second
 # The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
 
-_GUIDED, _LAND = {"copter": 4, "plane": 15}, 9
-_NEED_POSITION = {3, 4, 5, 6, 7, 16}  # modes of a copter; a plane flies on
 _GPS, _EXTERNAL = 3, 6  # EK3_SRCn_POSXY
-_HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
 
 
 class ArduPilot(Firmware):
@@ -38,22 +34,20 @@ class ArduPilot(Firmware):
     filter_report = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT  # nothing but heartbeats comes without being asked for
 
     def __init__(self, kind: str, motion: Motion) -> None:
-        mode = _GUIDED[kind] if motion.is_flying else 0
-        super().__init__(kind, motion, {**ARDUPILOT, **(ARDUPILOT_PLANE if kind == "plane" else {})}, mode)
+        super().__init__(kind, motion, {**ARDUPILOT, **(ARDUPILOT_PLANE if kind == "plane" else {})})
         self._source_set = 1
-        self._is_aiding = self._has_ever_passed = False
-        self._good_since_s: float | None = None
-        self._bad_since_s: float | None = None
-        self._frozen: tuple[float, float] | None = None  # the position that is reported without aiding
+        self._is_aiding = False
+        self._good_since_s, self._aligned_after_s = math.inf, _ALIGNED_AFTER_S
+        self._frozen: tuple[float, float] | None = None  # the position that is reported after aiding
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
-        self._start_aiding(
-            (self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m), self.now_s - 2 * _DEAD_RECKONING_S
-        )
-        self.texts.clear()
+        here = (self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m)
+        self._start_aiding(here, self.now_s - 2 * _DEAD_RECKONING_S)
 
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
+        if self._is_aiding and self.kind == "copter" and self.now_s - self._passed_s > _AIDING_LOST_S:
+            self._is_aiding, self._good_since_s, self._frozen = False, math.inf, self.reckoning.place(self.truth)
         measured, before, self._used = self._measured(), self._used, self._measured()
         if not self._is_aiding:
             self._wait_for_aiding(measured)
@@ -91,7 +85,7 @@ class ArduPilot(Firmware):
         self._reset_to(command.x / 1e7, command.y / 1e7, max(sd_m, _POSITION_NOISE_M), age_s)
         return OK
 
-    def set_origin(self, at: tuple[float, float, float]) -> bool:
+    def set_origin(self, at: Origin) -> bool:
         """Set the origin, unless there is one. Returns True if it was set."""
         return self.origin is None and super().set_origin(at)
 
@@ -113,41 +107,14 @@ class ArduPilot(Firmware):
 
     def _wait_for_aiding(self, measured: PositionMeasurement | None) -> None:
         if measured is None:
-            self._good_since_s = None
+            self._good_since_s = math.inf
             return
-        self._good_since_s = self.now_s if self._good_since_s is None else self._good_since_s
-        if self.now_s - self._good_since_s >= (_AGAIN_AFTER_S if self._has_ever_passed else _ALIGNED_AFTER_S):
+        self._good_since_s = min(self._good_since_s, self.now_s)
+        if self.now_s - self._good_since_s >= self._aligned_after_s:
             self._start_aiding((measured.lat_deg, measured.lon_deg, measured.alt_m), self.now_s)
 
-    def _start_aiding(self, at: tuple[float, float, float], passed_s: float) -> None:
-        self._is_aiding, self._passed_s, self._frozen = True, passed_s, None
-        if self.set_origin(at):
-            self._say(mavlink.MAV_SEVERITY_INFO, "EKF3 IMU0 origin set")
+    def _start_aiding(self, at: Origin, passed_s: float) -> None:
+        self._is_aiding, self._passed_s, self._aligned_after_s = True, passed_s, _AGAIN_AFTER_S
+        self.set_origin(at)
         self._reset_to(at[0], at[1], _POSITION_NOISE_M)
         self.reckoning.drift_m_s = 0j
-        source = "GPS" if self._source == _GPS else "external nav data"
-        self._say(mavlink.MAV_SEVERITY_INFO, f"EKF3 IMU0 is using {source}")
-
-    def _watch(self) -> None:
-        """Stop aiding, and land a copter, when the position is lost for too long. After landing, disarm."""
-        if self.kind == "plane":
-            return
-        if self.is_armed and self.mode == _LAND and not self.motion.is_flying:
-            self.is_armed = False
-        if self._is_aiding and self.now_s - self._passed_s > _AIDING_LOST_S:
-            self._is_aiding, self._good_since_s, self._frozen = False, None, self.reckoning.place(self.truth)
-            self._say(mavlink.MAV_SEVERITY_WARNING, "EKF3 IMU0 stopped aiding")
-        is_good = bool(self.flags() & _HAS_POSITION)
-        self._has_ever_passed |= is_good
-        if not self._has_ever_passed or is_good != self._has_failed:
-            self._bad_since_s = None
-            return
-        self._bad_since_s = self.now_s if self._bad_since_s is None else self._bad_since_s
-        if self.now_s - self._bad_since_s < _BAD_FOR_S:
-            return
-        self._has_failed, self._bad_since_s = not is_good, None
-        self._say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared" if is_good else "EKF variance")
-        if not is_good and self.is_armed and self.mode in _NEED_POSITION:
-            self.mode = _LAND
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe: changed to LAND Mode")
-            self.motion.land()

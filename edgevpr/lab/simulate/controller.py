@@ -94,8 +94,6 @@ class FlightController:
                 if self.brain.now_s >= self._due_s[number]:
                     self._due_s[number] = max(self._due_s[number] + interval_s, self.brain.now_s)
                     said += self._made(number)
-            said += [mavlink.MAVLink_statustext_message(each[0], each[1].encode()) for each in self.brain.texts]
-            self.brain.texts.clear()
         return said
 
     def hear(self, message: Message) -> list[Message]:
@@ -134,8 +132,6 @@ class FlightController:
                 self._stream(number, command.param2)
                 return OK, []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                if self.brain.number == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
-                    self.brain.texts.append((mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({number})"))
                 return mavlink.MAV_RESULT_DENIED, []
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
                 return OK if is_known else FAILED, self._made(number)

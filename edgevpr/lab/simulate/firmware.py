@@ -1,5 +1,5 @@
-"""The common part of the simulated firmwares, ArduPilot and PX4: parameters, a position estimator, and its failsafe.
-The error of the estimate grows by a simple model. East and north are one complex number, east + 1j * north."""
+"""The common part of the simulated firmwares, ArduPilot and PX4: parameters and a position estimator. The error of the
+estimate grows by a simple model. East and north are one complex number, east + 1j * north."""
 
 import cmath
 import math
@@ -28,15 +28,15 @@ _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_
 
 
 class Firmware(ABC):
-    """The position estimator of a vehicle, and all that depends on it. The failsafe lands `motion`. `texts` are the
-    (severity, text) of the status texts to be sent."""
+    """The position estimator of a vehicle, and all that edgevpr reads which depends on it. It flies no mode and has no
+    failsafe: what a pilot would see, edgevpr does not."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
     filter_report: ClassVar[int]
     default_hz: ClassVar[Mapping[int, float]] = {}
 
-    def __init__(self, kind: str, motion: Motion, parameters: dict[str, float], mode: int) -> None:
+    def __init__(self, kind: str, motion: Motion, parameters: dict[str, float]) -> None:
         self.kind, self.motion = kind, motion
         self.vehicle_type = _TYPES[kind]
         is_px4 = self.number == mavlink.MAV_AUTOPILOT_PX4
@@ -44,24 +44,21 @@ class Firmware(ABC):
         self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
         self.reckoning = Reckoning()
         self.origin: Origin | None = None
-        self.mode, self.is_armed = mode, motion.is_flying
-        self.texts: list[tuple[int, str]] = []
+        self.is_armed = motion.is_flying
         self.test_ratio = 0.0
         self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
         self._passed_s = -math.inf  # when a measured position was last within the gate
         self._used: PositionMeasurement | None = None
         self._wind_m_s = 0j  # as the filter has learnt it
-        self._has_failed = False
 
     def step(self, dt_s: float) -> None:
-        """Advance by `dt_s` seconds: motion, sensors, estimator, then the failsafe."""
+        """Advance by `dt_s` seconds: motion, sensors, estimator."""
         self.now_s += dt_s
         self.truth = self.motion.step(self.now_s, dt_s)
         self.receivers.step(self.truth, self.now_s)
         from_deg = self.parameters["SIM_WIND_DIR"]
         self._estimate(-cmath.rect(self.parameters["SIM_WIND_SPD"], math.radians(90 - from_deg)), dt_s)
-        self._watch()
 
     @abstractmethod
     def lose_gps(self) -> None:
@@ -79,10 +76,6 @@ class Firmware(ABC):
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         """Advance the estimator by `dt_s` seconds. `wind_m_s` is the true wind, complex."""
 
-    @abstractmethod
-    def _watch(self) -> None:
-        """Let the failsafe land a vehicle that has lost its position. After landing, disarm."""
-
     def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
@@ -94,9 +87,6 @@ class Firmware(ABC):
     def use_source_set(self, number: float) -> int:
         """Execute MAV_CMD_SET_EKF_SOURCE_SET (42007), if the firmware has source sets. Returns a MAV_RESULT."""
         return UNSUPPORTED
-
-    def _say(self, severity: int, text: str) -> None:
-        self.texts.append((severity, text))
 
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
         """Fuse a measurement that is within the gate; reset the position to one outside of it if none was within for

@@ -15,7 +15,6 @@ _RESET_AFTER_S = 7.0  # reset_timeout_max
 _SILENT_AFTER_S = 5.0  # of message 296
 _OLDEST_FIX_S = 15.0
 _DEFAULT_ACCURACY_M = 50.0
-_POSITION, _LAND = 3 << 16, 4 << 16 | 6 << 24
 
 
 class Px4(Firmware):
@@ -33,7 +32,7 @@ class Px4(Firmware):
     }
 
     def __init__(self, kind: str, motion: Motion) -> None:
-        super().__init__(kind, motion, PX4_PARAMETERS, _POSITION)
+        super().__init__(kind, motion, PX4_PARAMETERS)
         self._fused_s = self._aided_s = -math.inf  # last fused; last not purely inertial
         self._other_s = self._other_heard_s = -math.inf  # message 296: last fused, last received
 
@@ -114,14 +113,3 @@ class Px4(Firmware):
 
     def _is_valid(self) -> bool:
         return self.now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6
-
-    def _watch(self) -> None:
-        """Land when the position is lost in flight. After landing, disarm."""
-        if self.is_armed and self.mode == _LAND and not self.motion.is_flying:
-            self.is_armed = False
-        is_lost = self.origin is not None and not self._is_valid()
-        if is_lost and not self._has_failed and self.is_armed:
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe activated: no valid position, landing")
-            self.mode = _LAND
-            self.motion.land()
-        self._has_failed = is_lost

@@ -27,7 +27,7 @@ def heartbeat(brain: Firmware) -> Message:
         type=brain.vehicle_type,
         autopilot=brain.number,
         base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
-        custom_mode=brain.mode,
+        custom_mode=0,
         system_status=mavlink.MAV_STATE_ACTIVE if brain.is_armed else mavlink.MAV_STATE_STANDBY,
         mavlink_version=3,
     )

@@ -136,7 +136,6 @@ class Pilot:
 
     def arm(self, mode: int) -> None:
         self.command(mavlink.MAV_CMD_DO_SET_MODE, 1, mode)
-        self.until(lambda: self.last["HEARTBEAT"].custom_mode == mode, "the mode")
         for _ in range(60):
             if self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
                 return

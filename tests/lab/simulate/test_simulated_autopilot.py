@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
 
@@ -16,7 +15,7 @@ from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.motion import FlownTrack, Motion, read_track, truth_at
+from edgevpr.lab.simulate.motion import Motion, TrueState, read_track, truth_at
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -125,13 +124,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
 @pytest.mark.slow
 def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
     monkeypatch.setattr("edgevpr.mavlink.asking.LISTEN_S", 0.2)
-    track = FlownTrack(
-        t_s=np.array([0.0, 0.1]),
-        lat_deg=np.array([50.0, 50.1]),
-        lon_deg=np.array([8.0, 8.0]),
-        alt_m=np.zeros(2),
-        heading_deg=np.full(2, np.nan),
-    )
+    track = [TrueState(lat_deg=50.0 + t_s, lon_deg=8.0, alt_m=0.0, t_s=t_s) for t_s in (0.0, 0.1)]
     link = f"127.0.0.1:{free_port()}"
     autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
     try:
@@ -148,13 +141,8 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
 
 
 def test_it_says_how_fast_it_flies_along_the_track():
-    track = FlownTrack(
-        t_s=np.array([0.0, 10.0, 20.0, 21.0]),
-        lat_deg=np.array([50.0, 50.001, 50.001, 51.0]),
-        lon_deg=np.array([8.0, 8.0, 8.001, 8.0]),
-        alt_m=np.zeros(4),
-        heading_deg=np.full(4, np.nan),
-    )
+    points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001), (21.0, 51.0, 8.0)
+    track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
     velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
     expected = [11.12j, 11.12j, 7.15 + 0j, -71.47 + 327j, 0j]
     assert [each.real for each in velocities] == pytest.approx([each.real for each in expected], abs=0.01)

@@ -18,7 +18,6 @@ def asked(flown):
 
 
 def in_air(flown):
-    flown.controller.set_mode(13)
     flown.until(lambda: flown.controller.why_not_arm() is None)
     flown.controller.arm()
     return flown.fly(20)
