@@ -186,7 +186,7 @@ class FakeLink:
     def wish(self, wish: Wish) -> str:
         if wish not in self._offered:
             return "TEMPORARILY_REJECTED"
-        self._wishes.append(Wished(wish, 255, 190))
+        self._wishes.append(Wished(wish, "255/190"))
         return "ACCEPTED"
 
     def set_health(self, health: Health) -> None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from edgevpr.core.errors import LinkAddressError
 
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
-BAUD_MIN, BAUD_MAX = 1200, 12_000_000
+_BAUD = 1200, 12_000_000, "the baud rate must be a number such as 57600 or 921600"
+_PORT = 1, 65_535, "the port must be a whole number from 1 to 65535"
 
 Sender = tuple[str, int]  # host and port
 
@@ -31,26 +32,17 @@ def parse_link(url: str) -> LinkAddress:
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
         raise LinkAddressError(f"{url!r} is no MAVLink link: write {FORMS}.")
-    if kind == "serial":
-        if not _is_whole_number(number, BAUD_MIN, BAUD_MAX):
-            raise LinkAddressError(f"{url}: the baud rate must be a number such as 57600 or 921600, not {number!r}.")
-    elif ":" in where:
+    if kind != "serial" and ":" in where:
         raise LinkAddressError(f"{url}: {where!r} is no host: give a name or an IPv4 address.")
-    elif not _is_whole_number(number, 1, 65_535):
-        raise LinkAddressError(f"{url}: the port must be a whole number from 1 to 65535, not {number!r}.")
+    low, high, what = _BAUD if kind == "serial" else _PORT
+    if not (number.isascii() and number.isdigit() and len(number) < 10 and low <= int(number) <= high):
+        raise LinkAddressError(f"{url}: {what}, not {number!r}.")
     return LinkAddress(kind, where, int(number))
 
 
 def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
-    """Parse the texts of both links; None stands for no link. Raises LinkAddressError for a text that is no address,
-    and for a `ground` without a `flight`. Returns two addresses:
-    - that of the link to the flight controller, or None;
-    - that of the link to the ground station, or None.
-    """
+    """Parse the texts of the links to flight controller and ground station; None stands for no link. Raises
+    LinkAddressError for a text that is no address, and for a `ground` without a `flight`."""
     if flight is None and ground is not None:
         raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
     return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))
-
-
-def _is_whole_number(text: str, low: int, high: int) -> bool:
-    return text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high

@@ -14,7 +14,7 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
-from edgevpr.mavlink.messages import Health, Severity
+from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.requests import Requests, Wish, Wished
 from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
@@ -93,14 +93,20 @@ class Conversation:
         """True if a message or a text waits to be sent."""
         return bool(self._messages or self.texts)
 
-    def put(self, message: Message) -> None:
-        """Queue a message; if the queue is full, the oldest message is dropped."""
-        self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
-        self._messages.append(message)
-        self.copy_message(message)
+    def send(self, *outgoing: Message) -> None:
+        """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
+        for message in outgoing:
+            self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
+            self._messages.append(message)
+            self.copy_message(message)
+
+    def send_fix(self, fix: Fix) -> Sending:
+        """Queue a position fix. It is sent within `max_fix_age_s` seconds, and only while the autopilot is heard, or
+        never. The returned `Sending` holds the outcome as soon as that is known."""
+        return self.fixes.put(fix, self._clock())
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text for the people on the ground. `topic` names what it is about (see `Texts`)."""
+        """Queue a text for the people on the ground, one in five seconds. `topic`: what it is about (see `Texts`)."""
         self.texts.put(severity, text, topic)
         self.copy_text(severity, text, topic)
 
@@ -227,7 +233,7 @@ class Conversation:
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
-            return text, None  # not by `put`, which copies to the ground's link: that has its own texts
+            return text, None  # not by `send`, which copies to the ground's link: that has its own texts
         return (self._messages.popleft(), None) if self._messages else None
 
     def _heartbeat(self, now_s: float) -> Message:
@@ -257,8 +263,7 @@ class Conversation:
         that has restarted has forgotten the request."""
         if self._ask_position_s is None:
             return
-        for question in self.autopilot.interview.questions(now_s, system_id):
-            self.put(question)
+        self.send(*self.autopilot.interview.questions(now_s, system_id))
         if self.channel is not self._told_channel:
             self._told_channel, self._odometry_since_s = self.channel, now_s
             self.settings.listener.hear_channel(self.channel)
@@ -269,13 +274,11 @@ class Conversation:
         heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
         if now_s - heard_s > ASK_AGAIN_S or self._asked_for_state != self.channel.is_continuous:
             self._asked_for_state = self.channel.is_continuous
-            for request in messages.report_requests(system_id, self.autopilot.firmware, self._asked_for_state):
-                self.put(request)
+            self.send(*messages.report_requests(system_id, self.autopilot.firmware, self._asked_for_state))
 
     def _hear_request(self, message: Message, now_s: float) -> None:
         us = self._packer.srcSystem, self._packer.srcComponent
-        for reply in self.requests.hear(message, us, now_s):
-            self.put(reply)
+        self.send(*self.requests.hear(message, us, now_s))
 
     def _hear_answer(self, answer: str, now_s: float) -> None:
         readiness = self.autopilot.readiness
@@ -284,4 +287,4 @@ class Conversation:
             self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
         if answer == "FAILED" and readiness.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-            self.put(messages.message_request(self.autopilot.system_id or 0, origin))
+            self.send(messages.message_request(self.autopilot.system_id or 0, origin))

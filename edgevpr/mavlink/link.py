@@ -15,12 +15,9 @@ from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
-from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.ports import Port, open_port
 from edgevpr.mavlink.turns import Turns
-from edgevpr.mavlink.wire import Message
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
@@ -72,12 +69,18 @@ class LinkStats:
         return self.sent.get("COMMAND_INT", 0)
 
 
-def _in_turn(method: Callable[Concatenate[Conversation, P], T]) -> Callable[Concatenate["Link", P], T]:
-    """Make a method of `Link` from one of `Conversation`: it calls that method inside a turn."""
+def _in_turn(
+    method: Callable[Concatenate[Conversation, P], T], *, sends: bool = False
+) -> Callable[Concatenate["Link", P], T]:
+    """Make a method of `Link` from one of `Conversation`: it calls that method inside a turn. If it `sends`, the link's
+    thread is woken."""
 
     def done_in_turn(link: "Link", /, *values: P.args, **named: P.kwargs) -> T:
         with link.turn(method.__name__):
-            return method(link._conversation, *values, **named)
+            done = method(link._conversation, *values, **named)
+        if sends:
+            link._ring()
+        return done
 
     done_in_turn.__doc__ = method.__doc__
     return done_in_turn
@@ -128,27 +131,9 @@ class Link:
         stands still, so that several calls act at the same moment. `what` names the turn on the tape."""
         return self._turns.taken(what)
 
-    def send(self, *outgoing: Message) -> None:
-        """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
-        with self.turn("send"):
-            for message in outgoing:
-                self._conversation.put(message)
-        self._ring()
-
-    def send_fix(self, fix: Fix) -> Sending:
-        """Queue a position fix. It is sent within `max_fix_age_s` seconds, and only while the autopilot is heard, or
-        never. The returned `Sending` holds the outcome as soon as that is known."""
-        with self.turn("send_fix"):
-            sending = self._conversation.fixes.put(fix, self._turns.now_s())
-        self._ring()
-        return sending
-
-    def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text for the people on the ground; texts are sent at most every five seconds (see `Texts`)."""
-        with self.turn("announce"):
-            self._conversation.announce(severity, text, topic)
-        self._ring()
-
+    send = _in_turn(Conversation.send, sends=True)
+    send_fix = _in_turn(Conversation.send_fix, sends=True)
+    announce = _in_turn(Conversation.announce, sends=True)
     offer = _in_turn(Conversation.offer)
     take_wishes = _in_turn(Conversation.take_wishes)
     set_health = _in_turn(Conversation.set_health)

@@ -136,29 +136,28 @@ def position_sensor(fix: Fix, t_sent_s: float) -> Message:
 def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix".
     `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970 (None: unknown)."""
-    has_fix, state = state is not None, state or _NOWHERE
     week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
-    east, north, down = state.velocity_m_s
+    east, north, down = state.velocity_m_s if state else (0, 0, 0)
     return mavlink.MAVLink_gps_input_message(
         time_usec=round(t_mono_s * 1e6),
         gps_id=receiver,
         ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
         time_week_ms=int(rest_s * 1000),
         time_week=int(week),
-        fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if has_fix else mavlink.GPS_FIX_TYPE_NO_FIX,
+        fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
         hdop=0.0,
         vdop=0.0,
         # The smallest number with which a filter starts, so that a real receiver is always preferred.
-        satellites_visible=6 if has_fix else 0,
-        lat=round(state.lat_deg * 1e7),
-        lon=round(state.lon_deg * 1e7),
-        alt=state.alt_m,
+        satellites_visible=6 if state else 0,
+        lat=round(state.lat_deg * 1e7) if state else 0,
+        lon=round(state.lon_deg * 1e7) if state else 0,
+        alt=state.alt_m if state else 0,
         vn=north,
         ve=east,
         vd=down,
-        speed_accuracy=state.speed_accuracy_m_s,
-        horiz_accuracy=state.accuracy_m,
-        vert_accuracy=state.alt_accuracy_m,
+        speed_accuracy=state.speed_accuracy_m_s if state else 0,
+        horiz_accuracy=state.accuracy_m if state else 0,
+        vert_accuracy=state.alt_accuracy_m if state else 0,
     )
 
 
@@ -302,16 +301,6 @@ def status_text(severity: Severity, text: str) -> Message:
 
 _DENSE_HZ = 25  # an ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second
 _UNUSED = 2**32 - 1
-_NOWHERE = MotionState(
-    t_mono_s=0.0,
-    lat_deg=0.0,
-    lon_deg=0.0,
-    alt_m=0.0,
-    velocity_m_s=(0.0, 0.0, 0.0),
-    accuracy_m=0.0,
-    alt_accuracy_m=0.0,
-    speed_accuracy_m_s=0.0,
-)
 # Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
 _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,

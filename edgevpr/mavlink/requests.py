@@ -5,8 +5,8 @@ request that only the flight itself can fulfil, such as a pause. Used by `conver
 import re
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from edgevpr import __version__
 from edgevpr.mavlink.wire import Message, mavlink
@@ -24,18 +24,11 @@ class Wish(IntEnum):
     LEARN_NOTHING = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Wished:
-    """A wish, with the system and component id of the sender that made it."""
+class Wished(NamedTuple):
+    """A wish, and who made it: "system id/component id"."""
 
     wish: Wish
-    system_id: int
-    component_id: int
-
-    @property
-    def sender(self) -> str:
-        """The sender as the text "system/component"."""
-        return f"{self.system_id}/{self.component_id}"
+    sender: str
 
 
 class Requests:
@@ -84,10 +77,7 @@ class Requests:
         return (ack, *replies)
 
     def _obey(self, command: Message) -> tuple[int, tuple[Message, ...]]:
-        """Execute a command. Returns:
-        - its result, a MAV_RESULT;
-        - the messages that it requested.
-        """
+        """Execute a command. Returns its result, a MAV_RESULT, and the messages that it requested."""
         wanted = command.param1  # a float: a whole one equals its integer, and NaN equals none
         if command.command == mavlink.MAV_CMD_USER_1:
             return self._take_wish(command, wanted), ()
@@ -96,8 +86,7 @@ class Requests:
         return mavlink.MAV_RESULT_UNSUPPORTED, ()
 
     def _take_wish(self, command: Message, wanted: float) -> int:
-        """Keep a wish. It replaces a waiting one of the same subject: pause and resume, or learning and not learning.
-        Returns a MAV_RESULT."""
+        """Keep a wish, in place of a waiting one on the same subject. Returns a MAV_RESULT."""
         if wanted not in tuple(Wish):
             return int(mavlink.MAV_RESULT_DENIED)
         wish = Wish(int(wanted))
@@ -106,7 +95,7 @@ class Requests:
         is_about_learning = wish in (Wish.LEARN, Wish.LEARN_NOTHING)
         if not is_about_learning:
             self._is_paused = wish is Wish.PAUSE
-        self._waiting[is_about_learning] = Wished(wish, command.get_srcSystem(), command.get_srcComponent())
+        self._waiting[is_about_learning] = Wished(wish, f"{command.get_srcSystem()}/{command.get_srcComponent()}")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _may_answer(self, now_s: float) -> bool:

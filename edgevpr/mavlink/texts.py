@@ -38,17 +38,13 @@ class Texts:
         warning, note = (topic, Severity.WARNING), (topic, Severity.INFO)
         if severity is Severity.WARNING:
             self._waiting.pop(note, None)
-            if (replaced := self._waiting.get(warning)) not in (None, text):
-                log.info("the ground is not told %r, but what came after it: %r", replaced, text)
         self._waiting[topic, severity] = text
         others_wait = warning in self._waiting and note in self._waiting
         if not others_wait and self._last.get(topic) == text:
             del self._waiting[topic, severity]
         if len(self._waiting) > WAITING_MAX:
-            dropped = self._oldest(Severity.INFO)
-            lost_text = self._waiting.pop(dropped)
-            if dropped[1] is Severity.WARNING:
-                log.warning("the ground is not told, since too many texts wait: %s", lost_text)
+            lost_text = self._waiting.pop(self._oldest(Severity.INFO))
+            log.warning("the ground is not told, since too many texts wait: %s", lost_text)
 
     def next(self, now_s: float) -> Message | None:
         """Return the STATUSTEXT that is to be sent now; None if no text waits, or the last one was too recent."""
