@@ -94,17 +94,20 @@ def metering_row(log: Path) -> Row:
     for _ in range(MEASURED):
         elsewhere += 1
         begin_s = time.process_time()
-        with meter.reading_frame(is_live=False) as reading:
+        with meter.timed() as reading:
             pass
-        with meter.working():
+        meter.load.busy(reading.cost)
+        with meter.timed(thread_only=True) as work:
             of_query.begin()
             for name in STEPS:
                 with of_query.step(name):
                     pass
             steps = replace(of_query.steps(), read=reading.cost)
             meter.count(Recognition(frame=None, reason="", steps=steps, cost=of_query.cost()))
-            with meter.telling():
+            with meter.timed() as telling:
                 json.dumps([asdict(of_query.cost()), asdict(reading.cost), asdict(meter.thermal), meter.totals()])
+            meter.energy.add(telling.cost)
+        meter.load.busy(work.cost)
         meter.look_at_heat()
         meter.reading()
         taken_s.append(time.process_time() - begin_s)

@@ -13,7 +13,6 @@ LOGS, MAPS = "/var/log/edgevpr", "/var/lib/edgevpr"
 LEARNT = f"{MAPS}/learnt.gpkg"
 CUTS = 4
 _SYNCED_S = 2.5  # a line is on the disk two seconds after it was written
-_INSTALL = "/root/edgevpr/bin/edgevpr service install --config /etc/edgevpr/config.yaml"
 _GADGET = "/sys/kernel/config/usb_gadget/fc"
 # A flight controller on USB, made of the kernel's own parts: its vendor and product are ArduPilot's.
 _PLUG_FC = f"""
@@ -204,17 +203,6 @@ def judged(trial: Trial, row: Outcome) -> None:
     limits = {name: trial.unit(name) for name in ("MemoryMax", "CPUQuotaPerSecUSec", "WatchdogUSec", "MemoryCurrent")}
     row.kept = ", ".join(f"{name} {value}" for name, value in limits.items())
     row.expect(limits["MemoryMax"] == "256000000" and limits["MemoryCurrent"].isdigit(), "the limit of memory holds")
-
-
-@fault("`service install` a second time")
-def installed_twice(trial: Trial, row: Outcome) -> None:
-    pid = trial.unit("MainPID")
-    to_do = [line for line in trial.run(_INSTALL, limit_s=300).splitlines() if line.startswith("to do")]
-    row.again_s = trial.next_match(trial.begin_s)
-    row.does = f"finds all done but {len(to_do)} step, which has no state (udev names what is plugged in)"
-    row.kept = "everything; the service that flies goes on"
-    row.expect(len(to_do) == 1 and "udev" in to_do[0], f"nothing is done twice ({to_do})")
-    row.expect(trial.unit("MainPID") == pid, "the service that flies goes on")
 
 
 @fault("flight controller on USB pulled, and plugged in again after 10 s", flies=False, restarts=None)

@@ -21,7 +21,7 @@ from edgevpr.cli.shared import (
     path_of,
     show,
 )
-from edgevpr.core.config import Config, with_logs_in
+from edgevpr.core.config import with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import aligned, progress, shown, waiting
 
@@ -126,10 +126,8 @@ def run_flight(args: Namespace) -> int:
     """Run `run`: fly with a configuration, until the flight ends."""
     from edgevpr.runtime.flight.flight import fly
 
-    def config() -> Config:
-        return with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
-
-    return fly(config(), path_of(args.positions), config if args.config else None)
+    config = with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
+    return fly(config, path_of(args.positions))
 
 
 def run_check(args: Namespace) -> int:

@@ -4,14 +4,11 @@ import shutil
 import sys
 import time
 from argparse import Namespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from edgevpr.cli.shared import command
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import printable
-
-if TYPE_CHECKING:
-    from edgevpr.runtime.flight.status import LinkState, SeenQuery, Status
 
 _FILE = "/run/edgevpr/status.json"
 _LOOK_S = 1.0  # the flight writes its status once a second
@@ -53,23 +50,26 @@ def run_top(args: Namespace) -> int:
         return 0
 
 
-def lines_of(status: "Status") -> list[str]:
+def lines_of(status: dict[str, Any]) -> list[str]:
     """Return the status for people, as lines of a label and a text."""
-    latency, throttled = _known(", {:.2f} s old", status.latency_s), ", the board slows itself down"
-    ram = f"{status.machine_ram_mb:.0f} of {status.machine_ram_total_mb:.0f} MB by all programs"
+    latency, throttled = _known(", {:.2f} s old", status["latency_s"]), ", the board slows itself down"
+    ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
-        ("edgevpr", f"{status.version}, {status.elapsed_s:.0f} s of flight, {status.health.lower()}"),
-        ("frames", f"{status.source}{latency}{', paused' if status.paused else ''}"),
-        ("rate", f"{_known('{:.2f}', status.rate_hz) or '-'} of {status.asked_rate_hz:g} queries a second"),
-        ("queries", f"{status.queries}, {status.accepted} accepted, {status.failed} failed"),
-        ("CPU", f"{_known('{:.2f} cores, ', status.cpu_cores)}{status.machine_cpu_share:.0%} by all programs"),
-        ("RAM", f"{status.rss_mb:.0f} MB, {ram}"),
-        ("heat", (_known("{:.0f} °C", status.temperature_c) or "unknown") + (throttled if status.throttled else "")),
-        ("charge", f"{status.used_mah:.2f} mAh"),
-        ("match", _seen(status.match)),
-        ("newest", _seen(status.newest)),
-        *(_of_link(status.link) if status.link else [("link", "none")]),
-        *(("remark", remark) for remark in status.remarks),
+        ("edgevpr", f"{status['version']}, {status['elapsed_s']:.0f} s of flight, {status['health'].lower()}"),
+        ("frames", f"{status['source']}{latency}{', paused' if status['paused'] else ''}"),
+        ("rate", f"{_known('{:.2f}', status['rate_hz']) or '-'} of {status['asked_rate_hz']:g} queries a second"),
+        ("queries", f"{status['queries']}, {status['accepted']} accepted, {status['failed']} failed"),
+        ("CPU", f"{_known('{:.2f} cores, ', status['cpu_cores'])}{status['machine_cpu_share']:.0%} by all programs"),
+        ("RAM", f"{status['rss_mb']:.0f} MB, {ram}"),
+        (
+            "heat",
+            (_known("{:.0f} °C", status["temperature_c"]) or "unknown") + (throttled if status["throttled"] else ""),
+        ),
+        ("charge", f"{status['used_mah']:.2f} mAh"),
+        ("match", _seen(status["match"], status["t_mono_s"])),
+        ("newest", _seen(status["newest"], status["t_mono_s"])),
+        *(_of_link(status["link"]) if status["link"] else [("link", "none")]),
+        *(("remark", remark) for remark in status["remarks"]),
     ]
     return [f"{label:<11} {printable(text)}" for label, text in rows]
 
@@ -78,23 +78,24 @@ def _known(form: str, value: float | None) -> str:
     return "" if value is None else form.format(value)
 
 
-def _seen(query: "SeenQuery | None") -> str:
+def _seen(query: dict[str, Any] | None, now_s: float) -> str:
     if query is None:
         return "none yet"
-    if not query.accepted:
-        return f"{query.age_s:.0f} s ago, refused: {query.reason}"
-    sure = _known(", confidence {:.4f}", query.confidence) + _known(", score {:.3f}", query.score)
-    good = _known(", good to {:.0f} m", query.accuracy_m)
-    return f"{query.age_s:.0f} s ago, place {query.place} ({query.reference_image}){sure}{good}"
+    ago = f"{now_s - query['t_frame_s']:.0f} s ago"
+    if not query["accepted"]:
+        return f"{ago}, refused: {query['reason']}"
+    sure = _known(", confidence {:.4f}", query["confidence"]) + _known(", score {:.3f}", query["score"])
+    good = _known(", good to {:.0f} m", query["accuracy_m"])
+    return f"{ago}, place {query['place']} ({query['reference_image']}){sure}{good}"
 
 
-def _of_link(link: "LinkState") -> list[tuple[str, str]]:
-    channel = _CHANNELS.get(link.channel, link.channel)
-    heard = _known(f"flight controller {{:.0f}}, told by {channel}", link.autopilot)
-    answers = ", ".join(f"{number} {name}" for name, number in link.answers.items()) or "none"
+def _of_link(link: dict[str, Any]) -> list[tuple[str, str]]:
+    channel = _CHANNELS.get(link["channel"], link["channel"])
+    heard = _known(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
+    answers = ", ".join(f"{number} {name}" for name, number in link["answers"].items()) or "none"
     return [
-        ("link", f"{link.trouble or 'open'}, {heard or 'no flight controller is heard'}"),
-        ("fixes", link.fixes),
-        ("answers", f"{answers}, {link.unanswered} missing"),
-        ("navigation", _known("position known to {:.1f} m", link.accuracy_m) or "position unknown"),
+        ("link", f"{link['trouble'] or 'open'}, {heard or 'no flight controller is heard'}"),
+        ("fixes", link["fixes"]),
+        ("answers", f"{answers}, {link['unanswered']} missing"),
+        ("navigation", _known("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
     ]

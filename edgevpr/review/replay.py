@@ -24,7 +24,6 @@ from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import FRAMES, MAP, TAPE, frame_path, recording_of
-from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.flight.world import Stop, World
 
@@ -98,7 +97,6 @@ def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Pa
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
             tap=untapped,
             stop=Stop(playback),
-            reread=Reread(lambda: config, playback) if header["is_reread"] else None,
             status=None,
             recording=header["recording"],
         )

@@ -14,7 +14,6 @@ T = TypeVar("T")
 _AS_FOUND = "is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn"
 _ALWAYS: dict[str, Any] = {
     "stop": False,
-    "reread": False,
     "log is written": True,
     "process_cpu_s": 0.0,
     "thread_cpu_s": 0.0,

@@ -28,7 +28,7 @@ T = TypeVar("T")
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"
 
-_RETIRED = ("forms",)  # kinds of notes that only earlier versions wrote
+_RETIRED = "forms", "reread", "config"  # kinds of notes that only earlier versions wrote
 
 _log = logging.getLogger(__name__)
 

@@ -8,13 +8,12 @@ from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.flight.autopilot import NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
@@ -57,7 +56,6 @@ class Flight:
             else None
         )
         self.stop = Stop()
-        self.reread: Reread | None = None
         self.end: dict = {}
 
     def fly(
@@ -69,7 +67,7 @@ class Flight:
     ) -> list[dict]:
         settings, clock = self.config.mavlink, self.clock.clock
         with self.recogniser.place_map, FlightLog(self.log, clock=self.clock) as flight_log:
-            herald, autopilot = Herald(flight_log, self.link), NoAutopilot()
+            herald, autopilot = Herald(flight_log, self.link), None
             if self.link:
                 navigator = self.navigator
                 if navigator is None:  # of a real link it is the listener from the start
@@ -88,7 +86,6 @@ class Flight:
                 meter=meter or FlightMeter(self.config.battery, self.board, clock),
                 clock=clock,
                 stop=self.stop,
-                reread=self.reread,
                 status=status,
                 fewer_candidates=fewer_candidates,
             )

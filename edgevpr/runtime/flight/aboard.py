@@ -1,12 +1,10 @@
-"""Opening of the map, the recogniser, the learner and the flight log, and the first line of that log, which records all
-that a flight depends on. `flight` does this before it opens the links and the source of frames."""
+"""Opening of the map, the recogniser and the learner, and the first line of the flight log, which records all that a
+flight depends on. `flight` does this before it opens the links and the source of frames."""
 
 import logging
-import os
 import platform
 import sys
-from contextlib import ExitStack
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, astuple, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ from edgevpr.core.errors import MapError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, identity_of
-from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.metering import meter_of_queries
 from edgevpr.runtime.flight.world import World
 from edgevpr.runtime.preflight.choose import too_late
@@ -33,53 +30,14 @@ _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Aboard:
-    """Result of `come_aboard`. `learner` is None if no places are learnt. `cannot_learn` is why there is no learner
-    although the configuration asks for one (None: there is one, or none is asked for). `found` is the expected
-    performance."""
-
-    recogniser: Recogniser
-    learner: Learner | None
-    cannot_learn: str | None
-    flight_log: FlightLog
-    found: Outlook
-
-
-def come_aboard(config: Config, world: World, stack: ExitStack) -> Aboard:
-    """Open the map and the log, which `stack` closes, and measure how fast the technique is on this board. Raises an
-    EdgevprError if the map or the log cannot be opened."""
-    recogniser, learner, cannot_learn = _opened(config, world)
-    stack.callback(recogniser.place_map.close)
-    flight_log = FlightLog(
-        world.log.path,
-        world.clock.mono_s,
-        world.clock.utc_s,
-        wait="NOTIFY_SOCKET" in os.environ,
-        max_mb=world.log.max_mb,
-        tape=world.tape,
-    )
-    stack.enter_context(flight_log)
-    recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
-    found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
-    recogniser.candidates = found.candidates
-    return Aboard(
-        recogniser=recogniser,
-        learner=learner,
-        cannot_learn=cannot_learn,
-        flight_log=flight_log,
-        found=found,
-    )
-
-
-def _opened(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
+def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
     """Open the recogniser of a flight. Returns
     - the recogniser,
     - its learner (None: no places are learnt),
     - why it cannot learn (None: it can, or is not asked to).
 
     If the map cannot be written (a memory card that has become read-only, a full disk), only the recogniser is opened:
-    the places of the map can still be recognised.
+    the places of the map can still be recognised. Raises an EdgevprError if the map cannot be opened.
     """
     here = replace(config, map=world.place_map)
     name = world.tape.read("picked", lambda: _picked(config))
@@ -105,6 +63,15 @@ def _opened(config: Config, world: World) -> tuple[Recogniser, Learner | None, s
     return recogniser, None, cannot_learn
 
 
+def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
+    """Measure how fast the technique is on this board, and have it compare as many candidates as there is time for.
+    Returns the expected performance."""
+    recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
+    found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
+    recogniser.candidates = found.candidates
+    return found
+
+
 def _picked(config: Config) -> str | None:
     """Return the configured technique (None: that of the map). If a new map is to be learnt and no technique is
     configured, choose one for the board."""
@@ -126,10 +93,10 @@ def rate_hz(config: Config, recogniser: Recogniser) -> float:
     return config.source.rate_hz or recogniser.meter.board.rate_hz
 
 
-def say_start(config: Config, world: World, aboard: Aboard) -> None:
-    """Report which technique flies, warn if fixes would be too late or the board's power is unverified, and write the
-    first line of the flight log."""
-    board, recogniser, found = world.board, aboard.recogniser, aboard.found
+def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
+    """Report which technique flies, warn if fixes would be too late or the board's power is unverified, and return the
+    fields of the first line of the flight log."""
+    board = world.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
     sends = config.mavlink.link is not None and config.mavlink.send_fixes
@@ -137,7 +104,7 @@ def say_start(config: Config, world: World, aboard: Aboard) -> None:
         _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
     if not board.verified:
         _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
-    decided: dict[str, Any] = {
+    decided = {
         "reason": found.reason,
         "rule": recogniser.rule,
         "candidates": recogniser.candidates,
@@ -150,7 +117,7 @@ def say_start(config: Config, world: World, aboard: Aboard) -> None:
         "dry_run": not config.mavlink.send_fixes,
     }
     fields = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
-    aboard.flight_log.write("start", **fields, recording=world.recording, decided=decided)
+    return {**fields, "recording": world.recording, "decided": decided}
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:

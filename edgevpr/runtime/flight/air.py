@@ -2,7 +2,6 @@
 configured. `flight.fly` uses it; a replay makes a `World` of its own."""
 
 import logging
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -22,9 +21,9 @@ from edgevpr.mavlink.signing import open_signing
 from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.recording import Recording
-from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.status import StatusFile, usual_path
 from edgevpr.runtime.flight.world import Stop, World
 from edgevpr.runtime.recognise.learn import check_positions
@@ -36,12 +35,10 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def in_the_air(
-    config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None
-) -> Iterator[World]:
+def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]:
     """Open all inputs and outputs of a real flight, yield them, and close them at the end. `positions` is a file with
-    the positions of the frames, if the source is a recording (None: there is none). `read_again` reads the
-    configuration again (None: it has no file). Raises an EdgevprError if something cannot be opened."""
+    the positions of the frames, if the source is a recording (None: there is none). Raises an EdgevprError if something
+    cannot be opened."""
     if config.source.uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     parse_links(config.mavlink.link, config.mavlink.ground)
@@ -58,7 +55,6 @@ def in_the_air(
                     "version": __version__,
                     "config": asdict(config),
                     "board": asdict(board),
-                    "is_reread": read_again is not None,
                     "recording": str(recording.path.resolve()),
                 },
             )
@@ -85,7 +81,6 @@ def in_the_air(
             signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
             tap=tlog.record if tlog else untapped,
             stop=Stop(tape),
-            reread=Reread(read_again, tape) if read_again else None,
             status=status,
             recording=str(recording.path.resolve()) if recording else None,
         )
@@ -107,7 +102,7 @@ def _or_without(opened: Callable[[], T]) -> T | None:
     try:
         return opened()
     except EdgevprError as error:
-        if "NOTIFY_SOCKET" not in os.environ:
+        if not systemd.is_there():
             raise
         _log.warning("%s", error)
         return None

@@ -1,10 +1,10 @@
 """Exchange of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and gives the
-state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses `ToAutopilot` or, if there is
-no link, `NoAutopilot`."""
+state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses it."""
 
 import logging
 import math
 from dataclasses import replace
+from typing import Any
 
 from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
 from edgevpr.core.types import FixReport
@@ -15,7 +15,6 @@ from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.status import LinkState
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # While an autopilot is heard, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
@@ -27,28 +26,6 @@ DRY_RUN = "dry run: no fix is sent"
 _GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
 
 _log = logging.getLogger(__name__)
-
-
-class NoAutopilot:
-    """Replaces `ToAutopilot` in a flight without a link."""
-
-    summary = None
-
-    def log_answers(self) -> None:
-        """Do nothing: no fix is sent, so none is answered."""
-
-    def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Return the event; an accepted match gets a report that its fix was not sent."""
-        return replace(event, fix=_unsent(event, "there is no link")) if event.accepted else event
-
-    def compare_gps(self, off_m: float, is_wrong: bool) -> None:
-        """Do nothing."""
-
-    def state(self) -> None:
-        """Return None: there is no link."""
-
-    def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Do nothing."""
 
 
 class ToAutopilot:
@@ -83,20 +60,22 @@ class ToAutopilot:
         )
         return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
 
-    def state(self) -> LinkState:
-        """Return the state of the link, the counts of the autopilot's answers, and the accuracy of the navigation."""
+    def state(self) -> dict[str, Any]:
+        """Return the state of the link for the status: `trouble`, why it is not open (None: it is); `autopilot`, system
+        id of the one heard (None: none is); `channel`, how positions are sent; `answers` to fixes, counted by result;
+        `unanswered` fixes; `accuracy_m`, how well the position is known (one axis, 1 sigma; None: it is not)."""
         with self._link.turn("state"):
             stats = self._link.stats()
-            return LinkState(
-                connected=stats.connected,
-                trouble=stats.trouble,
-                autopilot=stats.autopilot_system_id if stats.autopilot_heard else None,
-                channel=self._link.channel.name,
-                fixes=self.summary,
-                answers=stats.acks,
-                unanswered=stats.unanswered_fixes,
-                accuracy_m=self._navigator.accuracy_m(self._clock.mono_s()),
-            )
+            return {
+                "connected": stats.connected,
+                "trouble": stats.trouble,
+                "autopilot": stats.autopilot_system_id if stats.autopilot_heard else None,
+                "channel": self._link.channel.name,
+                "fixes": self.summary,
+                "answers": stats.acks,
+                "unanswered": stats.unanswered_fixes,
+                "accuracy_m": self._navigator.accuracy_m(self._clock.mono_s()),
+            }
 
     def log_answers(self) -> None:
         """Write a log line of kind "answer" for each fix that, since the last call, was answered, was not answered in
@@ -188,28 +167,22 @@ class ToAutopilot:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("%s: %s; no fix is sent", event.name, error)
-            return _unsent(event, str(error)), None
+            return unsent(event, str(error)), None
         self._say_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
-            return _unsent(event, advice.why or DRY_RUN), None
+            return unsent(event, advice.why or DRY_RUN), None
         return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
         """Count a fix that is held back because of `objection` (None: it is not), and report when holding back begins
         and ends."""
-        is_holding = objection is not None
-        self._held += is_holding
-        if is_holding == self._is_holding:
-            return
-        self._is_holding = is_holding
-        if is_holding:
+        before, self._is_holding = self._is_holding, objection is not None
+        self._held += self._is_holding
+        if self._is_holding and not before:
             ground = "fix held back, contradicts autopilot"
             self._herald.say(messages.Severity.WARNING, f"a fix is {objection}", ground=ground, topic="held back")
-        else:
+        elif before and not self._is_holding:
             self._herald.say(messages.Severity.INFO, "fixes agree again", topic="held back")
-
-
-Autopilot = NoAutopilot | ToAutopilot
 
 
 class SourceSets:
@@ -251,7 +224,8 @@ def _reported(query: str, sending: Sending) -> FixReport:
     )
 
 
-def _unsent(event: Recognition, why: str) -> FixReport:
+def unsent(event: Recognition, why: str) -> FixReport:
+    """Return the report of a fix that was not sent, and why."""
     return FixReport(query=event.name, sent=False, why=why)
 
 

@@ -7,13 +7,12 @@ fixes have the same offset from it, and two wrong ones hardly ever do.
 """
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.runtime.flight.navigation import ExpectedFix
+from edgevpr.runtime.flight.navigation import ComparedFix
 from edgevpr.runtime.recognise.locate import in_sd
 
 # Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
@@ -21,19 +20,6 @@ from edgevpr.runtime.recognise.locate import in_sd
 _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
 _DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeenFix:
-    """A fix to be judged. `off_m` (2,): metres east and north from the path to the fix; `covariance_m2` (2, 2): that of
-    the fix; `path_m` (2,): point of the path when its frame was taken, metres from the path's origin; `t_s`: time of
-    the frame; `places`: numbers of the places that it comes from."""
-
-    off_m: Doubles
-    covariance_m2: Doubles
-    path_m: Doubles
-    t_s: float
-    places: Collection[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,15 +36,15 @@ class Consistency:
     GPS, a contradicting fix is never believed."""
 
     def __init__(self) -> None:
-        self._held: SeenFix | None = None
+        self._held: ComparedFix | None = None
 
-    def weighed(self, fix: SeenFix, expected: ExpectedFix, has_gps: bool) -> Weighed:
-        """Judge a fix by the one that was `expected`. `has_gps`: the autopilot has a GPS that is believed."""
-        step_m = fix.off_m - expected.off_m
-        if in_sd(step_m, fix.covariance_m2 + expected.covariance_m2) <= _CONTRADICTS:
+    def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""
+        step_m = fix.off_m - fix.expected_m
+        if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS:
             self._held = None
             return Weighed()
-        off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(expected.covariance_m2) / 2)
+        off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         if has_gps:
             self._held = None
             return Weighed(f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is")
@@ -73,22 +59,22 @@ class Consistency:
         )
 
 
-def _differ(one: SeenFix, other: SeenFix) -> float:
+def _differ(one: ComparedFix, other: ComparedFix) -> float:
     """Return by how many standard deviations the offsets of two fixes from the path differ; infinity if more than 30 s
     lie between the fixes."""
-    apart_s = abs(other.t_s - one.t_s)
+    apart_s = abs(other.seen.t_s - one.seen.t_s)
     return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
 
 
-def _is_independent(one: SeenFix, other: SeenFix) -> bool:
+def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:
     """Return True if two fixes are of different places, or if the aircraft has flown so far in between that the same
     wrong position, found twice, would not agree."""
-    if set(one.places).isdisjoint(other.places):
+    if set(one.seen.places).isdisjoint(other.seen.places):
         return True
     return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS
 
 
-def _of_both(one: SeenFix, other: SeenFix) -> Doubles:
-    drift_m = _DRIFT_M_S * abs(other.t_s - one.t_s)
-    both: Doubles = one.covariance_m2 + other.covariance_m2 + drift_m**2 * np.eye(2)
+def _of_both(one: ComparedFix, other: ComparedFix) -> Doubles:
+    drift_m = _DRIFT_M_S * abs(other.seen.t_s - one.seen.t_s)
+    both: Doubles = one.seen.covariance_m2 + other.seen.covariance_m2 + drift_m**2 * np.eye(2)
     return both

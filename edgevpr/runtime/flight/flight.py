@@ -14,28 +14,27 @@ from typing import Any
 
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import Frame
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import come_aboard, rate_hz, say_start
+from edgevpr.runtime.flight.aboard import look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.air import in_the_air
-from edgevpr.runtime.flight.autopilot import DRY_RUN, Autopilot, NoAutopilot, ToAutopilot
+from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
+from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.reloading import Reread, reload
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, signals
 from edgevpr.runtime.preflight.pick import trusted_candidates
-from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 _TURN_S = 0.2  # a pass of the loop waits no longer than this for a frame
@@ -43,11 +42,11 @@ _TURN_S = 0.2  # a pass of the loop waits no longer than this for a frame
 _log = logging.getLogger(__name__)
 
 
-def fly(config: Config, positions: Path | None = None, read_again: Callable[[], Config] | None = None) -> int:
+def fly(config: Config, positions: Path | None = None) -> int:
     """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions
-    of the frames, if the source is a recording (None: there is none). `read_again` reads the configuration again on
-    SIGHUP (None: it has no file). Raises an EdgevprError, one sentence, if the flight cannot start."""
-    with in_the_air(config, positions, read_again) as world, signals(world):
+    of the frames, if the source is a recording (None: there is none). Raises an EdgevprError, one sentence, if the
+    flight cannot start."""
+    with in_the_air(config, positions) as world, signals(world.stop):
         try:
             with closing(Flight.open(config, world)) as flight:
                 return flight.run()
@@ -61,7 +60,7 @@ class Flight:
 
     def __init__(self, config: Config, crew: Crew) -> None:
         self._config, self._crew, self._opened = config, crew, ExitStack()
-        self._map_watch, self._tally = MapWatch(crew.herald), Tally()
+        herald, self._map_watch, self._tally = crew.herald, MapWatch(crew.herald), Tally()
         self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
         self._governing = Governing(crew, self._pace)
         self._commands = Commands(crew)
@@ -77,8 +76,8 @@ class Flight:
             self._tally.tell,
             self._vitals.tell,
             self._map_watch.tell,
-            Sight(crew.herald).tell,
-            GpsWatch(config.mavlink.min_accuracy_m, crew.herald, crew.autopilot).tell,
+            Sight(herald).tell,
+            GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot).tell,
             self._log_event,
             self._learn,
         )
@@ -87,29 +86,31 @@ class Flight:
     def open(cls, config: Config, world: World) -> "Flight":
         """Open the map, the log, the links and the source, in this order. Raises an EdgevprError if one of them cannot
         be opened, and StopNow if a signal ends the flight before it has begun."""
-        systemd.starting()
+        systemd.notify(EXTEND_TIMEOUT_USEC=systemd.LONGEST_START_US)
         with ExitStack() as stack:
             with world.stop.beginning():
-                aboard = come_aboard(config, world, stack)
-            say_start(config, world, aboard)
-            recogniser, learner = aboard.recogniser, aboard.learner
+                recogniser, learner, cannot_learn = open_map(config, world)
+                stack.callback(recogniser.place_map.close)
+                flight_log = _open_log(world)
+                stack.enter_context(flight_log)
+                found = look_ahead(recogniser, config, world)
+            flight_log.write("start", **say_start(config, world, recogniser, found))
             step_s = 1 / rate_hz(config, recogniser)
             navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted=not config.mavlink.send_fixes)
             link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
             source = world.open_source(step_s)
             stack.callback(source.close)
             if link and not source.is_live:
-                _say_recording(config, learner)
-            herald = Herald(aboard.flight_log, link)
-            autopilot: Autopilot = NoAutopilot()
+                _log.warning("%s is a recording: its fixes say where it was made, not where you are", config.source.uri)
+            herald = Herald(flight_log, link)
+            autopilot = None
             if link:
-                autopilot = ToAutopilot(
-                    link, navigator, herald, settings=config.mavlink, cores=world.board.cores, clock=world.clock
-                )
+                settings, cores = config.mavlink, world.board.cores
+                autopilot = ToAutopilot(link, navigator, herald, settings=settings, cores=cores, clock=world.clock)
             if not config.mavlink.send_fixes:
                 herald.say(Severity.WARNING, DRY_RUN)
-            if aboard.cannot_learn:
-                _say_learning_stopped(herald, aboard.cannot_learn)
+            if cannot_learn:
+                _say_learning_stopped(herald, cannot_learn)
             herald.say(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
             meter = FlightMeter(config.battery, world.board, world.clock, tape=world.tape)
             crew = Crew(
@@ -119,18 +120,17 @@ class Flight:
                 link=link,
                 ground=ground,
                 autopilot=autopilot,
-                flight_log=aboard.flight_log,
+                flight_log=flight_log,
                 herald=herald,
                 meter=meter,
                 clock=world.clock,
                 stop=world.stop,
-                reread=world.reread,
                 status=world.status,
                 fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
             )
             flight = cls(config, crew)
             flight._opened = stack.pop_all()
-        systemd.ready()
+        systemd.notify(READY=1)
         return flight
 
     def close(self) -> None:
@@ -147,13 +147,10 @@ class Flight:
         return 1 if self._tally.unusable + self._tally.failed else 0
 
     def totals(self) -> dict[str, Any]:
-        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`, and
-        - `queries`: the number of queries
-        - `dropped`: pictures not read in time (None: the source is a recording)
-        - `refused`: pictures that were not new and whole, their number by reason
-        - `latency_s`: age of the newest picture when it could be read, seconds (None: unknown)
-        - `left_out`: places of the map that cannot be read.
-        """
+        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`; `queries`; `dropped`,
+        pictures not read in time (None: the source is a recording); `refused`, pictures that were not new and whole, by
+        reason; `latency_s`, age of the newest picture when it could be read, seconds (None: unknown); `left_out`,
+        places of the map that cannot be read."""
         source = self._crew.source
         return {
             "queries": self._tally.queries,
@@ -169,50 +166,47 @@ class Flight:
         source, clock, meter = self._crew.source, self._crew.clock, self._crew.meter
         self._vitals.beat()
         self._commands.obey()
-        if (reread := self._crew.reread) and reread.take():
-            self._reload(reread)
         if (wait_s := self._pace.wait_s()) > 0:
             clock.sleep(min(wait_s, _TURN_S))
             return
-        if self._commands.is_paused:
-            self._pass_over()
-            self._pace.taken()
+        is_paused = self._commands.is_paused
+        if is_paused and not source.is_live:  # a recording waits
+            clock.sleep(_TURN_S)
             return
-        with meter.reading_frame(source.is_live) as reading:
+        with meter.timed() as reading:
             try:
                 frame: Frame | ImageError | None = source.read(_TURN_S)
             except ImageError as error:
                 frame = error
+        if not source.is_live:  # of a live source, reading is mostly waiting
+            meter.load.busy(reading.cost)
         if frame is None:
             return
         self._pace.taken()
+        if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
+            return
         recogniser, link = self._crew.recogniser, self._crew.link
-        with meter.working():
+        with meter.timed(thread_only=True) as work:
             with self._crew.stop.breaks_off():
                 if isinstance(frame, ImageError):
                     event = recogniser.unread(frame)
                 else:
                     event = recogniser.step(frame, link.vehicle_at(frame.t_mono_s) if link else None)
             self._tell(replace(event, steps=replace(event.steps, read=reading.cost)))
+        meter.load.busy(work.cost)
         self._governing.look()  # here, so that each reading covers a whole number of queries
-
-    def _pass_over(self) -> None:
-        """Drop the newest picture of a live source while the flight is paused, so that none is old when it resumes. A
-        recording waits."""
-        if self._crew.source.is_live:
-            with suppress(ImageError):
-                self._crew.source.read(_TURN_S)
-        else:
-            self._crew.clock.sleep(_TURN_S)
 
     def _tell(self, event: Recognition) -> None:
         """Report an event to the autopilot, then to all observers, which also get the report of its fix. An exception
         in one of these is logged: it must not end the flight."""
         meter = self._crew.meter
         meter.count(event)
-        with meter.telling():
+        with meter.timed() as telling:
             try:
-                event = self._crew.autopilot.told(event, meter.used_mah)
+                if self._crew.autopilot:
+                    event = self._crew.autopilot.told(event, meter.used_mah)
+                elif event.accepted:
+                    event = replace(event, fix=unsent(event, "there is no link"))
             except Exception:
                 _log.exception("the autopilot could not be told")
             for tell in self._observers:
@@ -220,6 +214,7 @@ class Flight:
                     tell(event)
                 except Exception:
                     _log.exception("%s could not be told", tell.__qualname__)
+        meter.energy.add(telling.cost)
 
     def _log_event(self, event: Recognition) -> None:
         """Write the log line of an event: of kind "query", or "unusable" for a frame that could not become a query."""
@@ -257,17 +252,10 @@ class Flight:
         if well and learner.trouble:
             _say_learning_stopped(self._crew.herald, learner.trouble)
 
-    def _reload(self, reread: Reread) -> None:
-        config = reload(reread, self._config, self._crew.flight_log)
-        if config != self._config:
-            self._config = config
-            self._governing.ask_rate(rate_hz(config, self._crew.recogniser))
-            self._crew.recogniser.accept_with(config.match.accept_precision)
-
     def _end(self) -> None:
         crew, totals = self._crew, self.totals()
-        systemd.stopping()
-        if crew.link:
+        systemd.notify(STOPPING=1)
+        if crew.link and crew.autopilot:
             crew.link.close()  # sends waiting messages first, so that the log's last line counts them
             crew.autopilot.log_answers()
         crew.flight_log.write(
@@ -283,12 +271,17 @@ class Flight:
             "%d queries, %d accepted%s, %.3f mAh (%.3f of them for recognising)",
             self._tally.queries,
             self._tally.accepted,
-            f", {crew.autopilot.summary}" if crew.autopilot.summary else "",
+            f", {crew.autopilot.summary}" if crew.autopilot else "",
             totals["used_mah"],
             totals["marginal_mah"],
         )
         if crew.learner:
             _log.info("%s, %d in %s", crew.learner.summary, len(crew.recogniser.place_map), self._config.map)
+
+
+def _open_log(world: World) -> FlightLog:
+    log, clock, is_service = world.log, world.clock, systemd.is_there()
+    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb, tape=world.tape)
 
 
 def open_links(
@@ -299,13 +292,14 @@ def open_links(
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None
+    positions = (place.position for place in place_map.places() if place.position)
     link_settings = LinkSettings(
         component_id=settings.component_id,
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator,
         tap=world.tap,
-        origin=_first_position(place_map) if settings.set_origin else None,
+        origin=next(positions, None) if settings.set_origin else None,
         signing=world.signing,
         tape=world.tape,
     )
@@ -314,19 +308,6 @@ def open_links(
     return link, stack.enter_context(world.ground(ground_address, link)) if ground_address else None
 
 
-def _first_position(place_map: PlaceMap) -> Position | None:
-    return next((place.position for place in place_map.places() if place.position), None)
-
-
-def _say_recording(config: Config, learner: Learner | None) -> None:
-    uri = config.source.uri
-    if config.mavlink.send_fixes:
-        _log.warning("%s is a recording: the fixes sent say where it was made, not where you are", uri)
-    if learner:
-        _log.warning("%s is a recording: what it learns is put where the vehicle is now", uri)
-
-
 def _say_learning_stopped(herald: Herald, problem: str) -> None:
-    ground = "nothing more is learnt, see its log"
-    text = f"nothing more is learnt: {problem}"
+    text, ground = f"nothing more is learnt: {problem}", "nothing more is learnt, see its log"
     herald.tell("learning stopped", Severity.WARNING, text, ground=ground, topic="learning", problem=problem)

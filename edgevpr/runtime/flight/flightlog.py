@@ -32,26 +32,24 @@ from edgevpr.core.types import NO_TAPE, Tape
 _log = logging.getLogger(__name__)
 _PARTS = 4  # of `max_mb`: one for the file that is written, three for the numbered files
 _SYNC_EVERY_S = 1.0
-_MOST_START_BYTES = 1_000_000  # a larger file has more than start lines
 
 
 class FlightLog:
     """Writer of a flight log; with `path` None nothing is written. Close it (it is a context manager).
 
     `path` is the log of the newest flight. Before the first line of this flight, the file of an earlier flight is set
-    aside, that is renamed to the next number (see `core.appending`); if it has nothing but start lines, it is emptied
-    instead. A file that reaches a quarter of `max_mb` (None: no limit) is set aside too. The numbered files share the
-    other three quarters: the oldest are deleted. Each further file of a flight begins with a copy of the start line,
-    with `repeated` and with `part`, the number of the file within the flight. If another process writes `path`, this
-    flight writes numbered files only.
+    aside, that is renamed to the next number (see `core.appending`). A file that reaches a quarter of `max_mb` (None:
+    no limit) is set aside too. The numbered files share the other three quarters: the oldest are deleted. Each further
+    file of a flight begins with a copy of the start line, with `repeated` and with `part`, the number of the file
+    within the flight. If another process writes `path`, this flight writes numbered files only.
 
     Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
     are synced to the disk (fdatasync) by the first line written a second or more after the last sync, or by the next
     call of `sync_due`. A pulled battery costs at most the lines of the last two seconds.
 
-    `state` is None while lines are written, else a sentence that says why not. `lost_lines` counts the missing lines.
-    Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". If the log is deleted
-    or moved in flight, it goes on in a new file of the same name.
+    `state` is None while lines are written, else a sentence that says why not. `lost_lines` counts the lines that could
+    not be written. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". If the
+    log is deleted or moved in flight, it goes on in a new file of the same name.
     """
 
     def __init__(
@@ -74,11 +72,10 @@ class FlightLog:
         self._at = Path(path or "")  # the file to be written: `path`, or one with a number
         self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
         self._file: FileIO | None = None
-        self._ours: tuple[int, int] | None = None  # device and inode of the file with lines of this flight
-        self._written = 0  # lines in the file that is open
+        self._ours: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
         self._synced_s, self._is_synced, self._is_new = -math.inf, True, False
         self._start: dict[str, Any] = {}  # the start line, for the copies in later files
-        self._part, self._has_start = 0, False  # start lines written so far; the open file has one
+        self._part = 0  # start lines written so far
         self._warned: set[str] = set()
         if path is not None:
             try:
@@ -110,7 +107,9 @@ class FlightLog:
         if self.path is None:
             return
         if self._file is not None and not is_at(self._file, self._at):
-            self._note_taken_away(self._file)
+            self._warn(f"The flight log {self._at} was deleted or moved in flight: it goes on in a new file.")
+            self._let_go()
+            self._ours = None
         now_s, utc_s = self._clock(), self._utc_s()
         lines, is_start = _line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
         if is_start:
@@ -120,29 +119,21 @@ class FlightLog:
             lines = lines + gap if is_start else gap + lines
         try:
             file = self._writable(len(lines))
-            if is_repeated := bool(self._start) and not self._has_start and not is_start:
+            if self._start and not is_start and _identity(file) != self._ours:
+                is_start = True
                 lines = json_line({**self._start, "repeated": True, "part": self._part + 1}) + lines
             _append(file, lines)
             self._ours, self._is_synced = _identity(file), False
-            self._written += 1
-            self._part += is_repeated or is_start
-            self._has_start |= is_repeated or is_start
+            self._part += is_start
             if now_s - self._synced_s >= _SYNC_EVERY_S:
                 self._sync(file, now_s)
         except OSError as error:
             self.lost_lines += 1
-            self._has_start &= not is_start
             self._note_trouble(error)
-            self._let_go()  # the card may be another one when it comes back, so the file is opened anew
         else:
             if self.state is not None:
                 self.state = None
                 _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
-
-    def restate(self, **fields: Any) -> None:
-        """Change fields of the start line in its copies at the beginning of later files."""
-        if self._start:
-            self._start |= json.loads(json_line(fields))
 
     def sync_due(self, now_s: float) -> None:
         """Sync lines to the disk if a second or more has passed since the last sync. `now_s` is the present time of
@@ -153,7 +144,6 @@ class FlightLog:
             self._sync(self._file, now_s)
         except OSError as error:
             self._note_trouble(error)
-            self._let_go()
 
     def close(self) -> None:
         """Sync all lines to the disk and close the file. A failure is logged, not raised."""
@@ -169,17 +159,13 @@ class FlightLog:
     def _writable(self, more_bytes: int) -> FileIO:
         """Return the open file, with room for `more_bytes`; a full file is set aside first. Raises OSError."""
         file = self._file or self._open()
-        size = _size_of(file)
-        if not size or (_identity(file) == self._ours and size + more_bytes <= self._part_bytes):
+        size, is_ours = _size_of(file), _identity(file) == self._ours
+        if not size or (is_ours and size + more_bytes <= self._part_bytes) or not self._is_set_aside():
             return file
-        if self._ours is None and _has_only_starts(file):  # left by a service that could not start
-            file.truncate(0)
-        elif self._is_set_aside():
-            sync(file)
-            self._let_go()
-            self._delete_oldest()
-            return self._open()
-        return file
+        sync(file)
+        self._let_go()
+        self._delete_oldest()
+        return self._open()
 
     def _open(self) -> FileIO:
         """Open and lock the file to be written; if another process has locked it, a numbered file. Raises OSError."""
@@ -189,12 +175,11 @@ class FlightLog:
             self._at = claim(self.path or "")
             file = open_appending(self._at)
             try_lock(file)
-            self._warn_once(
+            self._warn(
                 f"The flight log {self.path} is written by another edgevpr: this flight is in {self._at}. Give each "
                 "flight a `log.path` of its own."
             )
-        self._file, self._written, self._is_new = file, 0, not _size_of(file)
-        self._has_start &= not self._is_new and _identity(file) == self._ours
+        self._file, self._is_new = file, not _size_of(file)
         return file
 
     def _is_set_aside(self) -> bool:
@@ -206,7 +191,7 @@ class FlightLog:
             else:
                 self._at = claim(self.path or "")
         except OSError as error:
-            self._warn_once(
+            self._warn(
                 f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
                 "grow past log.max_mb: let the flight write to its folder."
             )
@@ -218,16 +203,13 @@ class FlightLog:
         if math.isinf(self._part_bytes):
             return
         try:
-            deleted = keep_within(self.path or "", self._part_bytes * (_PARTS - 1))
+            if keep_within(self.path or "", self._part_bytes * (_PARTS - 1)):
+                self._warn("Old flight logs are deleted, the oldest first: all stay within log.max_mb together.")
         except OSError as error:
-            self._warn_once(
+            self._warn(
                 f"The oldest flight logs beside {self.path} cannot be deleted ({error.strerror}), so they grow past "
                 "log.max_mb: let the flight write to their folder."
             )
-            return
-        if deleted and "deleted" not in self._warned:
-            self._warned.add("deleted")
-            _log.warning("Old flight logs are deleted, %s first: all stay within log.max_mb together.", deleted[0])
 
     def _sync(self, file: FileIO, now_s: float) -> None:
         sync(file)
@@ -235,17 +217,16 @@ class FlightLog:
             sync_folder(self._at)
         self._is_synced, self._is_new, self._synced_s = True, False, now_s
 
-    def _note_taken_away(self, file: FileIO) -> None:
-        is_deleted = os.fstat(file.fileno()).st_nlink == 0
-        lost = self._written if is_deleted else 0
-        self.lost_lines += lost
-        self.state = (
-            f"The flight log {self._at} was {'deleted' if is_deleted else 'moved or replaced'} in flight, and "
-            f"{lost} lines of it are lost: it goes on in a new file as soon as there can be one."
-        )
-        _log.warning("%s", self.state)
+    def _note_trouble(self, error: OSError) -> None:
+        """Note that the file cannot be written. It is opened anew by the next line: the card may be another one when it
+        comes back."""
+        if self.state is None:
+            self.state = (
+                f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
+                "the flight goes on without it."
+            )
+            _log.warning("%s", self.state)
         self._let_go()
-        self._ours, self._has_start = None, False
 
     def _let_go(self) -> None:
         if self._file is not None:
@@ -253,15 +234,8 @@ class FlightLog:
                 self._file.close()
             self._file = None
 
-    def _note_trouble(self, error: OSError) -> None:
-        if self.state is None:
-            self.state = (
-                f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
-                "the flight goes on without it."
-            )
-            _log.warning("%s", self.state)
-
-    def _warn_once(self, sentence: str) -> None:
+    def _warn(self, sentence: str) -> None:
+        """Log a warning, once in a flight."""
         if sentence not in self._warned:
             self._warned.add(sentence)
             _log.warning("%s", sentence)
@@ -289,13 +263,6 @@ def record_of(line: bytes) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) else None
-
-
-def _has_only_starts(file: FileIO) -> bool:
-    if _size_of(file) > _MOST_START_BYTES:
-        return False
-    file.seek(0)
-    return all((record_of(line) or {}).get("kind") == "start" for line in file.readall().splitlines())
 
 
 def _append(file: FileIO, lines: bytes) -> None:

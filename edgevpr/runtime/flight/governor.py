@@ -84,7 +84,7 @@ class Governor:
 
     def __init__(self, limits: Limits, settings: Sequence[Setting]) -> None:
         self._limits, self._settings, self._at = limits, list(settings), 0
-        self._over, self._full, self._room = _Held(), _Held(), _Held()
+        self._since_s: dict[str, float] = {}  # when each condition that holds has begun to hold
         self._changed_s = self._raised_s = -math.inf
         self._wait_s = _FIRST_WAIT_S
         self._told: set[str] = set()
@@ -99,19 +99,14 @@ class Governor:
         """The highest setting, which is in force while no limit is exceeded."""
         return self._settings[0]
 
-    def ask_rate(self, rate_hz: float) -> None:
-        """Change the rate of the highest setting; the rates of all others change by the same factor."""
-        factor = rate_hz / self.asked.rate_hz
-        self._settings = [replace(each, rate_hz=each.rate_hz * factor) for each in self._settings]
-
     def look(self, now_s: float, reading: LoadReading) -> Change | None:
         """Judge a measurement, and return the change to be made (None: no change). Call it about once a second; each
         measurement must cover a whole number of queries."""
         hot, over = self._load(reading)
         most_mb = self._limits.memory_max_mb
         has_room = self._has_room(reading, self._settings[max(0, self._at - 1)])
-        over_s, room_s = self._over.since(now_s, over is not None), self._room.since(now_s, has_room)
-        full_s = self._full.since(now_s, reading.rss_mb >= _NEAR_MEMORY * most_mb)
+        over_s, room_s = self._held_s("over", now_s, over is not None), self._held_s("room", now_s, has_room)
+        full_s = self._held_s("full", now_s, reading.rss_mb >= _NEAR_MEMORY * most_mb)
         if has_room:
             self._told.discard("load")
         if reading.rss_mb <= _MEMORY_ROOM * most_mb:
@@ -129,6 +124,13 @@ class Governor:
             self._raised_s = now_s
             return self._changed(now_s, self._at - 1, "there is room again", back=True)
         return None
+
+    def _held_s(self, what: str, now_s: float, holds: bool) -> float:
+        """Return for how many seconds a condition has held without a break, 0 if it does not hold now."""
+        if not holds:
+            self._since_s.pop(what, None)
+            return 0.0
+        return now_s - self._since_s.setdefault(what, now_s)
 
     def _below(self, hot: bool) -> int | None:
         """Return the index of the next lower setting (None: there is none). If the board is `hot`, it is the next one
@@ -183,28 +185,8 @@ class Governor:
     def _changed(self, now_s: float, at: int, why: str, back: bool) -> Change:
         before = self.setting
         self._at, self._changed_s = at, now_s
-        for held in (self._over, self._full, self._room):
-            held.forget()  # readings before a change say nothing of the time after it
+        self._since_s.clear()  # readings before a change say nothing of the time after it
         return Change(before, self.setting, why, back)
-
-
-class _Held:
-    """Timer of a condition."""
-
-    def __init__(self) -> None:
-        self._since_s: float | None = None
-
-    def since(self, now_s: float, holds: bool) -> float:
-        """Return for how many seconds the condition has held without a break, 0 if it does not hold now."""
-        if not holds:
-            self._since_s = None
-            return 0.0
-        if self._since_s is None:
-            self._since_s = now_s
-        return now_s - self._since_s
-
-    def forget(self) -> None:
-        self._since_s = None
 
 
 class Governing:
@@ -225,11 +207,6 @@ class Governing:
         """Description of the lowered settings, in a few words; None if nothing is lowered."""
         what = lowered(self._governor.setting, self._governor.asked)
         return f"held to {what}" if what else None
-
-    def ask_rate(self, rate_hz: float) -> None:
-        """Change the rate that is asked for; lowered settings stay lowered by the same factor."""
-        self._governor.ask_rate(rate_hz)
-        self._pace.rate_hz = self._governor.setting.rate_hz
 
     def look(self) -> None:
         """Measure the load of the flight if the last measurement is a second old, and change the settings if needed."""

@@ -2,8 +2,6 @@
 moment. `watching.GpsWatch` uses it."""
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,18 +19,9 @@ _CONTRADICTS = 4.0
 _LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
 _IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
 _WITHIN_S = 30.0  # the matches in a row must be no older
+_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
-
-
-@dataclass(frozen=True, slots=True)
-class _Against:
-    """A match that contradicts GPS: the time of its frame, its places, and its offset (2,) from GPS, metres east and
-    north."""
-
-    t_s: float
-    places: Collection[int]
-    off_m: Doubles
 
 
 class Integrity:
@@ -43,7 +32,7 @@ class Integrity:
 
     def __init__(self, map_sd_m: float) -> None:
         self._map_sd_m = map_sd_m
-        self._against: list[_Against] = []
+        self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
         self._agreeing = 0
         self.is_wrong = False
         self.off_m: float | None = None
@@ -65,15 +54,14 @@ class Integrity:
                 return "GPS agrees with the map again"
             return None
         self._agreeing = 0
-        this = _Against(seen.t_s, seen.places, off_m)
         self._against = [
-            each
-            for each in self._against
-            if this.t_s - each.t_s <= _WITHIN_S
-            and _are_alike(each, this, sd_m)
-            and not set(each.places) >= set(seen.places)
+            (other, other_m)
+            for other, other_m in self._against
+            if seen.t_s - other.t_s <= _WITHIN_S
+            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _LED_AWAY_M_S * (seen.t_s - other.t_s))
+            and not set(other.places) >= set(seen.places)
         ]
-        self._against.append(this)
+        self._against.append((seen, off_m))
         if not self.is_wrong and len(self._against) >= _IN_A_ROW:
             self.is_wrong = True
             return f"GPS is {self.off_m:.0f} m from the map's position"
@@ -93,10 +81,3 @@ def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
     flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
     return off_m - flown_m
-
-
-def _are_alike(one: _Against, other: _Against, sd_m: float) -> bool:
-    """Tell whether two matches have about the same offset from GPS. It may change by 10 m/s, as a receiver may be led
-    away."""
-    room_m = math.hypot(2 * sd_m, 10.0 * (other.t_s - one.t_s))
-    return math.hypot(*(other.off_m - one.off_m)) <= 2 * room_m

@@ -1,8 +1,7 @@
 """Metering of what a flight takes from its board: charge, CPU time, memory, heat. The loop of `flight`, `vitals` and
 `governor` use it."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 
 from edgevpr.core.config import BatteryConfig
@@ -31,9 +30,9 @@ class LoadReading:
 
 
 class FlightMeter:
-    """Meter of a flight, which starts when it is made. `thermal` is the newest measurement of the board's heat,
-    `limit_c` the temperature at which the board slows itself down, and `queries_throttled` the number of queries while
-    it did. All measurements are recorded on the `tape`."""
+    """Meter of a flight, which starts when it is made. `energy` sums up the stages of queries, `load` the work of the
+    loop. `thermal` is the newest measurement of the board's heat, `limit_c` the temperature at which the board slows
+    itself down, `queries_throttled` the number of queries while it did. All is recorded on the `tape`."""
 
     def __init__(
         self,
@@ -46,8 +45,8 @@ class FlightMeter:
     ) -> None:
         self._board, self._clock, self._tape = board, clock, tape
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
-        self._energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
-        self._load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
+        self.energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
+        self.load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
         self._watch = watch or ThermalWatch()
         self.look_at_heat()
         self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
@@ -56,38 +55,20 @@ class FlightMeter:
     @property
     def age_s(self) -> float:
         """Seconds since the last `reading`."""
-        return self._load.age_s
+        return self.load.age_s
 
     @property
     def used_mah(self) -> float:
         """Charge that the board has drawn from the battery pack so far, mAh."""
         return self.totals()["used_mah"]
 
-    @contextmanager
-    def reading_frame(self, is_live: bool) -> Iterator[Stage]:
-        """Measure the reading of a frame. For a live source this is mostly waiting and does not count as work."""
-        with stage(self._clock.mono_s, self._clock.process_cpu_s) as reading:
-            yield reading
-        if not is_live:
-            self._load.busy(reading.cost)
-
-    @contextmanager
-    def working(self) -> Iterator[None]:
-        """Measure the loop's work on a frame, by the CPU time of its own thread."""
-        with stage(self._clock.mono_s, self._clock.thread_cpu_s) as work:
-            yield
-        self._load.busy(work.cost)
-
-    @contextmanager
-    def telling(self) -> Iterator[None]:
-        """Measure the reporting of an event to the autopilot and the observers."""
-        with stage(self._clock.mono_s, self._clock.process_cpu_s) as told:
-            yield
-        self._energy.add(told.cost)
+    def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
+        """Measure a block of code: its time, and the CPU time of all threads or of the calling one only."""
+        return stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
     def count(self, event: Recognition) -> None:
         """Add the cost of a frame: reading, encoding and matching."""
-        self._energy.add(event.steps.read, event.cost.whole)
+        self.energy.add(event.steps.read, event.cost.whole)
         self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
@@ -97,16 +78,16 @@ class FlightMeter:
         - `marginal_mah`: the part of that which the stages of queries added; `stages_cpu_s`: their CPU-seconds
         - `elapsed_s`: time since the start; `queries_throttled`: a count.
         """
-        process, board = self._energy.process(), self._board
+        process, board = self.energy.process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
             "queries_throttled": self.queries_throttled,
             "elapsed_s": process.wall_s,
             "used_mah": self._mah(board.idle_w * process.wall_s + process_j),
             "process_mah": self._mah(process_j),
-            "marginal_mah": self._mah(self._energy.marginal_j),
+            "marginal_mah": self._mah(self.energy.marginal_j),
             "process_cpu_s": process.cpu_s,
-            "stages_cpu_s": self._energy.stages_cpu_s,
+            "stages_cpu_s": self.energy.stages_cpu_s,
         }
 
     def look_at_heat(self) -> None:
@@ -124,7 +105,7 @@ class FlightMeter:
 
     def reading(self) -> LoadReading:
         """Return a measurement for the governor: the load since the last one, and the present memory and heat."""
-        cpu_share, late_share = self._load.look()
+        cpu_share, late_share = self.load.look()
         return LoadReading(
             cpu_share=cpu_share,
             late_share=late_share,

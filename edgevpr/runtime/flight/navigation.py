@@ -35,16 +35,30 @@ class Whereabouts:
     speed_accuracy_m_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedFix:
-    """Prediction of a fix, and the fix itself, in metres east and north. `off_m` (2,): predicted offset from the path;
-    `covariance_m2` (2, 2): that of the prediction, without that of the fix; `path_m` (2,): point of the path when the
-    frame was taken; `beside_m` (2,): offset of the fix from that point."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionedMatch:
+    """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
+    to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
+    from."""
 
-    off_m: Doubles
+    t_s: float
+    position: Position
+    accuracy_m: float
     covariance_m2: Doubles
+    places: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedFix:
+    """The fix of a match, and its prediction, in metres east and north. `path_m` (2,): point of the path when the frame
+    was taken; `off_m`, `expected_m` (2,): the offset of the fix from that point, and the predicted one;
+    `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
+
+    seen: PositionedMatch
     path_m: Doubles
-    beside_m: Doubles
+    off_m: Doubles
+    expected_m: Doubles
+    covariance_m2: Doubles
 
 
 class Navigation:
@@ -97,24 +111,25 @@ class Navigation:
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
-    def expected(self, position: Position, t_s: float) -> ExpectedFix | None:
-        """Predict the fix of a frame taken at `t_s`, and compare it with the fix at `position`; None if the path at
-        that time is not known."""
+    def compared(self, seen: PositionedMatch) -> ComparedFix | None:
+        """Compare the fix of a match with its prediction; None if the path at that time is not known."""
         path = self._unbroken
-        there = path.at(t_s) if path else None
+        there = path.at(seen.t_s) if path else None
         if path is None or there is None:
             return None
-        off_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - t_s)
-        beside_m = path.from_origin(position.lat_deg, position.lon_deg) - there.at_m
-        return ExpectedFix(off_m, covariance_m2, there.at_m, beside_m)
+        expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s)
+        off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
+        return ComparedFix(
+            seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
+        )
 
-    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, t_s: float, is_against: bool = False) -> None:
-        """Correct our position by a fix of a frame taken at `t_s` that lies `off_m` (2,) beside the path, with its
-        covariance (2, 2). `is_against`: it contradicts the expected position, and is believed all the same."""
+    def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
+        """Correct our position by a fix. `is_against`: it contradicts the expected position, and is believed all the
+        same."""
         if self._path:
             hear = self._filter.trust_fix if is_against else self._filter.hear_fix
-            hear(off_m, covariance_m2, self._path.now.t_s - t_s)
-            self._fixed_s = max(self._fixed_s, t_s)
+            hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s)
+            self._fixed_s = max(self._fixed_s, fix.seen.t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at a fix of a frame taken at `t_s`, when neither position nor velocity is known. Does nothing
@@ -166,19 +181,6 @@ def reckons_by_gps(vehicle: Vehicle) -> bool:
 def worst_sd(covariance: Doubles) -> float:
     """Return the standard deviation along the worst direction of a covariance (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PositionedMatch:
-    """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
-    to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
-    from."""
-
-    t_s: float
-    position: Position
-    accuracy_m: float
-    covariance_m2: Doubles
-    places: tuple[int, ...]
 
 
 def positioned(event: Recognition) -> PositionedMatch | None:

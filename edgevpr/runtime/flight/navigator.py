@@ -4,7 +4,7 @@ second, otherwise single fixes. The link calls it in its own thread, the loop of
 main one."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
@@ -16,9 +16,16 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.consistency import Consistency, SeenFix
+from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch, Whereabouts, positioned, reckons_by_gps
+from edgevpr.runtime.flight.navigation import (
+    Navigation,
+    PositionedMatch,
+    Whereabouts,
+    positioned,
+    reckons_by_gps,
+    worst_sd,
+)
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -115,23 +122,15 @@ class Navigator(Listener):
                 return self._unheard(fix, now_s)
             if vehicle.velocity_m_s is None:
                 return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
-            covariance_m2 = _covariance(seen, event.vehicle or vehicle)
-            expected = self._navigation.expected(seen.position, seen.t_s)
-            if expected is None:
-                sd_m = math.sqrt(np.linalg.eigvalsh(covariance_m2)[-1])
-                self._navigation.begin(seen.position, sd_m, seen.t_s, vehicle.t_heard_s)
+            seen = replace(seen, covariance_m2=_covariance(seen, event.vehicle or vehicle))
+            compared = self._navigation.compared(seen)
+            if compared is None:
+                self._navigation.begin(seen.position, worst_sd(seen.covariance_m2), seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            seen_fix = SeenFix(
-                off_m=expected.beside_m,
-                covariance_m2=covariance_m2,
-                path_m=expected.path_m,
-                t_s=seen.t_s,
-                places=seen.places,
-            )
-            verdict = self._consistency.weighed(seen_fix, expected, self.has_gps)
+            verdict = self._consistency.weighed(compared, self.has_gps)
             if verdict.objection:
                 return Advice(None, verdict.objection, is_held=True)
-            self._navigation.hear_fix(expected.beside_m, covariance_m2, seen.t_s, verdict.is_against)
+            self._navigation.hear_fix(compared, verdict.is_against)
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
 
     def knows_position(self, now_s: float) -> bool:

@@ -1,102 +1,19 @@
-"""The status of a flight at one moment, and the file in which people and programs beside the flight read it: one JSON
-object, replaced as a whole once a second. `vitals` writes it, the command `edgevpr top` reads it."""
+"""The file with the status of a flight, for people and programs beside it: one JSON object, replaced as a whole once a
+second. `vitals` writes it and says what its keys mean, the command `edgevpr top` reads it."""
 
 import json
 import os
-import stat
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import build
-from edgevpr.core.errors import ConfigError, EdgevprError
+from edgevpr import __version__
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import json_line
 
 NAME = "status.json"
 _MODE = 0o660  # positions are private, but the flight's group may read them
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeenQuery:
-    """A query and the place found for it. `age_s` is the time since its frame was taken. `place` (its number),
-    `reference_image` and `score` are None if no place was found, and `confidence` if the technique has none. The
-    position and `accuracy_m` are None unless a match with a position was accepted."""
-
-    query: str
-    age_s: float
-    accepted: bool
-    reason: str
-    place: int | None
-    reference_image: str | None
-    score: float | None
-    confidence: float | None
-    lat_deg: float | None
-    lon_deg: float | None
-    accuracy_m: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkState:
-    """State of the link to the flight controller. `trouble`: why it is not open (None: it is). `autopilot`: system id
-    of the autopilot heard (None: none is). `channel`: how positions are sent. `fixes`: counts of fixes in a few words.
-    `answers`: counts of answers to fixes, by result; `unanswered`: count of fixes without. `accuracy_m`: how well the
-    position is known (one axis, 1 sigma; None: it is not)."""
-
-    connected: bool
-    trouble: str | None
-    autopilot: int | None
-    channel: str
-    fixes: str
-    answers: dict[str, int]
-    unanswered: int
-    accuracy_m: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Status:
-    """Status of a flight.
-
-    `time` is UTC, `elapsed_s` the time since the start. `health` is the state sent in heartbeats, and `source` that of
-    the source of frames. `rate_hz` is the number of queries per second, and `cpu_cores` the number of cores that this
-    process has kept busy, both over the last ten seconds (None: too early); `asked_rate_hz` is the rate that the flight
-    tries to keep. `latency_s` is the age of the newest picture when it could be read (None: unknown).
-    `machine_cpu_share` (0..1) and `machine_ram_mb` (of `machine_ram_total_mb`) are those of all programs. `throttled`:
-    the board slows itself down (None: unknown). `newest` is the last query, `match` the last accepted one, `link` the
-    link (None: there is none). `remarks` are sentences on what else people should know.
-    """
-
-    version: str
-    time: str
-    elapsed_s: float
-    health: str
-    paused: bool
-    source: str
-    latency_s: float | None
-    queries: int
-    accepted: int
-    failed: int
-    rate_hz: float | None
-    asked_rate_hz: float
-    cpu_cores: float | None
-    rss_mb: float
-    machine_cpu_share: float
-    machine_ram_mb: float
-    machine_ram_total_mb: float
-    used_mah: float
-    temperature_c: float | None
-    throttled: bool | None
-    newest: SeenQuery | None
-    match: SeenQuery | None
-    link: LinkState | None
-    remarks: list[str]
-
-    @property
-    def summary(self) -> str:
-        """The most important values in one line."""
-        counts = f"{self.queries} queries, {self.accepted} accepted, {self.used_mah:.2f} mAh"
-        return "; ".join((self.source, counts, *([self.link.fixes] if self.link else []), *self.remarks))
 
 
 class StatusFile:
@@ -106,7 +23,7 @@ class StatusFile:
         """Try to write in the folder of `path`. Raises EdgevprError if no file can be made there."""
         self._path, self._new = Path(path), Path(f"{path}.new")
         try:
-            if self._path.exists() and not stat.S_ISREG(self._path.stat().st_mode):
+            if self._path.exists() and not self._path.is_file():
                 raise OSError("it is there and is no file")
             self._write(b"")
             self._new.unlink()
@@ -123,7 +40,7 @@ class StatusFile:
         with suppress(OSError):
             self._path.unlink()
 
-    def tell(self, status: Status) -> None:
+    def tell(self, status: dict[str, Any]) -> None:
         """Replace the status in the file. Never raises OSError."""
         with suppress(OSError):
             self._write(json_line(status))
@@ -136,14 +53,15 @@ class StatusFile:
             file.write(data)
 
 
-def read_status(path: str | Path) -> tuple[Status, float] | None:
+def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
     """Return the status in a file, and its age in seconds; None if there is no such file. Raises EdgevprError if the
-    file may not be read, or holds something else."""
+    file may not be read, or holds no status of this version."""
     try:
         with open(path, "rb") as file:
             age_s = time.time() - os.fstat(file.fileno()).st_mtime
-            fields: Any = json.loads(file.read())
-        return build(Status, fields, str(path)), age_s
+            status = json.loads(file.read())
+        if status["version"] != __version__:
+            raise ValueError
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -151,10 +69,11 @@ def read_status(path: str | Path) -> tuple[Status, float] | None:
             f"The status at {path} cannot be read ({error.strerror}): be its user or of its group (sudo), or name "
             "another file with --file."
         ) from error
-    except (ValueError, TypeError, RecursionError, ConfigError) as error:
+    except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise EdgevprError(
             f"{path} tells no status that this edgevpr understands: use the edgevpr of the flight."
         ) from error
+    return status, age_s
 
 
 def usual_path() -> str | None:

@@ -5,7 +5,7 @@ it ends no flight."""
 import logging
 
 from edgevpr.mavlink.messages import Severity
-from edgevpr.runtime.flight.autopilot import Autopilot
+from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.herald import Herald, Trouble
 from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -132,7 +132,7 @@ class GpsWatch:
     """Compares GPS with the matches, and reports once when they contradict each other and when they agree again. Every
     comparison is sent to the autopilot, and the navigation does not use a GPS that is wrong."""
 
-    def __init__(self, map_sd_m: float, herald: Herald, autopilot: Autopilot) -> None:
+    def __init__(self, map_sd_m: float, herald: Herald, autopilot: ToAutopilot | None) -> None:
         self._integrity, self._herald, self._autopilot = Integrity(map_sd_m), herald, autopilot
 
     def tell(self, event: Recognition) -> None:
@@ -143,7 +143,8 @@ class GpsWatch:
         off_m, is_wrong = self._integrity.off_m, self._integrity.is_wrong
         if off_m is None:
             return
-        self._autopilot.compare_gps(off_m, is_wrong)
+        if self._autopilot:
+            self._autopilot.compare_gps(off_m, is_wrong)
         if news:
             severity = Severity.WARNING if is_wrong else Severity.INFO
             self._herald.tell("gps", severity, news, said=news, off_m=round(off_m, 1), is_wrong=is_wrong)

@@ -1,7 +1,6 @@
 """Reading of a whole flight, which may be spread over several files of its log. All programs that read a flight after
 its end use it."""
 
-import os
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,19 +13,19 @@ from edgevpr.runtime.flight.flightlog import read_log, record_of
 
 Line = dict[str, Any]
 
-_MISSING = "Files of the flight that are missing before {}: {}. The flight is read without them."
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Stretch:
-    """The lines of one flight in one file, from byte `begin` to byte `end`. `start` is their first start line ({}:
-    there is none). `parts` are the numbers of the parts of the flight that begin here, usually one."""
+    """The lines of one flight in one file, from byte `begin` to byte `end`. `flight` identifies the flight: the time
+    of its start line on both clocks (None: it has none). `first` and `last` are the numbers of the first and the last
+    of the flight's parts that begin here."""
 
     path: Path
     begin: int
     end: int
-    start: Line
-    parts: frozenset[int]
+    flight: tuple[object, object] | None
+    first: int
+    last: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,61 +66,46 @@ def flight_of(path: str | Path, number: int | None = None) -> FlightLines:
     if number is not None and not 1 <= number <= len(found):
         raise UsageError(f"--flight {number}: {path} holds {len(found)}: give 1 to {len(found)}.")
     last = found[(number or 0) - 1]
-    earlier = _earlier(last)
-    known = {part for each in (*earlier, last) for part in each.parts}
-    lacking = max(last.parts, default=1) - len(known)
+    stretches = (*_earlier(last), last)
+    lacking = last.last - sum(each.last - each.first + 1 for each in stretches)
+    missing = f"Files of the flight that are missing before {path}: {lacking}. The flight is read without them."
     return FlightLines(
         path=path,
         number=number or len(found),
         flights=len(found),
-        missing=_MISSING.format(path, lacking) if lacking > 0 else None,
-        stretches=(*earlier, last),
+        missing=missing if lacking > 0 else None,
+        stretches=stretches,
     )
 
 
 def _earlier(last: Stretch) -> list[Stretch]:
     """Find the stretches, in other files, with the parts of the same flight before `last`, in order."""
-    first = min(last.parts, default=1)
-    found = {}
-    for path in _relatives(last.path) if first > 1 else ():
-        for each in _stretches(path):
-            if each.parts and min(each.parts) < first and _flight(each.start) == _flight(last.start):
-                found[min(each.parts)] = each
-    return [each for _, each in sorted(found.items())]
-
-
-def _relatives(path: Path) -> list[Path]:
+    found = []
     with suppress(OSError):
-        return [each for each in relatives(path) if each.is_file() and os.access(each, os.R_OK)]
-    return []
+        for path in relatives(last.path) if last.first > 1 else ():
+            with suppress(OSError):  # a file that may not be read counts as missing
+                found += [each for each in _stretches(path) if each.flight == last.flight and each.first < last.first]
+    return sorted(found, key=lambda each: each.first)
 
 
 def _stretches(path: Path) -> list[Stretch]:
     """Find the flights in a file. Lines before the first start line count as a flight too. Raises OSError."""
-    begins: list[tuple[int, Line, set[int]]] = []
+    found: list[Stretch] = []
     end = 0
     with open(path, "rb") as handle:
         for line in handle:
             # After the first line, only start lines matter: others are not parsed.
-            record = (record_of(line) if not begins or b'"start"' in line else None) or {}
-            kind = record.get("kind")
-            if kind == "start":
-                if not begins or not record.get("repeated") or _flight(record) != _flight(begins[-1][1]):
-                    begins.append((end, record, set()))
-                begins[-1][2].add(_part(record))
-            elif isinstance(kind, str) and not begins:
-                begins.append((end, {}, set()))
+            record = (record_of(line) if not found or b'"start"' in line else None) or {}
+            is_start, part = record.get("kind") == "start", _part(record)
+            flight = (record.get("time"), record.get("t_mono_s")) if is_start else None
+            if is_start and found and record.get("repeated") and found[-1].flight == flight:
+                found[-1].last = part
+            elif is_start or (isinstance(record.get("kind"), str) and not found):
+                found.append(Stretch(path=path, begin=end, end=end, flight=flight, first=part, last=part))
             end += len(line)
-    ends = [begin for begin, *_ in begins[1:]] + [end]
-    return [
-        Stretch(path=path, begin=begin, end=last, start=start, parts=frozenset(parts))
-        for (begin, start, parts), last in zip(begins, ends, strict=False)
-    ]
-
-
-def _flight(start: Line) -> tuple[object, object]:
-    """Return the values of a start line that identify its flight."""
-    return start.get("time"), start.get("t_mono_s")
+            if found:
+                found[-1].end = end
+    return found
 
 
 def _part(start: Line) -> int:

@@ -14,12 +14,11 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import NotSigning
 from edgevpr.mavlink.wire import Tap
 from edgevpr.power.boards import Board
-from edgevpr.runtime.flight.autopilot import Autopilot
+from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.flight.reloading import Reread
 from edgevpr.runtime.flight.status import StatusFile
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -82,7 +81,7 @@ class World:
     - `open_source`: opens the source of frames, given the seconds between two frames
     - `link`, `ground`: classes of the links to the autopilot and to the ground station
     - `signing`: of their packets; `tap`: is called with each packet sent or received
-    - `stop`, `reread`: signal handlers that end the flight and reread its configuration (None: it has no file)
+    - `stop`: the signal handler that ends the flight
     - `status`: the status file (None: none is written); `recording`: folder of the recording (None: there is none).
     """
 
@@ -97,39 +96,36 @@ class World:
     signing: NotSigning
     tap: Tap
     stop: Stop
-    reread: Reread | None
     status: StatusFile | None
     recording: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crew:
-    """All opened parts of a flight that work together. None means: `learner`, no places are learnt; `link` and
-    `ground`, there is no such link; `reread`, the configuration has no file; `status`, no status file is written.
-    `fewer_candidates` are the numbers of candidates that the governor may lower to."""
+    """All opened parts of a flight that work together. None means: `learner`, no places are learnt; `link`, `ground`
+    and `autopilot`, there is no such link; `status`, no status file is written. `fewer_candidates` are the numbers of
+    candidates that the governor may lower to."""
 
     recogniser: Recogniser
     learner: Learner | None = None
     source: Source
     link: Link | None = None
     ground: Link | None = None
-    autopilot: Autopilot
+    autopilot: ToAutopilot | None = None
     flight_log: FlightLog
     herald: Herald
     meter: FlightMeter
     clock: Clock
     stop: Stop
-    reread: Reread | None = None
     status: StatusFile | None = None
     fewer_candidates: tuple[int, ...] = ()
 
 
 @contextmanager
-def signals(world: World) -> Iterator[None]:
-    """Let SIGTERM and SIGINT end the flight inside this context, and SIGHUP reread its configuration."""
-    handlers: dict[signal.Signals, Callable[..., None]] = {signal.SIGTERM: world.stop, signal.SIGINT: world.stop}
-    if world.reread:
-        handlers[signal.SIGHUP] = world.reread
+def signals(stop: Stop) -> Iterator[None]:
+    """Let SIGTERM and SIGINT call `stop` inside this context; SIGHUP is ignored: a closed terminal ends no flight."""
+    handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
+    handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield

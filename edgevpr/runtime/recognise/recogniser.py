@@ -118,11 +118,6 @@ class Recogniser:
         """Number of queries that are matched together."""
         return self.search.length if self.search else 1
 
-    def accept_with(self, precision: float) -> None:
-        """Set the precision of accepted matches from the next frame on. A rule without confidence is not changed."""
-        if self.rule.sure:
-            self.rule = replace(self.rule, sure=replace(self.rule.sure, precision=precision))
-
     def extend(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
         """Use an index that has one more place, `place_id`, learnt from the frame taken at `t_mono_s`."""
         self._new = {new: t_s for new, t_s in self._new.items() if t_mono_s - t_s <= NEW_FOR_S}

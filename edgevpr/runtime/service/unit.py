@@ -1,5 +1,6 @@
 """The systemd unit of the service: deploy/edgevpr.service with a board's limits and the user's configuration file."""
 
+import os
 import re
 from pathlib import Path
 
@@ -17,8 +18,9 @@ def render_unit(board: Board, config_path: str | Path | None = None) -> str:
     """Return the text of edgevpr.service for a board and a configuration file (None: the one that the shipped unit
     names). Raises UsageError if the service cannot see the file, or if the unit cannot hold its name."""
     text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
-    visible = _visible(Path(config_path or USUAL_CONFIG))
-    text = text.replace(f" --config {USUAL_CONFIG}\n", f" --config {_quoted(str(visible))}\n")
+    path = str(Path(config_path or USUAL_CONFIG).absolute())
+    _require_visible(path)
+    text = text.replace(f" --config {USUAL_CONFIG}\n", f" --config {_quoted(path)}\n")
     changed = {
         "# Board: ": printable(board.name),
         "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
@@ -28,25 +30,17 @@ def render_unit(board: Board, config_path: str | Path | None = None) -> str:
     return keys.sub(lambda line: line[1] + changed[line[1]], text)
 
 
-def _visible(path: Path) -> Path:
-    """Return the absolute path of a configuration file. Raises UsageError if the service cannot see the file, or if a
-    unit cannot hold its name. Links are followed for the check, and stay in the returned path unless that has a
-    `..`."""
-    if not str(path).isprintable():  # a line break would begin a line of its own in the unit
+def _require_visible(path: str) -> None:
+    """Raise UsageError if the service cannot see the configuration file, or a unit cannot hold its name."""
+    if not path.isprintable():  # a line break would begin a line of its own in the unit
         raise UsageError(
             f"{path} holds a character that a unit cannot hold: give it another name, e.g. {USUAL_CONFIG}."
         )
-    try:
-        leads_to = path.resolve()
-    except (OSError, RuntimeError) as error:  # links in a circle; RuntimeError before Python 3.13
-        raise UsageError(f"{path} leads nowhere ({error}): give the path of a file, e.g. {USUAL_CONFIG}.") from error
-    written = leads_to if ".." in path.parts else path.absolute()
-    for folder in HIDDEN_FROM_THE_SERVICE:
-        if hidden := next((each for each in (written, leads_to) if each.is_relative_to(folder)), None):
+    for each in (os.path.abspath(path), os.path.realpath(path)):
+        if folder := next((name for name in HIDDEN_FROM_THE_SERVICE if Path(each).is_relative_to(name)), None):
             raise UsageError(
-                f"{hidden} is out of sight of the service, which has no access to {folder}: copy it to {USUAL_CONFIG}."
+                f"{each} is out of sight of the service, which has no access to {folder}: copy it to {USUAL_CONFIG}."
             )
-    return written
 
 
 def _quoted(argument: str) -> str:

@@ -66,7 +66,7 @@ def flown(recording, tmp_path, clock, results):
 def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path, monkeypatch):
     monkeypatch.setattr("edgevpr.runtime.flight.autopilot._SETTLED_WITHIN_S", 60.0)
     clock, statuses = FakeClock(), []
-    monkeypatch.setattr(systemd, "status", statuses.append)
+    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
     lines = flown(recording, tmp_path, clock, [ACCEPTED, FAILED, FAILED])
     kinds = [line["kind"] for line in lines if line["kind"] in ("query", "answer")]
     assert kinds[:7] == ["query", "answer"] * 3 + ["query"]

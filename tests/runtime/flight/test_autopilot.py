@@ -43,24 +43,11 @@ def test_an_answer_that_says_no_is_in_the_next_line(recording, tmp_path):
     assert of_kind(lines, "query")[1]["last_fix"]["answer"] == "FAILED"
 
 
-def test_without_an_autopilot_a_fix_waits_and_is_dropped_and_the_next_line_says_so(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock, answer=None)
-    flown = flight(recording, tmp_path, link, clock, **{"source.rate_hz": 0.5})
-    lines = flown.fly(FakeSource(pictures(2), clock))
-    assert fixes(lines) == [(None, None), (None, None)]
-    # After the first query's second of waiting.
-    link.stats()
-    last = of_kind(lines, "query")[1]["last_fix"]
-    assert last["sent"] in (None, False)
-    assert link.stats().fixes_sent == 0
-
-
 def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and_the_status(
     recording, tmp_path, monkeypatch
 ):
     clock, statuses = FakeClock(), []
-    monkeypatch.setattr(systemd, "status", statuses.append)
+    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
     link = FakeLink(clock)
     flown = flight(recording, tmp_path, link, clock)
     encode = flown.recogniser.technique.encode
@@ -129,23 +116,6 @@ def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recordin
     assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
     assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
     assert [line["state"] for line in of_kind(lines, "source")] == ["lost, reopening in 0.5 s", "streaming"]
-
-
-def test_a_camera_that_is_frozen_is_told_once_and_is_critical_until_it_is_back(recording, tmp_path):
-    clock = FakeClock()
-    link, health = FakeLink(clock), []
-    source = FakeSource(pictures(6), clock, work=lambda: (health.append(link.health.name), turn())[0])
-
-    def turn():
-        source.is_frozen = len(health) in (2, 3, 4)
-
-    lines = flight(recording, tmp_path, link, clock).fly(source)
-    assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "CRITICAL", "ACTIVE"]
-    assert link.texts() == [(4, "edgevpr: camera frozen"), (6, "edgevpr: camera is back")]
-    assert [line["state"] for line in of_kind(lines, "source")] == [
-        "frozen: the same picture over and over",
-        "streaming",
-    ]
 
 
 def test_a_listener_that_fails_does_not_end_the_flight(recording, tmp_path, caplog):

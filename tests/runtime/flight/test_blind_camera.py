@@ -1,7 +1,6 @@
 """A camera that shows nothing for a while: silence, and it is said once."""
 
 import numpy as np
-import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
 from pictures import textured
@@ -33,11 +32,3 @@ def test_ten_pictures_of_nothing_are_said_once_and_so_is_the_ground_after_them(r
     assert health[15] is Health.CRITICAL
     assert health[-1] is Health.ACTIVE
     assert len([record for record in caplog.records if "shows nothing" in record.message]) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [1, NOTHING_IN_A_ROW - 1])
-def test_a_few_pictures_of_nothing_are_a_matter_of_the_log(recording, tmp_path, count):
-    lines, texts, _ = flown(recording, tmp_path, [*([*[NOTHING] * count, GROUND] * 3), GROUND])
-    assert texts == []
-    assert of_kind(lines, "camera") == of_kind(lines, "failing") == []

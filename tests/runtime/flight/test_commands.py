@@ -49,19 +49,6 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
     assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: goes on by command")]
 
 
-def test_a_command_that_is_sent_once_more_is_logged_and_announced_once(recording, tmp_path, clock):
-    link, read = FakeLink(clock), []
-
-    def work():
-        read.append(1)
-        if len(read) in (1, 2):
-            link.wish(Wish.PAUSE)
-
-    lines = flight(recording, tmp_path, clock, link).fly(FakeSource(pictures(4), clock, work=work))
-    assert [line["is_new"] for line in of_kind(lines, "command")] == [True, False]
-    assert link.texts() == [(6, "edgevpr: paused by command")]
-
-
 def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_path, clock, monkeypatch):
     told = []
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")

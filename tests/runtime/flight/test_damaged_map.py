@@ -7,7 +7,6 @@ have.
 import shutil
 import sqlite3
 
-import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import PLACES, STEP_DEG, Flight, of_kind
@@ -123,33 +122,11 @@ def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_i
             assert mapped(line)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_a_map_that_is_cut_or_overwritten_in_flight_costs_queries_and_not_the_flight(place_map, tmp_path, share):
-    whole = place_map.read_bytes()
-    noise = np.random.default_rng(1).bytes(len(whole))
-
-    def cut():
-        place_map.write_bytes(whole[: int(share * len(whole))])
-
-    def overwritten():
-        at = int(share * len(whole))
-        with open(place_map, "r+b") as handle:
-            handle.seek(at)
-            handle.write(noise[: len(whole) - at])
-
-    def restored():
-        place_map.write_bytes(whole)
-
-    queries, _, _ = fly(place_map, tmp_path / "log", [nothing, cut, overwritten, restored])
-    assert len(queries) == 4
-    assert all(mapped(line) for line in queries)
-
-
 def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
     place_map, tmp_path, monkeypatch, caplog
 ):
     health, statuses = [], []
-    monkeypatch.setattr(systemd, "status", statuses.append)
+    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
     whole = place_map.read_bytes()
 
     def damage():

@@ -94,15 +94,6 @@ def test_the_autopilot_knows_nothing_of_a_recording(place_map, tmp_path):
     assert [line["hints"] for line in queries] == [None]
 
 
-def test_what_the_autopilot_said_more_than_a_second_ago_is_no_hint(place_map, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock, vehicle=lambda: vehicle_at(50.0, 8.0, clock.now_s - 1.1, heading_deg=75.0))
-    settings = {"match.reach_m_s": 20.0, "source.rate_hz": 60.0}
-    flight = Flight(place_map, tmp_path / "log", clock, link, **settings)
-    (query,) = of_kind(flight.fly(FakeSource([frame(4, 75.0)], clock)), "query")
-    assert query["hints"] is None
-
-
 @pytest.mark.slow
 def test_a_false_position_costs_time_and_not_the_flight(place_map, tmp_path):
     queries = fly(place_map, tmp_path / "log", [frame(0, MAPPED_DEG)] * 4, (7, None), 1.0)

@@ -153,14 +153,6 @@ def test_while_another_program_writes_nothing_is_learnt_and_afterwards_again(pla
     assert flight.learner.trouble is None
 
 
-def test_into_a_map_that_was_deleted_nothing_is_learnt(place_map, tmp_path):
-    lines, flight = learning(place_map, tmp_path, [nothing, place_map.unlink, nothing, nothing])
-    assert len(of_kind(lines, "learnt")) == 1
-    assert len(of_kind(lines, "query")) == 4
-    assert "is gone" in of_kind(lines, "query")[-1]["reason"]
-    assert flight.learner.trouble is None, "the queries fail, and nothing is learnt from those"
-
-
 def test_a_map_damaged_before_the_flight_is_flown_with_and_learnt_into(place_map, tmp_path):
     with sqlite3.connect(place_map) as db:
         db.execute("UPDATE places SET geom = 'text' WHERE place_id = 3")

@@ -2,14 +2,11 @@
 
 import random
 
-import cv2
-import numpy as np
 import pytest
-from fakes import FakeCapture, FakeClock, FakeLink, FakeSource
+from fakes import FakeClock, FakeLink, FakeSource
 from flights import PLACES, Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.power.thermal import ThermalState
 
 pytestmark = pytest.mark.slow
@@ -92,39 +89,6 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recor
     assert flight.end["queries_throttled"] == sum(throttled) > 0
     assert told[0] == 61
     assert told[-1] == 84
-
-
-def test_frames_that_nobody_took_are_counted(recording, tmp_path):
-    """The real capture thread, which takes twelve pictures before the loop asks for each next one."""
-    clock, picture = FakeClock(), cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGR)
-    pictures = [np.roll(picture, 9 * number, axis=1) for number in range(12)]
-    source = LiveSource(lambda: DeviceCapture(FakeCapture(pictures), clock), clock)
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
-
-    class Patient:
-        """The source, read once all twelve pictures of a capture have come."""
-
-        is_live, total, ended = True, 0, False
-        condition, state = property(lambda self: source.condition), property(lambda self: source.state)
-        dropped, refused = property(lambda self: source.dropped), property(lambda self: source.refused)
-        latency_s = property(lambda self: source.latency_s)
-        reads = 0
-
-        def read(self, timeout_s):
-            while source.dropped < 11 * (self.reads + 1):
-                source._closing.wait(0.005)
-            self.reads += 1
-            self.ended = self.reads == 2
-            return source.read(timeout_s)
-
-    lines = flight.fly(Patient())
-    source.close()
-    dropped = [line["totals"]["dropped"] for line in of_kind(lines, "query")]
-    assert dropped == sorted(dropped)
-    assert dropped[-1] >= 10, "most of its pictures are passed over"
-    assert flight.end["dropped"] == source.dropped
-    assert flight.end["refused"] == source.refused
-    assert of_kind(lines, "query")[-1]["totals"].keys() >= {"refused", "latency_s"}
 
 
 def test_a_flight_of_a_recording_takes_every_picture(recording, tmp_path):

@@ -9,11 +9,16 @@ from fakes import vehicle_at
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import Navigation
+from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch
 from edgevpr.runtime.flight.navigator import Slew
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
+
+
+def match_at(position, t_s, sd_m):
+    covariance_m2 = sd_m**2 * np.eye(2)
+    return PositionedMatch(t_s=t_s, position=position, accuracy_m=sd_m, covariance_m2=covariance_m2, places=(1,))
 
 
 class Flown:
@@ -65,8 +70,8 @@ class Flown:
     def fix(self, off_m=(0.0, 0.0), is_against=False):
         t_s = (self.step - self.late_steps) * STEP_S
         seen = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2) + off_m
-        expected = self.navigation.expected(Position(*moved(*HOME, *seen)), t_s)
-        self.navigation.hear_fix(expected.beside_m, self.fix_sd_m**2 * np.eye(2), t_s, is_against)
+        seen_fix = match_at(Position(*moved(*HOME, *seen)), t_s, self.fix_sd_m)
+        self.navigation.hear_fix(self.navigation.compared(seen_fix), is_against)
 
 
 def lengths(errors_m):
@@ -129,7 +134,7 @@ def test_a_silence_ends_what_is_known_until_the_vehicle_is_heard_with_a_position
     for _ in range(2):
         flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=None))
         assert flown.navigation.at(flown.t_s) is None
-        assert flown.navigation.expected(Position(*HOME), flown.t_s) is None
+        assert flown.navigation.compared(match_at(Position(*HOME), flown.t_s, 1.0)) is None
     flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=30.0))
     assert flown.navigation.at(flown.t_s).accuracy_m == pytest.approx(30.0)
 

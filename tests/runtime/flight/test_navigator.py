@@ -173,12 +173,6 @@ def test_a_continuous_position_comes_ten_times_a_second_and_does_not_jump():
     assert last.accuracy_m / LIKE_ONE < 4
 
 
-def test_no_single_fix_goes_to_an_autopilot_with_a_continuous_position():
-    air = lost(inertial(Navigator(1.0, 1.0))).fly(30)
-    assert air.sent == []
-    assert air.advices[-1][1].why.startswith("taken")
-
-
 def test_a_continuous_position_holds_and_says_how_good_it_is():
     air = lost(inertial(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
     states = said_states(air, 40)
@@ -226,12 +220,6 @@ def test_a_continuous_position_ends_when_it_is_worse_than_fifty_metres(monkeypat
     last = said_states(air)[-1][1]
     assert air.states[-1][1] is None
     assert last.accuracy_m / LIKE_ONE == pytest.approx(50.0, abs=1.0)
-
-
-def test_without_anything_heard_there_is_no_continuous_position():
-    nobody = inertial(Navigator(1.0, 1.0))
-    assert nobody.state_at(10.0) is None
-    assert not nobody.knows_position(10.0)
 
 
 def test_muted_it_hears_and_gives_no_state():

@@ -75,11 +75,3 @@ def test_without_a_position_of_ours_none_is_asked_for():
     assert sets.wanted(0.0, has_gps=False, has_own=False) is None
     assert sets.wanted(1.0, has_gps=False, has_own=True) == 2
     assert sets.wanted(2.0, has_gps=False, has_own=True) is None
-
-
-def test_gps_that_comes_and_goes_is_not_asked_for():
-    sets = SourceSets(ALLOWED)
-    assert [sets.wanted(float(t_s), has_gps=True, has_own=True) for t_s in range(30)] == [None] * 30
-    assert sets.wanted(30.0, has_gps=False, has_own=True) == 2
-    blinks = [sets.wanted(float(t_s), has_gps=t_s % 9 != 0, has_own=True) for t_s in range(31, 100)]
-    assert blinks == [None] * 69

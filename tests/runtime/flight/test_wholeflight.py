@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -64,16 +63,6 @@ def test_a_file_that_is_missing_is_said_and_the_rest_is_read(path, flown):
     whole = flight_of(path)
     assert numbers(whole) == [100, 102, 103]
     assert whole.missing == (f"Files of the flight that are missing before {path}: 1. The flight is read without them.")
-
-
-def test_the_last_file_alone_is_read_by_the_start_line_that_it_repeats(path, flown, tmp_path):
-    (tmp_path / "home").mkdir()
-    alone = Path(shutil.copy(path, tmp_path / "home" / "brought.jsonl"))
-    whole = flight_of(alone)
-    start, *rest = whole
-    assert (start["version"], start["repeated"]) == ("2", True)
-    assert numbers(rest) == [103]
-    assert "brought.jsonl: 3." in whole.missing
 
 
 def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown):

@@ -97,19 +97,6 @@ def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tm
     assert finding.what == "link"
 
 
-@pytest.mark.parametrize(("key", "is_fine"), [(bytes(32), True), (bytes(range(32)), False), (None, False)])
-def test_a_heartbeat_must_be_signed_where_there_is_a_key(settings, config_file, tmp_path, key, is_fine):
-    (tmp_path / "key").touch(mode=0o600)
-    (tmp_path / "key").write_bytes(bytes(32))
-    settings["mavlink"]["signing_key"] = str(tmp_path / "key")
-    config_file.write_text(yaml.safe_dump(settings))
-    with AnsweringAutopilot(parse_link(settings["mavlink"]["link"]).number, key=key):
-        (link,) = [each for each in check(config_file) if each.what == "link"]
-    assert link.ok is is_fine
-    assert ("system 1, signed" if is_fine else "refused (") in link.message
-    assert {path.name for path in tmp_path.iterdir()} == {"key", "config.yaml"}
-
-
 def test_a_tlog_is_looked_at_like_the_flight_log(settings, config_file, tmp_path):
     settings["log"]["tlog"] = str(tmp_path / "flight.tlog")
     config_file.write_text(yaml.safe_dump(settings))
@@ -222,13 +209,6 @@ def test_a_log_that_may_not_be_written_is_found(settings, config_file, tmp_path)
     log_path.touch(mode=0o400)
     (finding,) = wrong(config_file, settings)
     assert finding.message.startswith(f"{log_path} ")
-
-
-def test_a_disk_without_room_for_the_log_is_found(settings, config_file, monkeypatch):
-    usage = type(shutil.disk_usage("/"))
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(8_000_000_000, 7_999_000_000, 1_000_000))
-    (finding,) = wrong(config_file, settings)
-    assert "1.0 MB" in finding.message
 
 
 def wrong_online(config_file: Path, settings: dict, **how) -> list[Finding]:

@@ -14,9 +14,6 @@ from flight_process import cpu_s, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
 from edgevpr.cli.main import main
-from edgevpr.core.appending import numbered
-from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import identity_of
 from edgevpr.runtime.flight import aboard
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -178,38 +175,6 @@ def test_a_long_query_is_broken_off_when_the_flight_is_to_end(recording, tmp_pat
     assert run.returncode == 0, said
     lines = list(read_log(log))
     assert [line["kind"] for line in lines] == ["start", "end"], "what is broken off is no query"
-
-
-def test_a_flight_that_learns_ends_with_map_and_log_flushed(recording, tmp_path):
-    place_map, log = tmp_path / "m.gpkg", tmp_path / "flight.jsonl"
-    flags = ("--learn", "--technique", "hog", "--rate-hz", "25")
-    run = start(place_map, recording / "seen" / "images", log, *flags)
-    wait_for("learnt", log, run)
-    run.terminate()
-    assert run.wait(timeout=60) == 0
-    run.stderr.close()
-    lines = list(read_log(log))
-    learnt = [line["place"] for line in of_kind(lines, "learnt")]
-    assert lines[-1]["kind"] == "end"
-    assert lines[-1]["learnt"]["places"] == len(learnt)
-    with PlaceMap.open(place_map) as kept:
-        assert [place.place_id for place in kept.places()] == learnt
-
-
-def test_each_flight_has_its_log_and_says_with_which_map_it_flew(fly, tmp_path):
-    log = tmp_path / "flight.jsonl"
-    for _ in range(2):
-        run = fly("--rate-hz", "60")
-        run.communicate(timeout=120)
-        assert run.returncode == 0
-    (aside,) = numbered(log)
-    for flown in (aside, log):
-        lines = list(read_log(flown))
-        assert [line["kind"] for line in (lines[0], lines[-1])] == ["start", "end"]
-        assert [line["query"] for line in of_kind(lines, "query")] == [f"{n:02d}.png" for n in range(PLACES)]
-    with PlaceMap.open(lines[0]["map"]) as place_map:
-        assert lines[0]["map_identity"]["sha256"] == identity_of(place_map).sha256
-    assert set(lines[0]["libraries"]) == {"numpy", "cv2"}
 
 
 @contextmanager

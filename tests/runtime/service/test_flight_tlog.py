@@ -76,10 +76,3 @@ def test_a_service_flies_without_it(fly, tmp_path):
         said = flight.communicate(timeout=120)[1]
     assert flight.returncode == 0
     assert said.count("x.tlog cannot be opened") == 1
-
-
-def test_without_a_link_there_is_none_and_that_is_said(fly, tmp_path):
-    flight = fly("--tlog", tmp_path / "x.tlog")
-    said = flight.communicate(timeout=120)[1]
-    assert "no tlog" in said
-    assert not (tmp_path / "x.tlog").exists()

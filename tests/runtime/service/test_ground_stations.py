@@ -59,17 +59,3 @@ def test_mavproxy_sees_the_component_its_health_its_events_and_its_figures(seen_
         station.wait_for("NAMED_VALUE_FLOAT {", "name : vpr_mah", ask="status NAMED_VALUE_FLOAT")
         station.wait_for("NAMED_VALUE_INT {", "name : vpr_place", ask="status NAMED_VALUE_INT")
         station.wait_for("MAV Errors: 0", ask="status")
-
-
-@pytest.mark.parametrize(
-    ("open_station", "words"),
-    [
-        (mavsdk, ('"HEARTBEAT"', '"component": 197', f'"system_status": {CRITICAL}')),
-        (mavproxy, ("HEARTBEAT {type : 18", f"system_status : {CRITICAL}")),
-    ],
-)
-def test_the_ground_sees_that_the_camera_is_lost(seen_by, open_station, words):
-    asked = "status HEARTBEAT" if open_station is mavproxy else None
-    with seen_by(open_station, source="tcp://127.0.0.1:1") as station:
-        station.wait_for("edgevpr: camera lost")
-        station.wait_for(*words, ask=asked)

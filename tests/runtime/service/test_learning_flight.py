@@ -13,7 +13,6 @@ from flights import PLACES, Flight, of_kind
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
-from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.mapfile import PlaceMap
@@ -156,26 +155,6 @@ def test_a_full_disk_ends_the_learning_and_not_the_flight(recording, tmp_path):
     assert said.count("nothing more is learnt") == 1
     with PlaceMap.open(tmp_path / "m.gpkg") as place_map:
         assert {line["place"] for line in learnt} <= {place.place_id for place in place_map.places()}
-
-
-def test_the_end_of_learning_is_told_to_the_ground_once(recording, tmp_path):
-    clock = FakeClock()
-    flight = Flight(
-        tmp_path / "m.gpkg",
-        tmp_path / "log",
-        clock,
-        FakeLink(clock),
-        learns=True,
-        technique="hog",
-        **{"source.rate_hz": 1.0},
-    )
-    (pages,) = flight.recogniser.place_map.db.execute("PRAGMA page_count").fetchone()
-    flight.recogniser.place_map.db.execute(f"PRAGMA max_page_count = {pages + 200}")
-    source = open_source(str(recording / "seen" / "images"), live=True, clock=clock)
-    lines = flight.fly(source)
-    assert flight.link.texts() == [(4, "edgevpr: nothing more is learnt, see its log")]
-    assert 0 < len(of_kind(lines, "learnt")) < PLACES
-    assert len(of_kind(lines, "query")) == PLACES
 
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not on this machine")
