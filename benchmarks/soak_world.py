@@ -20,6 +20,7 @@ import numpy as np
 from rtsp_camera import RtspCamera, free_port
 
 from edgevpr.lab.simulate.autopilot import serve
+from edgevpr.lab.simulate.brush import Scene
 from edgevpr.lab.simulate.camera import CameraPose, lit, photograph
 from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import (
@@ -30,7 +31,7 @@ from edgevpr.lab.simulate.generated import (
     mapping_flight,
     write_flight,
 )
-from edgevpr.lab.simulate.landscape import Scene, make_scene
+from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, TrueState, read_track, truth_at
 
 SEED = 1

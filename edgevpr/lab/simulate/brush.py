@@ -12,12 +12,14 @@ from edgevpr.core.arrays import Array, Doubles, Floats, Image, Singles
 Box = tuple[slice, slice]  # rows, columns
 _GRID_M = 8.0
 BASE_CM = 300  # of open ground, so that a river bed and a furrow lie above zero
+AROUND = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # the corners of a rectangle
 
 
 @dataclass(frozen=True, slots=True)
-class Canvas:
-    """A scene in the making: `albedo` uint8 (H, W, 3) BGR and `height_cm` uint16 (H, W), both painted in place. North
-    is up; the south-west corner is (0, 0) m. A *box* is a rectangle of pixels, as slices of rows and columns."""
+class Scene:
+    """The ground without light: `albedo` uint8 (H, W, 3) BGR, and `height_cm` uint16 (H, W) over a common level, both
+    painted in place. North is up, and the south-west corner is the point 0 m east, 0 m north. A *box* is a rectangle of
+    pixels, as slices of rows and columns."""
 
     albedo: Image
     height_cm: NDArray[np.uint16]
@@ -33,8 +35,7 @@ class Canvas:
         return np.column_stack((east_m, self.shape[0] * self.metres_per_pixel - north_m)) / self.metres_per_pixel
 
     def box(self, points_m: ArrayLike, margin_m: float = 0.0) -> Box:
-        """Return the box of pixels around some points and `margin_m` beyond them, cut off at the edge of the scene
-        (empty outside of it)."""
+        """Return the box around some points and `margin_m` beyond them, cut off at the edge of the scene."""
         margin = margin_m / self.metres_per_pixel
         low, high = self.pixels(points_m).min(axis=0) - margin, self.pixels(points_m).max(axis=0) + margin
         (left, top), (right, bottom) = np.maximum(low, 0).astype(int), np.maximum(np.ceil(high), 0).astype(int)
@@ -47,14 +48,14 @@ class Canvas:
 
     def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
         """Return the share of each pixel of a box that a polygon covers, float32 (H, W): its edges are smooth."""
-        cover = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.uint8)
+        cover = np.zeros_like(self.height_cm[box], np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
         return cover.astype(np.float32) / 255
 
     def distance_m(self, box: Box, line_m: ArrayLike) -> Floats:
         """Return the distance of each pixel of a box from a polyline, float32 (H, W) in metres."""
-        away = np.full((box[0].stop - box[0].start, box[1].stop - box[1].start), 255, np.uint8)
+        away = np.full_like(self.height_cm[box], 255, np.uint8)
         points = self.pixels(line_m) - (box[1].start, box[0].start)
         cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
         return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
@@ -69,8 +70,8 @@ class Canvas:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
-    """Make smooth noise, float32 of `shape`, mean 0 and standard deviation 1. Its largest bumps are `first_px` wide;
-    each further octave halves the width."""
+    """Make smooth noise, float32 of `shape`, mean 0 and standard deviation 1, of bumps `first_px` wide, half as wide,
+    and so on for `octaves`."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
         step = max(first_px / 2**octave, 1.0)
@@ -97,14 +98,11 @@ def smooth_step(values: Array, low: float, high: float) -> Array:
 
 
 def roof(
-    canvas: Canvas, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
+    canvas: Scene, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
 ) -> None:
     """Paint a building with walls `wall_m` high and a gable roof. Its ridge is `turn_rad` anticlockwise from east."""
     along, across = axes_of(turn_rad)
-    corners = [
-        np.asarray(centre_m) + a * along * length_m / 2 + b * across * width_m / 2
-        for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    ]
+    corners = [centre_m + a * along * length_m / 2 + b * across * width_m / 2 for a, b in AROUND]
     box = canvas.box(corners, 1.0)
     cover = canvas.polygon(box, corners)
     east_m, north_m = canvas.grid_m(box)
@@ -126,7 +124,7 @@ def crown(rng: np.random.Generator, radius_px: int) -> Singles:
     return ragged
 
 
-def stand(canvas: Canvas, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
+def stand(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
     """Paint one tree, a `crown` that rises to `top_m` metres. Where crowns overlap, the higher one is seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
@@ -157,11 +155,8 @@ def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[flo
 def parcels(
     rng: np.random.Generator, width_m: float, depth_m: float, field_m2: float
 ) -> tuple[list[Doubles], list[tuple[int, Doubles]]]:
-    """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns
-
-    * the pieces, convex polygons (N, 2),
-    * the cuts, each as (level, its two ends). The cut of level 0 crosses all the land, those of level 1 its halves, ...
-    """
+    """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns the pieces, convex
+    polygons (N, 2), and the cuts as (level, its two ends): 0 crosses all the land, 1 its halves, and so on."""
     fields, cuts = [], []
     todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
     while todo:
@@ -186,8 +181,7 @@ def longest_side(polygon: Doubles) -> Doubles:
 
 
 class Bend:
-    """Bends straight lines by about `by_m` metres. Points near each other move alike: lines that touched still
-    touch."""
+    """Bends straight lines by about `by_m` metres. Points near each other move alike."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
@@ -216,11 +210,7 @@ def _area_m2(polygon: Doubles) -> float:
 
 
 def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Cut a convex polygon by the line through the point `through` at right angles to `across`. Returns
-
-    * its two halves,
-    * the ends of the cut.
-    """
+    """Cut a convex polygon by the line through `through` at right angles to `across`: its halves, the cut's ends."""
     side = (piece - through) @ across
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Image
-from edgevpr.lab.simulate.brush import noise, smooth_step
-from edgevpr.lab.simulate.landscape import Scene
+from edgevpr.lab.simulate.brush import Scene, noise, smooth_step
 
 _LONGEST_SHADOW_M = 30.0
 _STRIP = 256  # rows lit at a time: the working memory stays small

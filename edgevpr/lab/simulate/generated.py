@@ -13,8 +13,9 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image
 from edgevpr.core.geodesy import EARTH_RADIUS_M
 from edgevpr.core.types import Position
+from edgevpr.lab.simulate.brush import Scene
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
-from edgevpr.lab.simulate.landscape import Scene, make_scene
+from edgevpr.lab.simulate.landscape import make_scene
 
 # The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
 _ORIGIN_ALT_M = 584.0

@@ -5,17 +5,16 @@ such as meadow. A river, a road, farms and trees, (N, 4) metres: east, north, ra
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from edgevpr.core.arrays import Array, Doubles, Image, Singles
+from edgevpr.core.arrays import Array, Doubles, Singles
 from edgevpr.lab.simulate.brush import (
+    AROUND,
     BASE_CM,
     Bend,
-    Canvas,
+    Scene,
     axes_of,
     bgr_mix,
     crown,
@@ -38,29 +37,11 @@ GRASS, LUSH, DRY, STRAW = (60, 118, 106), (44, 96, 74), (96, 144, 150), (118, 17
 SOIL, MUD = (78, 100, 126), (92, 130, 156)
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """The ground without light: `albedo` uint8 (H, W, 3) BGR, and `height_cm` uint16 (H, W) over a common level. North
-    is up, and the south-west corner is the point 0 m east, 0 m north."""
-
-    albedo: Image
-    height_cm: NDArray[np.uint16]
-    metres_per_pixel: float
-
-    @property
-    def width_m(self) -> float:
-        return float(self.height_cm.shape[1] * self.metres_per_pixel)
-
-    @property
-    def depth_m(self) -> float:
-        return float(self.height_cm.shape[0] * self.metres_per_pixel)
-
-
 def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: float = 0.16) -> Scene:
     """Generate a scene: fields, hedges, woods, a river, a road, lanes and farms. The same seed gives the same scene."""
     rng = np.random.default_rng(seed)
     shape = round(depth_m / metres_per_pixel), round(width_m / metres_per_pixel)
-    canvas = Canvas(np.full((*shape, 3), GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
+    canvas = Scene(np.full((*shape, 3), GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
     river_m = winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
     road_m = winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
     bend = Bend(rng, width_m, depth_m, by_m=2.5)
@@ -76,10 +57,10 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     yards_m = _farms(rng, canvas, road_m, river_m)
     _mottle(rng, canvas)
     _plant(rng, canvas, np.concatenate(trees), keep_off_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
-    return Scene(canvas.albedo, canvas.height_cm, metres_per_pixel)
+    return canvas
 
 
-def _border(rng: np.random.Generator, canvas: Canvas, line_m: Doubles, level: int) -> Doubles:
+def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int) -> Doubles:
     """Paint the border of two fields: a lane if the `level` of its cut (see `parcels`) is 0 or 1, else a hedge, a wall
     or a grass strip. Returns its trees, (N, 4)."""
     box = canvas.box(line_m, 5.0)
@@ -116,7 +97,7 @@ def _along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: f
     return _grown(rng, points, radius_m, (1.4, 2.2))
 
 
-def _river(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> Doubles:
+def _river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     box = canvas.box(line_m, 24.0)
     shape = canvas.height_cm[box].shape
     wide, fine = noise(rng, shape, 40 / canvas.metres_per_pixel, 2), noise(rng, shape, 5 / canvas.metres_per_pixel)
@@ -134,7 +115,7 @@ def _river(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> Doubles
     return np.concatenate([_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
 
 
-def _road(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> None:
+def _road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
     box = canvas.box(line_m, 7.0)
     away_m = canvas.distance_m(box, line_m)
     worn = noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
@@ -146,7 +127,7 @@ def _road(rng: np.random.Generator, canvas: Canvas, line_m: Doubles) -> None:
     canvas.height_cm[box] = np.where(away_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
 
 
-def _farms(rng: np.random.Generator, canvas: Canvas, road_m: Doubles, river_m: Doubles) -> Doubles:
+def _farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Doubles) -> Doubles:
     """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
     yards = []
     for at in range(18, len(road_m) - 18, 13):
@@ -160,10 +141,10 @@ def _farms(rng: np.random.Generator, canvas: Canvas, road_m: Doubles, river_m: D
     return np.array(yards).reshape(-1, 2)
 
 
-def _farm(rng: np.random.Generator, canvas: Canvas, middle: Doubles, turn_rad: float) -> None:
+def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
     along, beside = axes_of(turn_rad)
-    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in AROUND])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
     ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
@@ -182,7 +163,7 @@ def _farm(rng: np.random.Generator, canvas: Canvas, middle: Doubles, turn_rad: f
         roof(canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour)
 
 
-def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
+def _mottle(rng: np.random.Generator, canvas: Scene) -> None:
     """Vary the brightness of the ground in bumps of 60 m, of 5 m and of 1 m: real ground is never of one colour."""
     for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
@@ -195,7 +176,7 @@ def _mottle(rng: np.random.Generator, canvas: Canvas) -> None:
 
 
 def _plant(
-    rng: np.random.Generator, canvas: Canvas, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
+    rng: np.random.Generator, canvas: Scene, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
 ) -> None:
     """Paint the trees (N, 4) on the canvas, except near the lines (or points) of `keep_off_m`, each with its
     distance."""
@@ -211,86 +192,67 @@ def _plant(
         stand(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)
 
 
-@dataclass(frozen=True, slots=True)
-class FieldGround:
-    """The pixels of one field, float32 (H, W): noise with bumps of 22 m (`patches`) and of 2.4 m (`tufts`), and the
-    distance in metres across the rows of the field (`across_m`)."""
-
-    patches: Singles
-    tufts: Singles
-    across_m: Array
-
-
+# The looks of fields. `patches` and `tufts`, float32 (H, W), are noise with bumps of 22 m and of 2.4 m; `across_m` is
+# the distance in metres across the rows of the field.
 Look = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 
-def _ploughed(plot: FieldGround) -> Look:
-    furrow = np.sin(plot.across_m * (2 * np.pi / 1.2) + 0.5 * plot.tufts)
-    return bgr_mix(
-        SOIL, MUD, smooth_step(plot.patches + 0.7 * plot.tufts + 0.25 * furrow, -2, 2.4)
-    ), 2 * furrow + 2 * plot.tufts
+def _ploughed(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    furrow = np.sin(across_m * (2 * np.pi / 1.2) + 0.5 * tufts)
+    return bgr_mix(SOIL, MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
 
 
-def _cereal(plot: FieldGround) -> Look:
-    wheels = smooth_step(np.abs(np.abs(plot.across_m % 15 - 7.5) - 0.9), 0.45, 0.15)
-    laid = smooth_step(plot.patches + 0.5 * plot.tufts, 1.2, 1.7)
-    drilled = np.sin(plot.across_m * (2 * np.pi / 0.9))
-    share = 0.6 * wheels + 0.2 * smooth_step(plot.tufts - 0.6 * plot.patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
-    return bgr_mix(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * plot.tufts
+def _cereal(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    wheels = smooth_step(np.abs(np.abs(across_m % 15 - 7.5) - 0.9), 0.45, 0.15)
+    laid = smooth_step(patches + 0.5 * tufts, 1.2, 1.7)
+    drilled = np.sin(across_m * (2 * np.pi / 0.9))
+    share = 0.6 * wheels + 0.2 * smooth_step(tufts - 0.6 * patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
+    return bgr_mix(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
 
 
-def _row_crop(plot: FieldGround) -> Look:
-    plants = smooth_step(np.sin(plot.across_m * (2 * np.pi / 1.8)) + 0.6 * plot.tufts, -0.9, 0.7)
-    plants = plants * smooth_step(plot.patches + 0.4 * plot.tufts, 1.9, 1.3)
-    return bgr_mix(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * plot.tufts
+def _row_crop(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    plants = smooth_step(np.sin(across_m * (2 * np.pi / 1.8)) + 0.6 * tufts, -0.9, 0.7)
+    plants = plants * smooth_step(patches + 0.4 * tufts, 1.9, 1.3)
+    return bgr_mix(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * tufts
 
 
-def _meadow(plot: FieldGround) -> Look:
-    swath = smooth_step(np.sin(plot.across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
-    heap = smooth_step(np.abs(plot.across_m % 6.5 - 3.2) + 0.15 * plot.tufts, 0.8, 0.3)
-    share = 0.15 + 0.3 * swath + 0.12 * plot.patches + 0.2 * plot.tufts + 0.2 * heap
-    return bgr_mix(GRASS, DRY, share), 8 * heap + 2 * plot.tufts
+def _meadow(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    swath = smooth_step(np.sin(across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
+    heap = smooth_step(np.abs(across_m % 6.5 - 3.2) + 0.15 * tufts, 0.8, 0.3)
+    share = 0.15 + 0.3 * swath + 0.12 * patches + 0.2 * tufts + 0.2 * heap
+    return bgr_mix(GRASS, DRY, share), 8 * heap + 2 * tufts
 
 
-def _pasture(plot: FieldGround) -> Look:
-    worn = smooth_step(plot.patches + 0.4 * plot.tufts, 0.4, 2.4)
-    wet = smooth_step(-plot.patches, 0.3, 1.7)
-    rushes = smooth_step(plot.tufts + 0.9 * plot.patches, 1.4, 2.8)
+def _pasture(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    worn = smooth_step(patches + 0.4 * tufts, 0.4, 2.4)
+    wet = smooth_step(-patches, 0.3, 1.7)
+    rushes = smooth_step(tufts + 0.9 * patches, 1.4, 2.8)
     # Cattle walk one behind the other: narrow paths wind along the lines of equal noise.
-    path = smooth_step(np.abs(plot.patches + 0.02 * plot.across_m % 2 - 0.9), 0.05, 0.02)
-    colour = bgr_mix(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * plot.tufts + 0.45 * path)
-    return colour * (1 - 0.3 * rushes[..., None]), 2 * plot.tufts + 10 * rushes
+    path = smooth_step(np.abs(patches + 0.02 * across_m % 2 - 0.9), 0.05, 0.02)
+    colour = bgr_mix(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
+    return colour * (1 - 0.3 * rushes[..., None]), 2 * tufts + 10 * rushes
 
 
-def _forest_floor(plot: FieldGround) -> Look:
-    return 0.75 * bgr_mix(LUSH, SOIL, 0.35 + 0.2 * plot.tufts), 10 * plot.tufts
+def _forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+    return 0.75 * bgr_mix(LUSH, SOIL, 0.35 + 0.2 * tufts), 10 * tufts
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """A kind of field: its relative frequency, the function that paints it, and the trees in it (spacing, scatter and
-    radius in metres; None: no trees)."""
-
-    weight: float
-    look: Callable[[FieldGround], Look]
-    trees_m: tuple[float, float, float] | None = None
-
-
-_KINDS = (
-    _Kind(7, _pasture, (31, 40, 2.6)),
-    _Kind(4, _meadow, (60, 60, 2.8)),
-    _Kind(4, _ploughed),
-    _Kind(5, _cereal),
-    _Kind(4, _row_crop),
-    _Kind(2.5, _forest_floor, (4.1, 1.4, 2.8)),
-    _Kind(0.8, _pasture, (6.5, 0.25, 1.7)),  # an orchard
+# Kinds of fields: how frequent, how they look, and their trees (spacing, scatter and radius in metres; None: no trees).
+_KINDS: tuple[tuple[float, Callable[[Singles, Singles, Array], Look], tuple[float, float, float] | None], ...] = (
+    (7, _pasture, (31, 40, 2.6)),
+    (4, _meadow, (60, 60, 2.8)),
+    (4, _ploughed, None),
+    (5, _cereal, None),
+    (4, _row_crop, None),
+    (2.5, _forest_floor, (4.1, 1.4, 2.8)),
+    (0.8, _pasture, (6.5, 0.25, 1.7)),  # an orchard
 )
 
 
-def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) -> Doubles:
+def paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
     """Paint a field of a random kind within its outline (N, 2); return the trees that stand in it."""
-    weights = np.array([kind.weight for kind in _KINDS])
-    kind = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
+    weights = np.array([weight for weight, _, _ in _KINDS])
+    _, look, trees_m = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
     side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
     turn_rad = np.arctan2(side[1], side[0]) + rng.normal(0, 0.06)
     along, _ = axes_of(turn_rad)
@@ -301,10 +263,10 @@ def paint_field(rng: np.random.Generator, canvas: Canvas, outline_m: Doubles) ->
         patches = noise(rng, cover.shape, 22 / canvas.metres_per_pixel)
         tufts = noise(rng, cover.shape, 2.4 / canvas.metres_per_pixel)
         across_m = -along[1] * east_m + along[0] * north_m + 0.4 * patches
-        colour, relief_cm = kind.look(FieldGround(patches, tufts, across_m))
+        colour, relief_cm = look(patches, tufts, across_m)
         canvas.paint(box, cover, colour * rng.uniform(0.85, 1.12) * rng.normal(1, 0.025, 3))
         canvas.height_cm[box] = np.where(cover > 0.5, np.clip(BASE_CM + relief_cm, 0, None), canvas.height_cm[box])
-    return _trees(rng, outline_m, turn_rad, *kind.trees_m) if kind.trees_m else np.empty((0, 4))
+    return _trees(rng, outline_m, turn_rad, *trees_m) if trees_m else np.empty((0, 4))
 
 
 def _trees(

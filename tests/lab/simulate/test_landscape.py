@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgevpr.lab.simulate.brush import Scene
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, lit, photograph
-from edgevpr.lab.simulate.landscape import Scene, make_scene
+from edgevpr.lab.simulate.landscape import make_scene
 
 CAMERA = Camera(noise_sigma=0)
 NOON = Light(sun_azimuth_deg=180, sun_elevation_deg=60)
@@ -113,7 +114,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another_one():
     np.testing.assert_array_equal(one.albedo, again.albedo)
     np.testing.assert_array_equal(one.height_cm, again.height_cm)
     assert np.mean(one.albedo != other.albedo) > 0.5
-    assert (one.width_m, one.depth_m) == (160, 120)
+    assert one.shape == (240, 320)
 
 
 def test_a_scene_has_texture_everywhere_and_things_that_stand_on_it():
