@@ -7,7 +7,7 @@ import cv2
 import pytest
 from pictures import textured
 
-from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.errors import ImageError
 from edgevpr.core.text import markdown, progress
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import as_json, compare, evaluate
@@ -85,13 +85,6 @@ def test_a_broken_image_stops_the_measurement(folder):
         evaluate("hog", dataset, HOG)
 
 
-def test_an_unknown_technique_or_parameter_is_refused(folder):
-    with pytest.raises(UsageError, match="hogg"):
-        evaluate("hogg", load(folder))
-    with pytest.raises(UsageError, match="bins"):
-        evaluate("hog", load(folder), {"binz": 9})
-
-
 def test_progress_is_shown_for_references_and_queries(folder):
     out = io.StringIO()
     evaluate("hog", load(folder), HOG, progress=lambda items, total, label: progress(items, total, label, out))
@@ -116,8 +109,3 @@ def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
 def test_a_markdown_table_has_a_cell_for_every_heading():
     lines = markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
     assert lines == ["| set | recall |", "| --- | ---: |", "| corridor | 0.66 |", "| park | 0.2 |"]
-
-
-def test_columns_of_text_in_a_markdown_table_are_flush_left():
-    lines = markdown(("fault", "kept", "s"), [["power cut", "the log", "2"]], left=2).splitlines()
-    assert lines[1] == "| --- | --- | ---: |"

@@ -76,11 +76,6 @@ def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, conten
     assert error.count("\n") == 1
 
 
-def test_without_images_and_without_similarities_it_says_what_to_give(truth, capsys):
-    assert main(["eval", "--ground-truth", str(truth)]) == 2
-    assert "--similarity" in capsys.readouterr().err
-
-
 class Judgement:
     """A ground truth over generated names, right and soft, bool (references, queries); the first query has no right
     reference, and the best match of the third is soft only."""

@@ -5,7 +5,6 @@ import math
 import pytest
 from freeflight import Piloted
 
-from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import Motion
@@ -148,13 +147,6 @@ def test_without_any_aid_ardupilot_loses_the_position_after_seven_seconds_and_ai
     assert "GLOBAL_POSITION_INT" not in {each.get_type() for each in flown.said}, "nobody has asked for it"
 
 
-def test_gps_that_comes_back_is_followed_again():
-    flown = lost("arducopter").wait(20)
-    flown.controller.set("SIM_GPS1_ENABLE", 1)
-    assert flown.wait(10).flags & mavlink.EKF_POS_HORIZ_ABS
-    assert flown.error_m < 1
-
-
 def odometry(north_m: float, frame: int = 20, quality: int = 0):
     return mavlink.MAVLink_odometry_message(
         0, frame, 12, north_m, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.01] * 21, [0.01] * 21, quality=quality
@@ -281,11 +273,6 @@ def test_px4_says_integers_byte_by_byte():
     listed = flown.tell(mavlink.MAVLink_param_request_list_message(1, 1))
     assert {each.param_id for each in listed} >= {"EKF2_AGP0_CTRL", "SIM_GPS1_ENABLE"}
     assert [each.param_index for each in listed] == list(range(listed[0].param_count))
-
-
-def test_an_unknown_vehicle_is_refused_in_a_sentence():
-    with pytest.raises(UsageError, match="arducopter"):
-        FlightController("balloon", Motion(), gps=False)
 
 
 def test_what_is_for_another_is_not_answered():

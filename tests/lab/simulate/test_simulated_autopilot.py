@@ -1,7 +1,6 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
 import json
-import signal
 import socket
 import subprocess
 import sys
@@ -14,8 +13,8 @@ from edgevpr.cli.main import main
 from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot
-from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.motion import Motion, TrueState, read_track, truth_at
+from edgevpr.lab.simulate.controller import VEHICLES
+from edgevpr.lab.simulate.motion import TrueState, read_track, truth_at
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -67,27 +66,6 @@ def test_it_answers_counts_and_remembers():
     assert summary.messages["COMMAND_INT"] == 5
     assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
     assert "2 accepted, 0 failed, 1 denied" in str(summary)
-
-
-@pytest.mark.process
-def test_it_is_a_process_that_ends_well_on_sigterm_and_says_what_it_saw():
-    number = free_port()
-    command = ["simulate", "autopilot", "--link", f"udpin:127.0.0.1:{number}", "--json"]
-    process = subprocess.Popen([sys.executable, "-m", "edgevpr", *command], stdout=subprocess.PIPE, text=True)
-    with link_to(f"udpout:127.0.0.1:{number}") as link:
-        link.set_health(Health.ACTIVE)
-        wait_until(lambda: link.stats().autopilot_heard, "the other process")
-        link.send_fix(Fix(50.1234567, 14.0, 25.0, time.monotonic()))
-        link.send(*messages.named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
-        wait_until(lambda: link.stats().acks == {"ACCEPTED": 1})
-        wait_until(lambda: link.stats().sent.get("NAMED_VALUE_FLOAT") == 1)
-    process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
-    summary = json.loads(said)
-    assert summary["fixes_accepted"] == 1
-    assert {"HEARTBEAT", "COMMAND_INT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"} <= set(summary["messages"])
-    assert (summary["lost_packets"], summary["bad_bytes"]) == (0, 0)
 
 
 def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
@@ -204,14 +182,6 @@ def test_it_tells_the_time_of_this_machine(vehicle):
         autopilot.finish()
         companion.port.close()
     assert before_s <= told_s <= time.time()
-
-
-def test_without_a_machine_its_clock_is_handed_in():
-    controller = FlightController("arduplane", Motion(), gps=False, start_utc_s=1_000.0)
-    controller.advance(5.0)
-    asked = messages.message_request(1, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
-    told = next(each for each in controller.hear(asked) if each.get_type() == "SYSTEM_TIME")
-    assert told.time_unix_usec / 1e6 == pytest.approx(1_005.0, abs=0.05)
 
 
 @pytest.mark.process
