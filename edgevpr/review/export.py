@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TextIO
-from xml.etree import ElementTree
+from xml.sax.saxutils import escape
 
 from edgevpr.core.text import printable
 from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point
@@ -55,57 +55,50 @@ def _of_query(query: LoggedQuery) -> Iterator[Feature]:
 
 def write_geojson(features: Sequence[Feature], out: TextIO) -> None:
     """Write a GeoJSON FeatureCollection, one feature a line."""
-    out.write('{"type": "FeatureCollection", "features": [')
-    for count, each in enumerate(features):
-        lat_deg, lon_deg = each.at
-        feature = {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [round(lon_deg, 8), round(lat_deg, 8)]},
-            "properties": {"kind": each.kind, **each.properties},
-        }
-        out.write((",\n" if count else "\n") + json.dumps(feature))
-    out.write("\n]}\n")
+    lines = [
+        json.dumps(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": [round(degrees, 8) for degrees in reversed(each.at)]},
+                "properties": {"kind": each.kind, **each.properties},
+            }
+        )
+        for each in features
+    ]
+    out.write('{"type": "FeatureCollection", "features": [\n' + ",\n".join(lines) + "\n]}\n")
 
 
 def write_csv(features: Sequence[Feature], out: TextIO) -> None:
     """Write a CSV table with a heading, one point a line; the cell of a property that a point lacks is empty."""
-    names = list(dict.fromkeys(name for each in features for name in each.properties))
-    table = csv.writer(out, lineterminator="\n")
-    table.writerow(("kind", "lat_deg", "lon_deg", *names))
+    names = dict.fromkeys(name for each in features for name in each.properties)
+    table = csv.DictWriter(out, ("kind", "lat_deg", "lon_deg", *names), lineterminator="\n")
+    table.writeheader()
     for each in features:
-        lat_deg, lon_deg = each.at
-        table.writerow((each.kind, f"{lat_deg:.8f}", f"{lon_deg:.8f}", *(each.properties.get(name) for name in names)))
+        lat_deg, lon_deg = (f"{degrees:.8f}" for degrees in each.at)
+        table.writerow({"kind": each.kind, "lat_deg": lat_deg, "lon_deg": lon_deg, **each.properties})
 
 
 def write_kml(features: Sequence[Feature], out: TextIO) -> None:
     """Write a KML document with a folder for each kind of point."""
-    root = ElementTree.Element("kml", xmlns=_KML)
-    document = ElementTree.SubElement(root, "Document")
+    out.write(f'<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="{_KML}"><Document>\n')
     for kind in dict.fromkeys(each.kind for each in features):
-        folder = ElementTree.SubElement(document, "Folder")
-        _child(folder, "name", kind)
-        for each in features:
-            if each.kind == kind:
-                _add_placemark(folder, each)
-    ElementTree.indent(root, " ")
-    out.write('<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
+        marks = "".join(_placemark(each) for each in features if each.kind == kind)
+        out.write(f"<Folder>{_tag('name', kind)}\n{marks}</Folder>\n")
+    out.write("</Document></kml>\n")
 
 
-def _add_placemark(folder: ElementTree.Element, feature: Feature) -> None:
-    mark = ElementTree.SubElement(folder, "Placemark")
+def _placemark(feature: Feature) -> str:
     properties, (lat_deg, lon_deg) = feature.properties, feature.at
-    _child(mark, "name", properties.get("query") or properties.get("place") or feature.kind)
-    if when := properties.get("time"):
-        _child(ElementTree.SubElement(mark, "TimeStamp"), "when", when)
-    extended = ElementTree.SubElement(mark, "ExtendedData")
-    for key, known in properties.items():
-        if known is not None:
-            _child(ElementTree.SubElement(extended, "Data", name=key), "value", known)
-    _child(ElementTree.SubElement(mark, "Point"), "coordinates", f"{lon_deg:.8f},{lat_deg:.8f}")
+    known = {name: value for name, value in properties.items() if value is not None}
+    data = "".join(f'<Data name="{name}">{_tag("value", value)}</Data>' for name, value in known.items())
+    time = f"<TimeStamp>{_tag('when', properties['time'])}</TimeStamp>" if properties.get("time") else ""
+    name = _tag("name", properties.get("query") or properties.get("place") or feature.kind)
+    point = _tag("coordinates", f"{lon_deg:.8f},{lat_deg:.8f}")
+    return f"<Placemark>{name}{time}<ExtendedData>{data}</ExtendedData><Point>{point}</Point></Placemark>\n"
 
 
-def _child(parent: ElementTree.Element, tag: str, text: object) -> None:
-    ElementTree.SubElement(parent, tag).text = printable(str(text))
+def _tag(tag: str, text: object) -> str:
+    return f"<{tag}>{escape(printable(str(text)))}</{tag}>"
 
 
 WRITERS: dict[str, Callable[[Sequence[Feature], TextIO], None]] = {

@@ -159,6 +159,8 @@ def _take_answer(query: LoggedQuery | None, line: dict[str, Any]) -> None:
     if query and query.fix:
         query.fix.outcome = _outcome(line, line.get("result"))
         query.fix.why = text(line, "why") or query.fix.why
+        if query.fix.outcome is FixOutcome.REFUSED:
+            query.fix.why = query.fix.why or "it does not say why"
         query.fix.latency_ms = number(line, "latency_ms")
 
 

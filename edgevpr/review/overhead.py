@@ -22,7 +22,6 @@ _MARGIN = 0.04
 _SHAPES = 0.55, 1.8  # the least and the greatest ratio of a drawing's height to its width
 _MOST_VH = 80  # of the height of the window
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
-_ROUND = (1, 2, 5)
 _FIXES = (
     (FixOutcome.TAKEN, "fixes taken", "taken"),
     (FixOutcome.UNANSWERED, "fixes not answered", "unanswered"),
@@ -55,10 +54,8 @@ class Layer:
 def read_ground(path: str | Path) -> MapGround:
     """Read the places of the map file `path`. If it is damaged, the places up to there are returned, with `trouble`.
     Raises MapError if nothing can be read."""
+    places, at, trouble = 0, [], None
     with PlaceMap.open(path) as place_map:
-        places = 0
-        at = []
-        trouble = None
         try:
             for place in place_map.places():
                 places += 1
@@ -72,17 +69,18 @@ def read_ground(path: str | Path) -> MapGround:
 def layers_of(flight: LoggedFlight) -> list[Layer]:
     """Return the layers of a flight, from the bottom to the top. Those without points are left out."""
     queries = flight.queries
-    found = list(dict.fromkeys(query.place_at for query in queries if query.place_at))
+    fixes = [query.fix for query in queries if query.fix and query.fix.at]
     layers = [
-        Layer("places found", "found", [found]),
+        Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("GPS", "gps", _known_ways(query.gps_at for query in queries), are_dots=False),
         Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), are_dots=False),
         Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
+        *(
+            Layer(name, colour, [[fix.at for fix in fixes if fix.at and fix.outcome is outcome]])
+            for outcome, name, colour in _FIXES
+        ),
     ]
-    for outcome, name, colour in _FIXES:
-        fixes = [query.fix.at for query in queries if query.fix and query.fix.at and query.fix.outcome is outcome]
-        layers.append(Layer(name, colour, [fixes]))
     return [layer for layer in layers if any(layer.ways)]
 
 
@@ -114,9 +112,9 @@ def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, 
         for x, y in view.on([at])
     )
     boxes = "".join(
-        f'<label class="key {layer.colour}"><input type="checkbox" checked id="show-{layer.colour}">'
-        f"{escape(layer.name)}</label>"
-        for layer in ([Layer("places of the map", "places", ())] if shown else []) + list(layers)
+        f'<label class="key {colour}"><input type="checkbox" checked id="show-{colour}">{escape(name)}</label>'
+        for name, colour in [("places of the map", "places")][: len(shown)]
+        + [(each.name, each.colour) for each in layers]
     )
     shape = _WIDE / view.high  # labels are placed in per cent of width and height: they fit this shape only
     length_m, share = view.ruler()
@@ -136,40 +134,36 @@ class _View:
 
     def __init__(self, everything: Sequence[Point], footprint_m: float) -> None:
         self._origin = everything[0]
-        east_m, north_m = self._metres(everything)
-        around_m = footprint_m * 0.75
-        wide_m, high_m = np.ptp(east_m) + 2 * around_m, np.ptp(north_m) + 2 * around_m
+        metres = self._metres(everything)
+        wide_m, high_m = np.ptp(metres, axis=1) + 1.5 * footprint_m
         least, most = _SHAPES
         high_m, wide_m = max(high_m, least * wide_m), max(wide_m, high_m / most)
         self._scale = _WIDE * (1 - 2 * _MARGIN) / wide_m
         self.high = _WIDE * high_m / wide_m
-        self._middle_m = (np.min(east_m) + np.max(east_m)) / 2, (np.min(north_m) + np.max(north_m)) / 2
+        self._middle_m = (metres.min(axis=1, keepdims=True) + metres.max(axis=1, keepdims=True)) / 2
 
     def on(self, points: Sequence[Point]) -> Points:
         """Convert positions into points (x, y) of the drawing."""
-        east_m, north_m = self._metres(points)
-        return list(zip(*self._drawn(east_m, north_m), strict=True))
+        return self._drawn(self._metres(points))
 
     def square(self, at: Point, pose: Pose) -> str:
         """Return SVG path data of the ground that a picture shows, drawn as a square with its longest side."""
-        east_m, north_m = self._metres([at])
         corners = axes_of(pose.up_deg) @ np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * pose.footprint_m / 2
-        x, y = self._drawn(east_m + corners[0], north_m + corners[1])
-        return "M" + "L".join(f"{a:.0f} {b:.0f}" for a, b in zip(x, y, strict=True)) + "z"
+        return "M" + "L".join(f"{x:.0f} {y:.0f}" for x, y in self._drawn(self._metres([at]) + corners)) + "z"
 
     def ruler(self) -> tuple[float, float]:
         """Return two parts: a round length in metres, at most a quarter of the drawing's width;
         its share of that width, 0..1."""
         wide_m = _WIDE / self._scale
         power = 10.0 ** math.floor(math.log10(wide_m / 4))
-        length_m = max(each * power for each in _ROUND if each * power <= wide_m / 4)
+        length_m = max(each * power for each in (1, 2, 5) if each * power <= wide_m / 4)
         return length_m, length_m / wide_m
 
-    def _metres(self, points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
+    def _metres(self, points: Sequence[Point]) -> np.ndarray:
+        """Return float (2, N): how far east and north of the origin the points lie."""
         lat_deg, lon_deg = np.array(points, dtype=float).reshape(-1, 2).T
-        east_m, north_m = offset_m(*self._origin, lat_deg, lon_deg)
-        return east_m, north_m
+        return np.array(offset_m(*self._origin, lat_deg, lon_deg))
 
-    def _drawn(self, east_m: np.ndarray, north_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        middle_e, middle_n = self._middle_m
-        return _WIDE / 2 + (east_m - middle_e) * self._scale, self.high / 2 - (north_m - middle_n) * self._scale
+    def _drawn(self, metres: np.ndarray) -> Points:
+        east, north = (metres - self._middle_m) * self._scale
+        return list(zip(_WIDE / 2 + east, self.high / 2 - north, strict=True))

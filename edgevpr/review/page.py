@@ -6,10 +6,10 @@ Functions that return a str return HTML.
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from html import escape
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from statistics import median
 from types import MappingProxyType
@@ -18,11 +18,14 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
 from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
 from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, text, value
-from edgevpr.review.moments import WorstMoment, worst
 from edgevpr.review.overhead import MapGround, draw, layers_of
-from edgevpr.review.svg import UNKNOWN, Points, Series, clock, figure, lanes, time_chart
+from edgevpr.review.svg import UNKNOWN, Points, Series, chart, clock, figure, lanes, times
 
 _MOST_REMARKS = 200
+_FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
+_LONG_S = 5.0
+_NEAR_S = 5.0  # of two moments that are closer in time only the first is shown
+_OF_A_KIND, _MOST = 2, 6  # moments at most, of one kind and in all
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 _COLOURS = {
     FixOutcome.TAKEN: "taken",
@@ -40,6 +43,35 @@ _CHARTS = (
     ("Age of the newest picture", "ms", "latency_ms", "accepted"),
 )
 
+Moment = tuple[LoggedQuery, str]  # a query to show, and a sentence on why
+
+# The kinds of bad moments: so many of the worst come into question (None: all), how bad a query is (None: not at all),
+# and why. The first are dangers; `_silences` come after them.
+_DANGERS = 3
+_WORST: tuple[tuple[int | None, Callable[[LoggedQuery], float | None], str], ...] = (
+    (
+        None,
+        lambda query: query.off_m if (query.off_m or 0.0) > _FAR_M else None,
+        "The match lies {0.off_m:.0f} m from GPS: one of both is wrong.",
+    ),
+    (
+        None,
+        lambda query: 0.0 if query.fix and query.fix.outcome is FixOutcome.REFUSED else None,
+        "The autopilot refused the fix: {0.fix.why}.",
+    ),
+    (
+        None,  # not sent because it contradicts the autopilot
+        lambda query: 0.0 if query.fix and (query.fix.why or "").startswith("held back") else None,
+        "The fix was {0.fix.why}.",
+    ),
+    (
+        1,
+        lambda query: query.accuracy_m if query.accepted else None,
+        "Of the accepted matches this is the least exact: good to {0.accuracy_m:.1f} m.",
+    ),
+    (1, lambda query: query.wall_ms, "The slowest query: it took {0.wall_ms:.0f} ms."),
+)
+
 
 class Album:
     """Finds pictures by the names that the log gives them: in `recorded`, the frames of a recording by name, else as
@@ -49,9 +81,9 @@ class Album:
     def __init__(self, folders: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
         self._recorded = recorded
         self._folders = [Path(folder).resolve() for folder in folders]
-        for given, folder in zip(folders, self._folders, strict=True):
+        for folder in self._folders:
             if not folder.is_dir():
-                raise UsageError(f"{given}: there is no such folder: give one that holds pictures.")
+                raise UsageError(f"{folder}: there is no such folder: give one that holds pictures.")
 
     def picture(self, name: str | None) -> bytes | None:
         """Return the picture `name` as a small JPEG; None if there is none that can be read."""
@@ -59,36 +91,34 @@ class Album:
             return None
         from edgevpr.frames.images import EXTENSIONS, read_image, small_jpeg  # a page without pictures needs no OpenCV
 
-        if path := self._recorded.get(name):
-            with suppress(ImageError):
-                return small_jpeg(read_image(path))
-        for folder, ending in product(self._folders, ("", *EXTENSIONS)):
+        files = [(path.parent, path) for path in [self._recorded.get(name)] if path]
+        files += [(folder, folder / f"{name}{ending}") for folder, ending in product(self._folders, ("", *EXTENSIONS))]
+        for folder, path in files:
             with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
-                path = (folder / f"{name}{ending}").resolve()
                 # A log from somebody else may name any file of this machine: show only files in the folder.
-                if path.is_relative_to(folder) and path.is_file():
+                if path.resolve().is_relative_to(folder.resolve()) and path.is_file():
                     return small_jpeg(read_image(path))
         return None
 
 
 def page_of(flight: LoggedFlight, ground: MapGround, frames: Album, references: Album) -> str:
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of."""
-    moments = worst(flight)
+    moments = list(enumerate(worst(flight.queries), start=1))
     named = [
         (str(number), where)
-        for number, moment in enumerate(moments, start=1)
-        if (where := moment.query.at or moment.query.autopilot_at or moment.query.gps_at)
+        for number, (query, _) in moments
+        if (where := query.at or query.autopilot_at or query.gps_at)
     ]
-    shown = [_moment(number, moment, frames, references) for number, moment in enumerate(moments, start=1)]
+    shown_moments = [_moment(number, *moment, frames, references) for number, moment in moments]
     title = _title(flight)
     body = [
         heading(title, _known(flight)),
-        section("", _figures(flight)),
+        section("", _figures(flight.queries)),
         notes(_notes(flight, ground)),
         section("Over the ground", draw(ground, layers_of(flight), named)),
         section("What became of every query", _lanes(flight)),
         section("Over time", _charts(flight)),
-        section("Worst moments", "".join(shown)),
+        section("Worst moments", "".join(shown_moments)),
         section("Why matches were refused", _counts(_refusals(flight))),
         section("Why fixes were not sent, or not taken", _counts(_objections(flight))),
         section("What was said", _remarks(flight)),
@@ -115,15 +145,15 @@ def _known(flight: LoggedFlight) -> Iterator[str]:
     yield str(flight.path)
 
 
-def _figures(flight: LoggedFlight) -> str:
-    queries = flight.queries
+def _figures(queries: Sequence[LoggedQuery]) -> str:
     outcomes = Counter(query.fix.outcome for query in queries if query.fix)
     sent = sum(outcomes[outcome] for outcome in (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED))
     accepted = sum(query.accepted for query in queries)
+    share = f" <small>{accepted / len(queries):.0%}</small>" if queries else ""
     off_m, wall_ms = _all(queries, "off_m"), _all(queries, "wall_ms")
     figures = {
         "queries": str(len(queries)),
-        "accepted": str(accepted),
+        "accepted": f"{accepted}{share}",
         "fixes sent": str(sent),
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
         "fixes refused": str(outcomes[FixOutcome.REFUSED]),
@@ -136,13 +166,8 @@ def _figures(flight: LoggedFlight) -> str:
         "a query, median": figure(median(wall_ms) if wall_ms else None, "ms"),
         "hottest": figure(max(_all(queries, "temperature_c"), default=None), "°C"),
     }
-    more = {"accepted": f"{accepted / len(queries):.0%}"} if queries else {}
-    tiles = "".join(
-        f"<div><dt>{name}</dt><dd>{known} <small>{more.get(name, '')}</small></dd></div>"
-        for name, known in figures.items()
-        if known != UNKNOWN
-    )
-    return f'<dl class="figures">{tiles}</dl>'
+    known = [f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in figures.items() if value != UNKNOWN]
+    return f'<dl class="figures">{"".join(known)}</dl>'
 
 
 def _notes(flight: LoggedFlight, ground: MapGround) -> Iterator[str]:
@@ -187,30 +212,26 @@ def _lanes(flight: LoggedFlight) -> str:
 
 
 def _charts(flight: LoggedFlight) -> str:
-    queries, span_s = flight.queries, flight.span_s
-    accepted = [query for query in queries if query.accepted]
-    refused = [query for query in queries if not query.accepted]
-    confidences = [
-        Series("accepted", "accepted", _over(accepted, "confidence"), are_dots=True),
-        Series("refused", "refused", _over(refused, "confidence"), are_dots=True),
-    ]
-    positions = [
-        Series("from GPS", "gps", _over(queries, "off_m"), are_dots=True),
-        Series("accuracy, 1 sigma", "accepted", _over(queries, "accuracy_m")),
-    ]
+    queries = flight.queries
+    accepted = _over([query for query in queries if query.accepted], "confidence")
+    refused = _over([query for query in queries if not query.accepted], "confidence")
     answered = [
         (query.t_s, query.fix.latency_ms) for query in queries if query.fix and query.fix.latency_ms is not None
     ]
-    charts = [
-        time_chart("Confidence", "", confidences, span_s, top=1.0),
-        time_chart("Position", "m", positions, span_s),
-        *(
-            time_chart(title, unit, [Series("", colour, _over(queries, field))], span_s)
-            for title, unit, field, colour in _CHARTS
-        ),
-        time_chart("Answer to a fix", "ms", [Series("", "taken", answered, are_dots=True)], span_s),
+    confidences = [Series("accepted", "accepted", accepted, True), Series("refused", "refused", refused, True)]
+    positions = [
+        Series("from GPS", "gps", _over(queries, "off_m"), True),
+        Series("accuracy, 1 sigma", "accepted", _over(queries, "accuracy_m")),
     ]
-    return f'<div class="charts">{"".join(charts)}</div>' if any(charts) else ""
+    charts = [
+        ("Confidence", "", confidences),
+        ("Position", "m", positions),
+        *((title, unit, [Series("", colour, _over(queries, field))]) for title, unit, field, colour in _CHARTS),
+        ("Answer to a fix", "ms", [Series("", "taken", answered, True)]),
+    ]
+    axis = times(flight.span_s)
+    drawn = [chart(title, unit, series, axis, top=0.0 if unit else 1.0) for title, unit, series in charts]
+    return f'<div class="charts">{"".join(drawn)}</div>' if any(drawn) else ""
 
 
 def _over(queries: Sequence[LoggedQuery], field: str) -> Points:
@@ -221,12 +242,40 @@ def _all(queries: Sequence[LoggedQuery], field: str) -> list[float]:
     return [known for _, known in _over(queries, field)]
 
 
-def _moment(number: int, moment: WorstMoment, frames: Album, references: Album) -> str:
-    query = moment.query
+def worst(queries: Sequence[LoggedQuery]) -> list[Moment]:
+    """Return the worst moments, at most `_MOST`, each a query and why it is shown. Those that could have been dangerous
+    come first, and of each kind the worst."""
+    kinds = []
+    for first, badness, why in _WORST:
+        bad = [(known, query) for query in queries if (known := badness(query)) is not None]
+        kinds.append([(query, why.format(query)) for _, query in sorted(bad, key=lambda pair: -pair[0])[:first]])
+    kinds.insert(_DANGERS, _silences(queries))
+    chosen: list[Moment] = []
+    for moments in kinds:
+        most = len(chosen) + _OF_A_KIND
+        for query, sentence in moments:
+            if len(chosen) < most and all(abs(query.t_s - other.t_s) > _NEAR_S for other, _ in chosen):
+                chosen.append((query, sentence))
+    return chosen[:_MOST]
+
+
+def _silences(queries: Sequence[LoggedQuery]) -> list[Moment]:
+    """Return the middles of the times without an accepted match, the longest first."""
+    moments = []
+    runs = [list(several) for accepted, several in groupby(queries, lambda each: each.accepted) if not accepted]
+    for run in sorted(runs, key=lambda run: run[0].t_s - run[-1].t_s):
+        if run[-1].t_s - run[0].t_s >= _LONG_S:
+            since = f"{clock(run[0].t_s)} to {clock(run[-1].t_s)}"
+            moments.append((run[len(run) // 2], f"Nothing was recognised from {since}, in {len(run)} queries."))
+    return moments
+
+
+def _moment(number: int, query: LoggedQuery, why: str, frames: Album, references: Album) -> str:
     found = "no place was found"
     if query.place is not None:
         found = f"place {query.place} ({query.reference_image or 'without a name'}), score {figure(query.score)}"
     sure = "" if query.confidence is None else f", confidence {query.confidence:.4f}"
+    verdict = f"{'accepted' if query.accepted else 'refused'}: {query.reason}"
     pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
     pair = "".join(
         picture(name, f"{what}: {name}", jpeg)
@@ -234,9 +283,8 @@ def _moment(number: int, moment: WorstMoment, frames: Album, references: Album) 
         if name and (jpeg := album.picture(name))
     )
     return (
-        f'<div class="moment" id="moment-{number}"><h3><i>{number}</i>{clock(query.t_s)} – {foreign(moment.why)}</h3>'
-        f'<p class="soft">{foreign(query.name)}: {foreign(found + sure)}; '
-        f"{'accepted' if query.accepted else 'refused'}: {foreign(query.reason)}</p>"
+        f'<div class="moment" id="moment-{number}"><h3><i>{number}</i>{clock(query.t_s)} – {foreign(why)}</h3>'
+        f'<p class="soft">{foreign(f"{query.name}: {found}{sure}; {verdict}")}</p>'
         + (f'<div class="pair">{pair}</div></div>' if pair else "</div>")
     )
 

@@ -18,8 +18,7 @@ from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
 from edgevpr.review.compare import Line, Packets
-from edgevpr.review.supposed import Supposed
-from edgevpr.review.tape import Playback, ReplayedSigning, TapeEnded, read_tape
+from edgevpr.review.tape import Playback, ReplayedSigning, Supposed, TapeEnded, read_tape
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import read_log

@@ -5,7 +5,7 @@ drawing, so that it is readable on a phone. A `colour` is a CSS class that sets 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
@@ -15,12 +15,11 @@ Points = Sequence[tuple[float, float]]  # (x, value), or (x, y) of a drawing
 UNKNOWN = "–"
 
 _WIDE, _HIGH = 1000.0, 100.0
-_MOST_POINTS = 1200  # of a line: more than there are pixels
 _LAST = 0.97  # share of an axis: a text centred on a point further right would leave the page
 _TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
-_GAP, _LEAST_GAP_S = 5.0, 3.0  # a line is broken where points are missing for so many usual steps and so many seconds
+_GAP, _LEAST_GAP = 5.0, 3.0  # a line is broken where points are missing for so many usual steps, and so much of x
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +60,9 @@ class Axis:
         return f'<div class="times">{texts}</div>'
 
 
-def chart(
-    title: str,
-    unit: str,
-    series: Sequence[Series],
-    axis: Axis,
-    top: float = 0.0,
-    parts: Callable[[Points], Iterable[Points]] = lambda points: [points],
-) -> str:
+def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: float = 0.0) -> str:
     """Return a chart of `series` as HTML. Its values reach from 0 to the highest one, and to `top` at least. A series
-    without points is left out; if none has points, the result is "". `parts` splits a line where it is to be broken."""
+    without points is left out; if none has points, the result is "". A line is broken where points are missing."""
     series = [each for each in series if each.points]
     if not series:
         return ""
@@ -78,17 +70,12 @@ def chart(
     paths = ""
     for each in series:
         path, kind = (dots, "dots") if each.are_dots else (way, "line")
-        several = [each.points] if each.are_dots else parts(_thinned(each.points))
+        several = [each.points] if each.are_dots else _known_parts(each.points)
         places = ([(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in part] for part in several)
         paths += f'<path class="{kind} {each.colour}" d="{"".join(map(path, places))}"/>'
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
     drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + paths)
     return _framed(title, f"{unit} {legend}", highest, axis, drawing)
-
-
-def time_chart(title: str, unit: str, series: Sequence[Series], span_s: float, top: float = 0.0) -> str:
-    """Return a `chart` over time, from 0 to `span_s`. A line is broken where points are missing for an unusual time."""
-    return chart(title, unit, series, _times(span_s), top, _known_parts)
 
 
 def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
@@ -110,11 +97,11 @@ def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str
 
 def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
     """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number."""
-    axis, lines = _times(span_s), ""
-    for name, colour, times in rows:
-        marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times}))
-        drawing = _svg(f"{name}: {len(times)}", 20, f'{axis.grid(20)}<path class="mark {colour}" d="{marks}"/>')
-        lines += f"<span>{escape(name)} <b>{len(times)}</b></span>{drawing}"
+    axis, lines = times(span_s), ""
+    for name, colour, times_s in rows:
+        marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times_s}))
+        drawing = _svg(f"{name}: {len(times_s)}", 20, f'{axis.grid(20)}<path class="mark {colour}" d="{marks}"/>')
+        lines += f"<span>{escape(name)} <b>{len(times_s)}</b></span>{drawing}"
     return f'<div class="lanes">{lines}<span></span>{axis.below()}</div>'
 
 
@@ -171,19 +158,8 @@ def _label(title: str, unit: str) -> str:
     return f"{title}, {unit}" if unit else title
 
 
-def _thinned(points: Points) -> Points:
-    """Return all points; if there are more than can be seen, the lowest and the highest of each short stretch."""
-    if len(points) <= _MOST_POINTS:
-        return points
-    step = -(-2 * len(points) // _MOST_POINTS)
-    kept: list[tuple[float, float]] = []
-    for first in range(0, len(points), step):
-        several = points[first : first + step]
-        kept += sorted({min(several, key=lambda point: point[1]), max(several, key=lambda point: point[1])})
-    return kept
-
-
-def _times(span_s: float) -> Axis:
+def times(span_s: float) -> Axis:
+    """Return an axis of time, from 0 to `span_s` seconds."""
     step = next((each for each in _STEPS_S if span_s / each <= _MOST_TICKS), span_s / _MOST_TICKS)
     ticks = [count * step for count in range(int(span_s / step) + 1)] if step else [0.0]
     last = _LAST * span_s
@@ -192,11 +168,8 @@ def _times(span_s: float) -> Axis:
 
 def _known_parts(points: Points) -> Iterator[Points]:
     """Split a line wherever points are missing for an unusual time, and yield its parts."""
-    steps_s = sorted(after[0] - before[0] for before, after in pairwise(points))
-    most_s = max(_LEAST_GAP_S, _GAP * steps_s[len(steps_s) // 2]) if steps_s else 0.0
-    first = 0
-    for at, (before, after) in enumerate(pairwise(points), start=1):
-        if after[0] - before[0] > most_s:
-            yield points[first:at]
-            first = at
-    yield points[first:]
+    steps = [after[0] - before[0] for before, after in pairwise(points)]
+    most = max(_LEAST_GAP, _GAP * sorted(steps)[len(steps) // 2]) if steps else 0.0
+    breaks = [at for at, step in enumerate(steps, start=1) if step > most]
+    for first, last in pairwise([0, *breaks, len(points)]):
+        yield points[first:last]

@@ -9,7 +9,7 @@ import json
 import logging
 from base64 import b64decode
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -29,6 +29,20 @@ Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"
 
 _RETIRED = "forms", "reread", "config"  # kinds of notes that only earlier versions wrote
+
+# Kinds of questions of a what-if: those answered by the newest answer on the tape, and those with always the same one.
+_AS_FOUND = "is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn"
+_ALWAYS: dict[str, Any] = {
+    "stop": False,
+    "log is written": True,
+    "process_cpu_s": 0.0,
+    "thread_cpu_s": 0.0,
+    "refused": {},
+    "dropped": 0,
+    "latency_s": None,
+    "condition": "RUNNING",
+    "state": "replayed",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -75,8 +89,8 @@ class ReplayedLink(Link):
         packet, sending = self._conversation.next_packet() or (None, None)
         if sending:
             self._leaving.append(sending)
-        said = then and b64decode(then)
-        self._playback.packets.compare(self._turns.now_s(), self.name, said or None, packet)
+        said = b64decode(then) if then else None
+        self._playback.packets.compare(self._turns.now_s(), self.name, said, packet)
 
     def _departed(self, count: int) -> None:
         departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
@@ -100,6 +114,27 @@ class ReplayedLink(Link):
 
 class ReplayedGround(GroundLink, ReplayedLink):
     """The link to the ground station, replayed as `ReplayedLink` is."""
+
+
+class SupposedLink(ReplayedLink):
+    """A link on which the autopilot sends what it sent in the flight. A packet to it counts as sent at once."""
+
+    def _said(self, then: str | None) -> None:
+        while chosen := self._conversation.next_packet():
+            if sending := chosen[1]:
+                sending.settle(True)
+                self._conversation.note_departed([sending])
+
+    def _departed(self, count: int) -> None:
+        pass
+
+    def _ring(self) -> None:
+        with self.turn("ring"):
+            self._said(None)
+
+
+class SupposedGround(GroundLink, SupposedLink):
+    """The link to the ground station, replayed as `SupposedLink` is."""
 
 
 class ReplayedSigning(NotSigning):
@@ -129,9 +164,9 @@ class ReplayedSigning(NotSigning):
 
 
 class Playback(Tape):
-    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns; they are
-    performed in the order of the tape. `packets` compares the packets sent. `link` and `ground` are the classes of the
-    links that a replay uses.
+    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns, given their
+    time and steps; they are performed in the order of the tape. `packets` compares the packets sent. `link` and
+    `ground` are the classes of the links that a replay uses.
 
     Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
     the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
@@ -141,34 +176,36 @@ class Playback(Tape):
     link: type[ReplayedLink] = ReplayedLink
     ground: type[GroundLink] = ReplayedGround
 
-    def __init__(self, notes: Iterator[Note]) -> None:
-        self.links: dict[str, Callable[..., None]] = {}  # each takes the time of a turn, and its steps
+    def __init__(self, notes: Iterable[Note]) -> None:
+        self.links: dict[str, Callable[[float, list[Note]], None]] = {}
         self.packets = Packets()
         self.guessed = 0
         self.t_s = 0.0  # of the newest turn or look at the clock
-        self._notes = notes
-        self._ahead: deque[Note] = deque()
+        self._notes, self._at = list(notes), 0
         self._known: dict[str, Any] = {}
         self._is_stopping = False
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
         """Return the flight's answer to a question of `kind`. `look` asks the real machine: it is called only if the
         tape has no answer. Raises StopNow where the flight was stopped, and TapeEnded."""
-        if self._head()[0] == "stopped":
-            self._ahead.popleft()
+        if self._head() == "stopped":
+            self._at += 1
             self._is_stopping = True
         # A flight that was stopped may have asked more while it cleaned up: such a question is answered first.
-        if self._is_stopping and self._head()[0] != kind:
+        if self._is_stopping and self._head() != kind:
             self._is_stopping = False
             raise StopNow
-        if self._head()[0] != kind:
+        if self._head() != kind:
             self.guessed += 1
-            steps = self._steps_to(kind)
-            if steps is None:
+            if not self._comes(kind):
                 return cast(T, self._guess(kind, look))
-            for _ in range(steps):
-                self._take()
-        found = self._known[kind] = self._take()[1]
+            while self._head() not in (kind, "stopped"):
+                self._at += 1
+        head, *values = self._notes[self._at]
+        self._at += 1
+        if head == "stopped":
+            raise StopNow
+        found = self._known[kind] = values[0]
         if _is_moment(kind):
             self.t_s = max(self.t_s, found)
         return cast(T, found)
@@ -176,50 +213,30 @@ class Playback(Tape):
     def sleep(self, seconds: float) -> None:
         """Return at once: the time comes from the tape."""
 
-    def _head(self) -> Note:
-        """Perform the turns that come next on the tape, and return the answer after them, still on the tape. Raises
-        TapeEnded."""
-        for note in self._upcoming():
+    def _head(self) -> str:
+        """Perform the turns that come next on the tape, and return the kind of the answer after them, which stays on
+        the tape. Raises TapeEnded."""
+        while note := self._next():
             perform = self.links.get(note[0])
             if perform is None:
-                return note
-            self._ahead.popleft()
-            _, t_s, steps = note
-            self.t_s = max(self.t_s, t_s)
-            perform(t_s, steps)
+                return cast(str, note[0])
+            self._at += 1
+            self.t_s = max(self.t_s, note[1])
+            perform(note[1], note[2])
         raise TapeEnded
 
-    def _take(self) -> Note:
-        """Take the next answer off the tape. Raises StopNow if it says that the flight was stopped, and TapeEnded."""
-        note = self._head()
-        self._ahead.popleft()
-        if note[0] == "stopped":
-            raise StopNow
-        return note
+    def _next(self) -> Note | None:
+        return self._notes[self._at] if self._at < len(self._notes) else None
 
-    def _steps_to(self, kind: str) -> int | None:
-        """Count the answers before the next one of `kind`; None if it does not come before the next frame. None for
-        clocks as well: no answers are skipped to read a clock."""
-        steps = 0
-        for note in self._upcoming() if kind not in _CLOCKS else ():
-            if note[0] in (kind, "stopped"):
-                return steps
-            if note[0] == "frame":
-                return None
-            steps += note[0] not in self.links
-        return None
-
-    def _upcoming(self) -> Iterator[Note]:
-        """Yield the notes ahead. The caller may take the first one off the tape meanwhile."""
-        at = 0
-        while True:
-            if at == len(self._ahead):
-                if (note := next(self._notes, None)) is None:
-                    return
-                self._ahead.append(note)
-            before = len(self._ahead)
-            yield self._ahead[at]
-            at += len(self._ahead) == before
+    def _comes(self, kind: str) -> bool:
+        """Tell whether an answer of `kind`, or the end, comes before the next frame. No answers are skipped to read a
+        clock: False for it."""
+        for at in range(self._at, len(self._notes)) if kind not in _CLOCKS else ():
+            if self._notes[at][0] in (kind, "stopped"):
+                return True
+            if self._notes[at][0] == "frame":
+                return False
+        return False
 
     def _guess(self, kind: str, look: Callable[[], Any]) -> Any:
         if kind == "frame":
@@ -229,6 +246,65 @@ class Playback(Tape):
         if kind in _CLOCKS:
             return self._known.get(kind, 0.0)
         return self._known[kind] if kind in self._known else look()
+
+
+class Supposed(Playback):
+    """Playback for a "what if": a flight with another configuration, which may ask for and send other things than it
+    did. Its time is that of the tape and goes on from frame to frame; computing takes no time. Questions about the
+    machine get the newest answer on the tape."""
+
+    link, ground = SupposedLink, SupposedGround
+    _has_ended = False
+    _utc_ahead_s = 0.0
+
+    def read(self, kind: str, look: Callable[[], T]) -> T:
+        """Return an answer that the flight could have got to a question of `kind`; `look` asks the real machine."""
+        return cast(T, look() if kind == "outlook" else self._answer(kind, look))
+
+    def sleep(self, seconds: float) -> None:
+        """Advance the time by `seconds`. The notes of that time are taken off the tape, up to the next frame."""
+        until_s = self.t_s + seconds
+        while (note := self._next()) and note[0] != "frame" and self._time_of(note) <= until_s:
+            self._step(note)
+        self.t_s = max(self.t_s, until_s)
+
+    def _answer(self, kind: str, look: Callable[[], Any]) -> Any:
+        if kind == "frame":
+            return self._frame()
+        if kind == "ended":
+            return self._has_ended
+        if kind in _ALWAYS:
+            return _ALWAYS[kind]
+        if kind in _AS_FOUND:
+            while kind not in self._known and (note := self._next()):
+                self._step(note)
+            return self._known[kind] if kind in self._known else look()
+        return self.t_s + (self._utc_ahead_s if kind == "utc_s" else 0.0)
+
+    def _frame(self) -> dict[str, Any] | None:
+        """Return the next frame (None: the tape has no more). If the time is past several frames, return the newest of
+        them, as a camera would."""
+        frame: dict[str, Any] | None = None
+        while (note := self._next()) and not (frame and self._time_of(note) > self.t_s):
+            frame = note[1] or frame if note[0] == "frame" else frame
+            self._step(note)
+        self._has_ended |= frame is None
+        return frame
+
+    def _step(self, note: Note) -> None:
+        """Take the next note off the tape and act on it."""
+        self._at += 1
+        kind, *values = note
+        self.t_s = max(self.t_s, self._time_of(note))
+        if perform := self.links.get(kind):
+            perform(*values)
+        elif kind == "utc_s":
+            self._utc_ahead_s = values[0] - self.t_s
+        elif values:
+            self._known[kind] = values[0]
+
+    def _time_of(self, note: Note) -> float:
+        return float(note[1]) if note[0] == "mono_s" or note[0] in self.links else self.t_s
 
 
 def _is_moment(kind: str) -> bool:
