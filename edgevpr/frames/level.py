@@ -155,7 +155,7 @@ def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
 
 
 class _Taking:
-    """The geometry of a picture when it was taken, as far as known. `top_deg` to `objection` explain its results.
+    """The geometry of a picture when it was taken, as far as known.
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
     looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
@@ -165,9 +165,8 @@ class _Taking:
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
         self.is_attitude_known = roll_deg is not None and pitch_deg is not None
-        self._level_from_body = np.eye(3)
-        if roll_deg is not None and pitch_deg is not None:
-            self._level_from_body = _level_from_body(roll_deg, pitch_deg)
+        known = (roll_deg or 0.0, pitch_deg or 0.0) if self.is_attitude_known else (0.0, 0.0)
+        self._level_from_body = _level_from_body(*known)
         self._lens = lens
         height, width = frame.image.shape[:2]
         self.longest_px = max(height, width)
@@ -184,7 +183,7 @@ class _Taking:
 
     @property
     def top_deg(self) -> float | None:
-        """Compass direction of the top of the picture, None if the heading is unknown."""
+        """Compass direction of the picture's top, None if unknown."""
         return None if self.heading_deg is None else (self.heading_deg + self._lens.up_deg) % 360
 
     @property
@@ -203,8 +202,7 @@ class _Taking:
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
-        rotation: Doubles = _body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg)
-        return rotation
+        return np.asarray(_body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg))
 
     def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
         """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the attitude is unknown."""
@@ -220,18 +218,15 @@ def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
 
 
 def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
-    """Return the rotation (3, 3) from the axes (nose, right, down) of the airframe to those of a level airframe with
-    the same heading."""
+    """Return the rotation (3, 3) of the airframe's axes (nose, right, down) to those of a level one."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
-    rotation: Doubles = np.array(about_right) @ np.array(about_nose)
-    return rotation
+    return np.asarray(np.array(about_right) @ np.array(about_nose))
 
 
 def _body_from_lens(up_deg: float) -> Doubles:
-    """Return the rotation (3, 3) to the axes (nose, right, down) from the axes (right, down in the picture, viewing
-    direction) of a camera that looks straight down, the picture's top `up_deg` clockwise from the nose."""
+    """Return the rotation (3, 3) of the axes of a camera that looks straight down to those of the airframe."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
 
@@ -243,9 +238,8 @@ def _quadrangle(corners: Doubles, side: int) -> Mask:
 
 
 def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
-    """Warp an image to (side, side) pixels by the homography `out_from_pixel` (3, 3). Along a side, `shrink` pixels
-    become one. If more than two, the image is averaged first, since a warp alone would ignore most pixels."""
-    if shrink > 2:
+    """Warp an image to (side, side) pixels by a homography (3, 3), after which `shrink` pixels along a side are one."""
+    if shrink > 2:  # averaged first, since a warp alone would ignore most pixels
         height, width = image.shape[:2]
         small = max(1, round(width / shrink)), max(1, round(height / shrink))
         across, along = width / small[0], height / small[1]
@@ -267,11 +261,6 @@ class Footprint:
     sides_m: tuple[float, float]
     up_deg: float
 
-    @property
-    def rectangle(self) -> tuple[tuple[float, float], tuple[float, float], float]:
-        """The rectangle as OpenCV's rotated rectangle (middle, sides, degrees), x to the east and y to the south."""
-        return (self.middle_m[0], -self.middle_m[1]), self.sides_m, self.up_deg
-
 
 def footprint(
     middle_m: tuple[float, float], height_m: float, fov_deg: float, size_px: tuple[int, int], up_deg: float
@@ -285,7 +274,9 @@ def footprint(
 
 def shared(one: Footprint, other: Footprint) -> float:
     """Return the area that two footprints share, as a share of the area of the smaller one, 0..1."""
-    kind, corners = cv2.rotatedRectangleIntersection(one.rectangle, other.rectangle)
+    # OpenCV's rotated rectangles have x to the east and y to the south.
+    own, others = (((each.middle_m[0], -each.middle_m[1]), each.sides_m, each.up_deg) for each in (one, other))
+    kind, corners = cv2.rotatedRectangleIntersection(own, others)
     if kind == cv2.INTERSECT_NONE:
         return 0.0
     area_m2 = cv2.contourArea(cv2.convexHull(np.asarray(corners, np.float32)))

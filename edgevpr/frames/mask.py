@@ -13,7 +13,6 @@ import numpy as np
 
 from edgevpr.core import arrays
 from edgevpr.core.arrays import Bools, Image
-from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.files import write_whole
 from edgevpr.frames.images import read_image, write_png
@@ -30,15 +29,6 @@ _MOVING_AT_LEAST = 0.5  # share of the pixels with edges that must move; the oth
 _AROUND_PX = 4  # pixels masked around each edge: digits of a display change, and video compression smears them
 
 
-class NoMask:
-    """Used in place of a `Mask` if the whole frame shows ground."""
-
-    sha256 = None
-
-    def fitted(self, image: Image) -> None:
-        """Return None: all of the image shows ground."""
-
-
 @dataclass(frozen=True, slots=True)
 class Mask:
     """A mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to the size of a frame.
@@ -53,19 +43,11 @@ class Mask:
         return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-AnyMask = NoMask | Mask
-
-
-def encoded(technique: Technique, image: Image, allowed: arrays.Mask | None) -> Descriptor:
-    """Encode the pixels of `image` where `allowed`, bool (H, W), is True (None: all pixels)."""
-    return technique.encode(image) if allowed is None else technique.encode(image, allowed)
-
-
-def mask_of(path: str | None) -> AnyMask:
-    """Read the mask file that the configuration names (`source.mask`). None gives `NoMask`. Raises the errors of
+def mask_of(path: str | None) -> Mask | None:
+    """Read the mask file that the configuration names (`source.mask`); None if it names none. Raises the errors of
     `read_mask`."""
     try:
-        return NoMask() if path is None else read_mask(path)
+        return read_mask(path) if path else None
     except ImageError as error:  # its message sounds as if a frame were meant
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
 
@@ -110,16 +92,13 @@ def learn_overlay(images: Iterable[Image], where: str) -> arrays.Mask:
     across, down, length = sums / count
     still = np.hypot(across, down) / np.maximum(length, 1e-6)
     edged = length >= _ANY_EDGE
-    if not edged.any() or (still[edged] < _STILL).mean() < _MOVING_AT_LEAST:
-        raise SourceError(
-            f"{where} shows a scene that stands still: a mask is learnt from what moves, so record it in flight."
-        )
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1))
     display = cv2.dilate(((still >= _STILL) & (length >= _STRONG)).astype(np.uint8), around) > 0
-    if (masked := display.mean()) > MOST_MASKED:
+    moving = (still[edged] < _STILL).mean() if edged.any() else 0.0
+    if moving < _MOVING_AT_LEAST or display.mean() > MOST_MASKED:
         raise SourceError(
-            f"{where}: {masked:.0%} of the picture stands still, and {MOST_MASKED:.0%} at most can be masked: record "
-            "more of the flight."
+            f"{where} shows a scene most of which stands still: a mask is learnt from what moves, so record it in "
+            "flight, and for longer."
         )
     return ~display
 

@@ -22,7 +22,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import Levelled
-from edgevpr.frames.mask import Mask, encoded
+from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
@@ -175,7 +175,7 @@ def _as_mapped(
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
         picture = preparation.picture(frame)
-        coarse = encoded(technique, picture.image, picture.mask).coarse
+        coarse = technique.encode(picture.image, picture.mask).coarse
         of_name = ids_by_image.get(readable(frame.name), ())
         if (place_id := next((at for at in of_name if place_map.is_of(at, coarse)), None)) is not None:
             yield place_id, picture

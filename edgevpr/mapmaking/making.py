@@ -121,12 +121,12 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     path, is_cut = map_path(order.path), isinstance(order.pictures, Cuttings)
     camera = _camera(config.source.camera, is_cut)
     source = order.pictures.open()
-    mask = mask_of(None if is_cut else config.source.mask)
+    mask = None if is_cut else mask_of(config.source.mask)
     is_new = not (order.append and path.exists())
     if is_new:
         technique = _new_technique(order, camera, source.total)
         place_map = PlaceMap.create(path, technique.spec)
-        place_map.record_mask(mask.sha256)
+        place_map.record_mask(mask.sha256 if mask else None)
     else:
         place_map = PlaceMap.open_for_adding(path)
         settings = _settings(order, order.technique or place_map.spec.name, camera)
@@ -215,7 +215,7 @@ def calibrate_map(
 def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
     """Return the steps before encoding: overlay mask and levelling. Pictures cut from an orthophoto need neither."""
     if isinstance(pictures, Cuttings):
-        return Preparation(mask=mask_of(None), levelling=None)
+        return Preparation()
     return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
 
 

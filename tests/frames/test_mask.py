@@ -9,8 +9,6 @@ from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.mask import (
     FEWEST_FRAMES,
-    NoMask,
-    encoded,
     learn_overlay,
     mask_of,
     read_mask,
@@ -34,7 +32,7 @@ def half(height=120, width=160):
 def test_black_is_ignored_and_white_is_used(tmp_path):
     mask = read_mask(written(tmp_path / "m.png", half()))
     assert np.array_equal(mask.allowed, half())
-    assert isinstance(mask_of(None), NoMask)
+    assert mask_of(None) is None
     assert mask_of(str(tmp_path / "m.png")).sha256 == mask.sha256
 
 
@@ -74,12 +72,12 @@ def test_what_lies_under_the_mask_changes_nothing(tmp_path, camera):
     picture = textured(1, 240, 320)
     covered = picture.copy()
     covered[:, :150] = np.random.default_rng(1).integers(0, picture.max(), (240, 150))  # ends before the mask
-    one, other = (encoded(technique, image, mask.fitted(image)) for image in (picture, covered))
+    one, other = (technique.encode(image, mask.fitted(image)) for image in (picture, covered))
     assert not one.good.all()
     assert one.good.any()
     assert np.array_equal(one.good, other.good)
     assert np.array_equal(one.fine, other.fine)
-    without = encoded(technique, picture, NoMask().fitted(picture))
+    without = technique.encode(picture)
     assert not np.array_equal(one.fine, without.fine)
 
 

@@ -9,7 +9,7 @@ from edgevpr import techniques
 from edgevpr.core.config import Config, SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
-from edgevpr.frames.mask import AnyMask, mask_of
+from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.frames.source import is_live
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -179,11 +179,11 @@ def technique_of(
     return technique
 
 
-def say_other_mask(place_map: PlaceMap, mask: AnyMask) -> None:
+def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
     """Warn if the places of a map were made with another mask than `mask`. They remain usable: a display in them is
     just ground that is never seen."""
     built_with = place_map.mask_sha256
-    if len(place_map) and built_with != mask.sha256:
+    if len(place_map) and built_with != (mask.sha256 if mask else None):
         how = "without a mask" if built_with is None else "with another mask"
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
@@ -227,12 +227,12 @@ def _recogniser(
     )
 
 
-def _make_map(path: Path, technique: Technique, mask: AnyMask) -> None:
+def _make_map(path: Path, technique: Technique, mask: Mask | None) -> None:
     """Make an empty map, completely or not at all, so that a service killed at power-on can start again."""
     unfinished = path.with_name(path.name + ".new")
     remove(unfinished)
     with PlaceMap.create(unfinished, technique.spec) as place_map:
-        place_map.record_mask(mask.sha256)
+        place_map.record_mask(mask.sha256 if mask else None)
     unfinished.replace(path)
 
 

@@ -14,7 +14,7 @@ from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
-from edgevpr.frames.mask import AnyMask, encoded
+from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
@@ -61,7 +61,7 @@ class Preparation:
     excludes parts of it (None: no part), and `gate` rejects frames that are not memorable (None: no frame)."""
 
     levelling: Levelling | None = None
-    mask: AnyMask | None = None
+    mask: Mask | None = None
     gate: Gate | None = None
 
     def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
@@ -165,7 +165,7 @@ class Recogniser:
         with self.meter.step("gate"):
             event.worth = gate.look(frame.image) if gate else None
         with self.meter.step("encode"):
-            event.descriptor = descriptor = encoded(self.technique, picture.image, picture.mask)
+            event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
         return picture, descriptor
 
     def _recognise(
