@@ -33,8 +33,8 @@ _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up f
 def open_pictures(
     uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
 ) -> "WholePictures | None":
-    """Open a stream or file with `options` of FFmpeg. `timeouts_s` are those for opening and for each read (None: no
-    time-outs). Returns None if it cannot be opened or has no pictures."""
+    """Open a stream or file with `options` of FFmpeg and time-outs for opening and each read (None: no time-outs).
+    Returns None if it cannot be opened or has no pictures."""
     with av.logging.Capture() as said:
         try:
             container = av.open(uri, options=options, timeout=timeouts_s)

@@ -10,8 +10,8 @@ from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
 from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.positions import GeoTag, VideoTrack
-from edgevpr.frames.recordings import RecordingSource, tagged
 from edgevpr.frames.shot import Refusal
+from edgevpr.frames.source import RecordingSource, tagged
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame

@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection
 from edgevpr.core.errors import ImageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
-from edgevpr.frames.recordings import RecordingSource
 from edgevpr.frames.shot import Refusal
+from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.lattice import Lattice
 from edgevpr.mapmaking.orthophoto import Orthophoto
 

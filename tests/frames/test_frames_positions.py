@@ -33,28 +33,29 @@ def test_a_full_row_is_read_and_other_columns_are_ignored(written):
     }
 
 
-def test_file_lat_and_lon_are_enough(written):
-    assert read_positions(written("file,lat,lon\na.jpg,-54.5,2\n")) == {"a.jpg": GeoTag(position=Position(-54.5, 2.0))}
-
-
-def test_what_is_empty_is_not_known(written):
-    assert read_positions(written(HEADER + "a.jpg,ref,,,,,,\n")) == {"a.jpg": GeoTag()}
-
-
-def test_zero_zero_is_a_receiver_without_a_fix(written):
-    tags = read_positions(written("file,lat,lon\na.jpg,0,0.0\nb.jpg,0,0.1\n"))
-    assert tags == {"a.jpg": GeoTag(), "b.jpg": GeoTag(position=Position(0.0, 0.1))}
-
-
-def test_headings_are_turned_into_0_to_360(written):
-    text = "file,lat,lon,heading_deg,yaw_deg\na.jpg,,,-90,5\nb.jpg,,,,360\nc.jpg,,,,-180\n"
-    assert [tag.heading_deg for tag in read_positions(written(text)).values()] == [270, 0, 180]
-
-
-def test_what_spreadsheets_write_is_read(written):
-    text = 'File, Lat, Lon\r\n"a, b.jpg", 1.5, 2\r\n\r\nc.jpg,3,4\r\n'
-    tags = read_positions(written(text, "utf-8-sig"))
-    assert tags == {"a, b.jpg": GeoTag(position=Position(1.5, 2.0)), "c.jpg": GeoTag(position=Position(3.0, 4.0))}
+@pytest.mark.parametrize(
+    ("text", "tags"),
+    [
+        ("file,lat,lon\na.jpg,-54.5,2\n", {"a.jpg": GeoTag(position=Position(-54.5, 2.0))}),
+        (HEADER + "a.jpg,ref,,,,,,\n", {"a.jpg": GeoTag()}),
+        # a receiver without a fix, and one that has it
+        ("file,lat,lon\na.jpg,0,0.0\nb.jpg,0,0.1\n", {"a.jpg": GeoTag(), "b.jpg": GeoTag(position=Position(0.0, 0.1))}),
+        (
+            'File, Lat, Lon\r\n"a, b.jpg", 1.5, 2\r\n\r\nc.jpg,3,4\r\n',  # as spreadsheets write
+            {"a, b.jpg": GeoTag(position=Position(1.5, 2.0)), "c.jpg": GeoTag(position=Position(3.0, 4.0))},
+        ),
+        (
+            "file,lat,lon,heading_deg,yaw_deg\na.jpg,,,-90,5\nb.jpg,,,,360\nc.jpg,,,,-180\n",
+            {"a.jpg": GeoTag(heading_deg=270), "b.jpg": GeoTag(heading_deg=0), "c.jpg": GeoTag(heading_deg=180)},
+        ),
+        (  # the height over the take-off point stands in
+            "file,lat,lon,roll_deg,pitch_deg,height_m,rel_alt\na.jpg,,,-12.5,3,80,90\nb.jpg,,,,,,90\n",
+            {"a.jpg": GeoTag(roll_deg=-12.5, pitch_deg=3.0, height_m=80.0), "b.jpg": GeoTag(height_m=90.0)},
+        ),
+    ],
+)
+def test_a_table_is_read(text, tags, written):
+    assert read_positions(written(text, "utf-8-sig")) == tags
 
 
 @pytest.mark.parametrize(
@@ -134,21 +135,16 @@ def test_a_file_that_is_missing_no_text_or_a_pipe_is_refused(written, tmp_path):
         read_positions(tmp_path / "pipe.csv")
 
 
-def test_positions_are_found_in_the_folder_or_else_beside_it(tmp_path):
+def test_positions_are_found_in_the_folder_or_else_beside_it(tmp_path, monkeypatch):
     folder = tmp_path / "ref"
     folder.mkdir()
     assert find_positions(folder) is None
     (tmp_path / "positions.csv").touch()
     assert find_positions(folder) == tmp_path / "positions.csv"
+    monkeypatch.chdir(folder)
+    assert find_positions(".") == tmp_path / "positions.csv"
     (folder / "positions.csv").touch()
     assert find_positions(folder) == folder / "positions.csv"
-
-
-def test_positions_beside_a_relative_folder_are_found(tmp_path, monkeypatch):
-    (tmp_path / "positions.csv").touch()
-    (tmp_path / "ref").mkdir()
-    monkeypatch.chdir(tmp_path / "ref")
-    assert find_positions(".") == tmp_path / "positions.csv"
 
 
 def test_positions_that_are_written_are_read_as_the_same(tmp_path):
@@ -157,13 +153,6 @@ def test_positions_that_are_written_are_read_as_the_same(tmp_path):
     tags |= {"b, c.png": GeoTag(position=Position(1.0, 2.0)), "d.png": GeoTag()}
     write_positions(tmp_path / "positions.csv", tags)
     assert read_positions(tmp_path / "positions.csv") == tags
-
-
-def test_attitude_and_height_are_read(written):
-    text = "file,lat,lon,roll_deg,pitch_deg,height_m,rel_alt\na.jpg,,,-12.5,3,80,90\nb.jpg,,,,,,90\n"
-    tags = read_positions(written(text))
-    assert tags["a.jpg"] == GeoTag(roll_deg=-12.5, pitch_deg=3.0, height_m=80.0)
-    assert tags["b.jpg"] == GeoTag(height_m=90.0), "the height over the take-off point stands in"
 
 
 @pytest.fixture

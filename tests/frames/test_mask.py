@@ -117,18 +117,13 @@ def test_a_flight_without_a_display_needs_no_mask():
     assert learn_overlay((view(number, display=False) for number in range(40)), "here").mean() > 0.995
 
 
-@pytest.mark.parametrize("noise", [0, 3])
-def test_a_scene_that_stands_still_teaches_nothing(noise):
+@pytest.mark.parametrize(("noise", "contrast"), [(0, 1.0), (3, 1.0), (0, 0.0)])
+def test_a_scene_that_stands_still_teaches_nothing(noise, contrast):
     rng = np.random.default_rng(1)
-    still = view(3).astype(float)
+    still = contrast * view(3).astype(float)
     pictures = (np.clip(still + rng.normal(0, noise, still.shape), 0, 255).astype(np.uint8) for _ in range(40))
     with pytest.raises(SourceError, match=r"stands still"):
         learn_overlay(pictures, "video.mp4")
-
-
-def test_blank_pictures_teach_nothing():
-    with pytest.raises(SourceError, match="stands still"):
-        learn_overlay((np.zeros((240, 320, 3), np.uint8) for _ in range(40)), "here")
 
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_FRAMES - 1])

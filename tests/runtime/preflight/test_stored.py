@@ -67,9 +67,7 @@ def test_figures_of_this_machine_are_read_back_as_they_were(kept):
     ("changes", "said"),
     [
         ({"machine": "Raspberry Pi 5"}, "machine: Raspberry Pi 5 there, "),
-        ({"cores": 99}, "cores: 99 there, "),
         ({"kernel": "2.6.32"}, "kernel: 2.6.32 there, "),
-        ({"numpy": "1.0"}, "numpy: 1.0 there, "),
         ({"onnxruntime": None}, "onnxruntime: None there, "),
     ],
 )
@@ -81,37 +79,19 @@ def test_figures_of_another_machine_or_installation_are_refused_and_it_is_said(k
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "null", '{"format": 4}', '{"format": 4, "trials": 3}', '{"score": {}}']
-)
-def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path, text):
-    path = tmp_path / "m.json"
-    path.write_text(text)
-    assert_unreadable(path)
-
-
-def assert_unreadable(path):
-    figures, refused = load(path)
-    assert figures is None
-    assert refused.startswith(f"{path} holds no figures ")
-
-
-@pytest.mark.parametrize(
-    ("keys", "value"),
+    "text",
     [
-        (["trials", 0, "costs", "encode"], 0.1),
-        (["trials", 0, "costs", "scanned"], 1),
-        (["score", "single"], 0),
-        (["score", "products"], "quick"),
+        *("", "{", "[]", "null", '{"format": 4}', '{"format": 4, "trials": 3}', '{"score": {}}'),
+        lambda text: text.replace('"wall_s": 0.1', '"wall_s": "quick"'),
+        lambda text: text.replace('"scan_once"', '"scanned"'),
+        lambda text: text.replace('"single": 0.2', '"single": 0'),
     ],
 )
-def test_figures_that_are_none_are_said_and_not_used(kept, keys, value):
-    fields = json.loads(kept.read_text())
-    at = fields
-    for key in keys[:-1]:
-        at = at[key]
-    at[keys[-1]] = value
-    kept.write_text(json.dumps(fields))
-    assert_unreadable(kept)
+def test_figures_that_cannot_be_read_are_said_and_not_used(kept, text):
+    kept.write_text(text if isinstance(text, str) else text(kept.read_text()))
+    figures, refused = load(kept)
+    assert figures is None
+    assert refused.startswith(f"{kept} holds no figures ")
 
 
 def test_another_version_of_the_file_is_said_and_no_file_is_nothing_to_say(kept):
