@@ -1,6 +1,7 @@
 """`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller, and
 demonstrate all steps from map to match."""
 
+import signal
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,7 @@ def simulate_autopilot(args: Namespace) -> int:
     from edgevpr.lab.simulate.autopilot import run_autopilot
     from edgevpr.lab.simulate.motion import read_track
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it says what it has heard
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps
     summary = run_autopilot(

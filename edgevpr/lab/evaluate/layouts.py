@@ -10,12 +10,13 @@
   video with positions beside it, query.mp4 with query.csv, or a folder that holds one.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m
@@ -29,6 +30,7 @@ from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, l
 from edgevpr.lab.evaluate.numbered import read_numbered
 from edgevpr.lab.evaluate.videos import side_of, without_position
 
+Tags = dict[Path, GeoTag]  # of the pictures of a folder
 _FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
 
 
@@ -85,8 +87,8 @@ def of_positions(
         raise UsageError(
             "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
         )
-    _, origin, _ = references[0]
-    truth = _near(_shots(queries, origin), _shots(references, origin), rule)
+    origin = next(tag.position for tag in references.values() if tag.position)
+    truth = _near(queries, _offsets_m(queries, origin), references, _offsets_m(references, origin), rule)
     notes = []
     for given, folder in ((query, query_dir), (ref, ref_dir)):
         without, count = without_position(folder) if Path(given) != folder else (0, 0)
@@ -100,10 +102,10 @@ def _of_numbers(query_dir: Path, ref_dir: Path, path: Path) -> Dataset:
 
 
 def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
-    queries, references = (
-        [_Shot(path, *_utm_m(path), GeoTag()) for path in list_images(each)] for each in (query_dir, ref_dir)
-    )
-    return joined(query_dir, ref_dir, _near(queries, references, Nearness(within_m=rule.within_m)), query_dir)
+    queries, references = ({path: GeoTag() for path in list_images(each)} for each in (query_dir, ref_dir))
+    query_m, reference_m = (np.array([_utm_m(path) for path in each]) for each in (queries, references))
+    truth = _near(queries, query_m, references, reference_m, Nearness(within_m=rule.within_m))
+    return joined(query_dir, ref_dir, truth, query_dir)
 
 
 def _utm_m(path: Path) -> tuple[float, float]:
@@ -116,47 +118,37 @@ def _utm_m(path: Path) -> tuple[float, float]:
         ) from None
 
 
-@dataclass(frozen=True, slots=True)
-class _Shot:
-    """A picture: its file, its position in metres from an origin that all share, and the `tag` with its heading and
-    height."""
-
-    path: Path
-    east_m: float
-    north_m: float
-    tag: GeoTag
-
-
-def _tagged(folder: Path) -> list[tuple[Path, Position, GeoTag]]:
-    """Return the pictures of a folder that have a position, each as (its file, its position, its whole tag)."""
+def _tagged(folder: Path) -> Tags:
+    """Return the tags of the pictures of a folder that have a position."""
     csv_path = find_positions(folder)
     known = read_positions(csv_path) if csv_path else {}
     tags = ((path, known.get(path.name) or read_exif(path)) for path in list_images(folder))
-    return [(path, tag.position, tag) for path, tag in tags if tag.position]
+    return {path: tag for path, tag in tags if tag.position}
 
 
-def _shots(tagged: Sequence[tuple[Path, Position, GeoTag]], origin: Position) -> list[_Shot]:
-    there = [(at.lat_deg, at.lon_deg) for _, at, _ in tagged]
-    east_m, north_m = offset_m(origin.lat_deg, origin.lon_deg, *np.transpose(there))
-    places = zip(east_m.tolist(), north_m.tolist(), strict=True)
-    return [_Shot(path, *place, tag) for (path, _, tag), place in zip(tagged, places, strict=True)]
+def _offsets_m(tags: Tags, origin: Position) -> Doubles:
+    """Return where pictures were taken, (N, 2) metres east and north of `origin`."""
+    there = [(tag.position.lat_deg, tag.position.lon_deg) for tag in tags.values() if tag.position]
+    return np.transpose(offset_m(origin.lat_deg, origin.lon_deg, *np.transpose(there)))
 
 
-def _near(queries: Sequence[_Shot], references: Sequence[_Shot], rule: Nearness) -> GroundTruth:
-    """Return the ground truth of each query that has a right reference. Raises UsageError where none has."""
-    there_m = np.array([(shot.east_m, shot.north_m) for shot in references])
-    prints = [_print(shot, rule) for shot in references] if rule.overlap is not None else []
+def _near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Doubles, rule: Nearness) -> GroundTruth:
+    """Return the ground truth of each query that has a right reference. `query_m` and `reference_m`, (N, 2), are metres
+    from a common origin. Raises UsageError where none has."""
+    prints = []
+    if rule.overlap is not None:
+        prints = [_print(*each, rule) for each in zip(references.items(), reference_m.tolist(), strict=True)]
     truth = {}
-    for query in queries:
-        near = np.hypot(*(there_m - (query.east_m, query.north_m)).T) <= rule.within_m
+    for (path, tag), at_m in zip(queries.items(), query_m.tolist(), strict=True):
+        near = np.hypot(*(reference_m - at_m).T) <= rule.within_m
         if rule.within_deg is not None:
-            near &= [_apart_deg(query.tag, shot.tag) <= rule.within_deg for shot in references]
+            near &= [_apart_deg(tag, other) <= rule.within_deg for other in references.values()]
         if rule.overlap is not None and near.any():
-            own = _print(query, rule)
+            own = _print((path, tag), at_m, rule)
             near &= [bool(ok) and shared(own, other) >= rule.overlap for ok, other in zip(near, prints, strict=True)]
         if near.any():
-            names = (decoded_name(shot.path.name) for shot, is_near in zip(references, near, strict=True) if is_near)
-            truth[decoded_name(query.path.name)] = Judged(frozenset(names))
+            names = (decoded_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
+            truth[decoded_name(path.name)] = Judged(frozenset(names))
     if not truth:
         raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
     return truth
@@ -168,12 +160,12 @@ def _apart_deg(one: GeoTag, other: GeoTag) -> float:
     return abs((one.heading_deg - other.heading_deg + 180) % 360 - 180)
 
 
-def _print(shot: _Shot, rule: Nearness) -> Footprint:
-    if rule.fov_deg is None or shot.tag.height_m is None or shot.tag.heading_deg is None:
+def _print(picture: tuple[Path, GeoTag], at_m: tuple[float, float], rule: Nearness) -> Footprint:
+    path, tag = picture
+    if rule.fov_deg is None or tag.height_m is None or tag.heading_deg is None:
         raise UsageError(
-            f"{shot.path}: --overlap needs --fov-deg, and height_m and yaw_deg of every picture in positions.csv: "
-            "leave it out."
+            f"{path}: --overlap needs --fov-deg, and height_m and yaw_deg of every picture in positions.csv: leave it "
+            "out."
         )
-    height_px, width_px = read_image(shot.path).shape[:2]
-    middle_m, size_px = (shot.east_m, shot.north_m), (width_px, height_px)
-    return footprint(middle_m, shot.tag.height_m, rule.fov_deg, size_px, shot.tag.heading_deg)
+    height_px, width_px = read_image(path).shape[:2]
+    return footprint((at_m[0], at_m[1]), tag.height_m, rule.fov_deg, (width_px, height_px), tag.heading_deg)

@@ -3,12 +3,10 @@ port and to the clock. Used by `edgevpr simulate` and by tests."""
 
 import logging
 import select
-import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -62,8 +60,8 @@ def run_autopilot(
     gps: bool = False,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
-    """Simulate an autopilot at `link_url` until `duration_s` is over, `stop` is set, SIGINT or SIGTERM comes, or the
-    link is lost. Its UTC is that of this machine.
+    """Simulate an autopilot at `link_url` until `duration_s` is over, `stop` is set, Ctrl-C comes, or the link is
+    lost. Its UTC is that of this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that is more than a question, and
     stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS, and accepts no
@@ -92,13 +90,14 @@ def serve(
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
     log.info("%s is up at %s", controller, address)
     port = _Conversation(transport, controller)
-    with _set_by_signals(stop):
-        try:
-            port.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
-        except OSError as error:
-            log.warning("%s was lost (%s)", address, error)
-        finally:
-            transport.close()
+    try:
+        port.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
+    except KeyboardInterrupt:
+        log.debug("%s is asked to end", address)
+    except OSError as error:
+        log.warning("%s was lost (%s)", address, error)
+    finally:
+        transport.close()
     return port.summary()
 
 
@@ -168,16 +167,3 @@ def _is_question(message: Message) -> bool:
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
         return bool(message.command == mavlink.MAV_CMD_REQUEST_MESSAGE)
     return message.get_type() in _QUESTIONS
-
-
-@contextmanager
-def _set_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT set `stop` (in the main thread, which alone may handle signals)."""
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGTERM, signal.SIGINT) if is_main else ()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
