@@ -47,19 +47,19 @@ class ArduPilot(Firmware):
 
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         if self._is_aiding and self.kind == "copter" and self.now_s - self._passed_s > _AIDING_LOST_S:
-            self._is_aiding, self._good_since_s, self._frozen = False, math.inf, self.reckoning.place(self.truth)
+            self._is_aiding, self._good_since_s, self._frozen = False, math.inf, self.place
         measured, before, self._used = self._measured(), self._used, self._measured()
         if not self._is_aiding:
             self._wait_for_aiding(measured)
         elif measured is not None and measured != before:
             self._fuse(measured, wind_m_s, _POSITION_LOST_WITH_VELOCITY_S)
         if self._is_aiding and measured is not None and self.now_s - measured.t_s < _DEAD_RECKONING_S:
-            self.reckoning.drift_m_s = 0j
+            self.drift_m_s = 0j
         elif self._is_aiding:
             self._go_wrong(wind_m_s, dt_s, _UNNOTICED_SHARE)
-            self.reckoning.step(dt_s, SD_GROWS_M_S[self.kind])
+            self._reckon(dt_s, SD_GROWS_M_S[self.kind])
         elif self._frozen:
-            self._reset_to(*self._frozen, self.reckoning.sd_m)
+            self._reset_to(*self._frozen, self.sd_m)
 
     def flags(self) -> int:
         flags: int = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
@@ -117,4 +117,4 @@ class ArduPilot(Firmware):
         self._is_aiding, self._passed_s, self._aligned_after_s = True, passed_s, _AGAIN_AFTER_S
         self.set_origin(at)
         self._reset_to(at[0], at[1], _POSITION_NOISE_M)
-        self.reckoning.drift_m_s = 0j
+        self.drift_m_s = 0j

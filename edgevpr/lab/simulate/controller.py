@@ -73,7 +73,7 @@ class FlightController:
     @property
     def error_m(self) -> float:
         """Distance in metres between the estimated and the true position."""
-        return abs(self.brain.reckoning.error_m)
+        return abs(self.brain.error_m)
 
     def set(self, name: str, value: float) -> None:
         """Set a parameter, as PARAM_SET does. For example, SIM_GPS1_ENABLE 0 switches GPS off."""

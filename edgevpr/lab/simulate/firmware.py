@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from edgevpr.core.errors import UsageError
-from edgevpr.lab.simulate.motion import Motion
-from edgevpr.lab.simulate.sensors import ExternalNavigation, Origin, PositionMeasurement, Receivers, Reckoning
+from edgevpr.lab.simulate.motion import Motion, beside, from_to
+from edgevpr.lab.simulate.sensors import ExternalNavigation, Origin, PositionMeasurement, Receivers
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
 GATE_SD = 5.0  # standard deviations that an innovation may have; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
@@ -20,6 +20,8 @@ DENIED: int = mavlink.MAV_RESULT_DENIED
 NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0}
+_TAKEN_SHARE = 0.3  # of an innovation, that each measurement corrects
+_LEAST_SD_M = 0.3
 _INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter dead-reckons
 _WIND_LEARNT_IN_S = 5.0
 _NAME_BYTES = 16
@@ -29,7 +31,8 @@ _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_
 
 class Firmware(ABC):
     """The position estimator of a vehicle, and all that edgevpr reads which depends on it. It flies no mode and has no
-    failsafe: what a pilot would see, edgevpr does not."""
+    failsafe: what a pilot would see, edgevpr does not. The estimate is kept as its error against the truth, `error_m`
+    (complex), the growth of that error, `drift_m_s`, and `sd_m`, the standard deviation that the estimator assumes."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
@@ -42,7 +45,7 @@ class Firmware(ABC):
         is_px4 = self.number == mavlink.MAV_AUTOPILOT_PX4
         self.parameters = Parameters({**parameters, **SIMULATOR}, bytewise=is_px4)
         self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
-        self.reckoning = Reckoning()
+        self.error_m, self.drift_m_s, self.sd_m = 0j, 0j, _LEAST_SD_M
         self.origin: Origin | None = None
         self.is_armed = motion.is_flying
         self.test_ratio = 0.0
@@ -88,13 +91,38 @@ class Firmware(ABC):
         """Execute MAV_CMD_SET_EKF_SOURCE_SET (42007), if the firmware has source sets. Returns a MAV_RESULT."""
         return UNSUPPORTED
 
+    @property
+    def place(self) -> tuple[float, float]:
+        """The estimated (latitude, longitude) in degrees."""
+        return beside(self.truth.lat_deg, self.truth.lon_deg, self.error_m)
+
+    @property
+    def velocity_m_s(self) -> complex:
+        """The estimated velocity, east + 1j * north."""
+        return self.truth.velocity_m_s + self.drift_m_s
+
+    def _reckon(self, dt_s: float, sd_m_s: float) -> None:
+        self.error_m += self.drift_m_s * dt_s
+        self.sd_m += sd_m_s * dt_s
+
+    def _innovation_m(self, lat_deg: float, lon_deg: float) -> complex:
+        """Return the vector from the estimate to a point, metres (east + 1j * north)."""
+        return from_to(self.truth.lat_deg, self.truth.lon_deg, lat_deg, lon_deg) - self.error_m
+
+    def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
+        """Set the estimate to a point that was measured `age_s` seconds ago, plus the distance flown since."""
+        self.error_m += self._innovation_m(lat_deg, lon_deg) + self.velocity_m_s * age_s
+        self.sd_m = max(_LEAST_SD_M, sd_m)
+
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
         """Fuse a measurement that is within the gate; reset the position to one outside of it if none was within for
         `reset_after_s` seconds. Returns True in both cases; then the filter also learns the true `wind_m_s`."""
-        away_m = abs(self.reckoning.innovation_m(self.truth, measured.lat_deg, measured.lon_deg))
-        self.test_ratio = away_m / (GATE_SD * math.hypot(self.reckoning.sd_m, measured.sd_m))
+        innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg)
+        self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, measured.sd_m))
         if self.test_ratio <= 1:
-            self.reckoning.fuse(self.truth, measured)
+            self.error_m += _TAKEN_SHARE * innovation_m
+            self.drift_m_s = 0j
+            self.sd_m = max(_LEAST_SD_M, min(self.sd_m, measured.sd_m))
         elif self.now_s - self._passed_s > reset_after_s:
             self._reset_to(measured.lat_deg, measured.lon_deg, measured.sd_m)
         else:
@@ -107,13 +135,9 @@ class Firmware(ABC):
         """Increase the velocity error of the dead reckoning: of a plane by `unnoticed_share` of the change of wind
         since the filter learnt it, of a copter by the error of its accelerometers."""
         if self.kind == "plane":
-            drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
-            self.reckoning.drift_m_s = drift_m_s if self.motion.is_flying else 0j
+            self.drift_m_s = unnoticed_share * (self._wind_m_s - wind_m_s) if self.motion.is_flying else 0j
         elif self.motion.is_flying:
-            self.reckoning.drift_m_s += _INERTIAL_M_S2 * dt_s
-
-    def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
-        self.reckoning.reset_to(self.truth, lat_deg, lon_deg, sd_m, age_s)
+            self.drift_m_s += _INERTIAL_M_S2 * dt_s
 
 
 class Parameters(dict[str, float]):

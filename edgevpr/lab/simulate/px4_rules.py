@@ -53,12 +53,12 @@ class Px4(Firmware):
                 self._fused_s = self.now_s
         is_aided, is_flying = self.now_s - self._fused_s < _AIDING_GONE_S, self.motion.is_flying
         if is_aided:
-            self.reckoning.drift_m_s = 0j
+            self.drift_m_s = 0j
         else:
             self._go_wrong(wind_m_s, dt_s, 1.0)
         if is_aided or self.kind == "plane" or not is_flying:
             self._aided_s = self.now_s
-        self.reckoning.step(dt_s, SD_GROWS_M_S[self.kind] if is_flying and not is_aided else 0.0)
+        self._reckon(dt_s, SD_GROWS_M_S[self.kind] if is_flying and not is_aided else 0.0)
 
     def flags(self) -> int:
         flags: int = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
@@ -95,16 +95,16 @@ class Px4(Firmware):
         noise_m = max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
         lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
         delay_s = self.parameters["EKF2_AGP0_DELAY"] / 1e3
-        moved_m = (self.truth.velocity_m_s + self.reckoning.drift_m_s) * delay_s
-        innovation_m = self.reckoning.innovation_m(self.truth, lat_deg, lon_deg) + moved_m
-        variance_m2 = self.reckoning.sd_m**2 + noise_m**2
+        moved_m = self.velocity_m_s * delay_s
+        innovation_m = self._innovation_m(lat_deg, lon_deg) + moved_m
+        variance_m2 = self.sd_m**2 + noise_m**2
         if self.origin is None:
             self.origin = lat_deg, lon_deg, message.alt
             self._reset_to(lat_deg, lon_deg, noise_m)
         elif abs(innovation_m) <= self.parameters["EKF2_AGP0_GATE"] * math.sqrt(variance_m2):
-            gain = self.reckoning.sd_m**2 / variance_m2
-            self.reckoning.error_m += gain * innovation_m
-            self.reckoning.sd_m *= math.sqrt(1 - gain)
+            gain = self.sd_m**2 / variance_m2
+            self.error_m += gain * innovation_m
+            self.sd_m *= math.sqrt(1 - gain)
         elif self.now_s - self._passed_s > _AIDING_GONE_S and (is_starting or is_late):
             self._reset_to(lat_deg, lon_deg, noise_m, delay_s)
         else:

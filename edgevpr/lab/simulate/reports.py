@@ -36,8 +36,8 @@ def heartbeat(brain: Firmware) -> Message:
 def _position(brain: Firmware) -> Message | None:
     if brain.origin is None:
         return None
-    truth, (lat_deg, lon_deg) = brain.truth, brain.reckoning.place(brain.truth)
-    velocity_m_s = truth.velocity_m_s + brain.reckoning.drift_m_s
+    truth, (lat_deg, lon_deg) = brain.truth, brain.place
+    velocity_m_s = brain.velocity_m_s
     north_cm_s, east_cm_s, down_cm_s = (
         max(-32_768, min(32_767, round(100 * each)))
         for each in (velocity_m_s.imag, velocity_m_s.real, -truth.climb_m_s)
@@ -111,7 +111,7 @@ def _ekf_status(brain: Firmware) -> Message:
 
 
 def _estimator_status(brain: Firmware) -> Message:
-    both_m = math.sqrt(2) * brain.reckoning.sd_m if brain.origin else 0.0
+    both_m = math.sqrt(2) * brain.sd_m if brain.origin else 0.0
     return mavlink.MAVLink_estimator_status_message(
         round(brain.now_s * 1e6), brain.flags(), 0.1, brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
     )

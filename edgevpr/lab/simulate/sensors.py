@@ -1,12 +1,12 @@
 """Sensors of a simulated flight controller: its GPS, a second GPS by GPS_INPUT messages, external navigation by
-ODOMETRY messages, and its dead reckoning. Used by `firmware`. Rules and numbers are those of ArduPilot 4.7-dev: AP_GPS,
+ODOMETRY messages. Used by `firmware`. Rules and numbers are those of ArduPilot 4.7-dev: AP_GPS,
 AP_GPS_MAV and AP_VisualOdom."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from edgevpr.lab.simulate.motion import TrueState, beside, from_to
+from edgevpr.lab.simulate.motion import TrueState, beside
 from edgevpr.mavlink.wire import Message, mavlink
 
 NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
@@ -17,8 +17,6 @@ _SIMULATED_SD_M = 0.3
 _TIMEOUT_S = 4.0
 _LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # VISO_POS_M_NSE, and the upper limit
 _EXTERNAL_GOOD_FOR_S = 0.3
-_TAKEN_SHARE = 0.3  # of an innovation, that each measurement corrects
-_LEAST_SD_M = 0.3
 
 Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea level
 
@@ -120,39 +118,3 @@ class ExternalNavigation:
         step_m, sd_m, t_s = self._last
         lat_deg, lon_deg = beside(origin[0], origin[1], step_m)
         return PositionMeasurement(lat_deg=lat_deg, lon_deg=lon_deg, alt_m=origin[2], sd_m=sd_m, t_s=t_s)
-
-
-@dataclass(slots=True)
-class Reckoning:
-    """The estimated position, kept as its error against the truth: `error_m` (complex, east + 1j * north), `drift_m_s`
-    (the growth of that error), and `sd_m`, the standard deviation that the estimator assumes."""
-
-    error_m: complex = 0j
-    drift_m_s: complex = 0j
-    sd_m: float = _LEAST_SD_M
-
-    def step(self, dt_s: float, sd_m_s: float) -> None:
-        """Dead-reckon for `dt_s` seconds; the standard deviation grows by `sd_m_s` metres a second."""
-        self.error_m += self.drift_m_s * dt_s
-        self.sd_m += sd_m_s * dt_s
-
-    def place(self, truth: TrueState) -> tuple[float, float]:
-        """Return the estimated (latitude, longitude) in degrees."""
-        return beside(truth.lat_deg, truth.lon_deg, self.error_m)
-
-    def innovation_m(self, truth: TrueState, lat_deg: float, lon_deg: float) -> complex:
-        """Return the vector from the estimate to a point, metres (east + 1j * north)."""
-        return from_to(truth.lat_deg, truth.lon_deg, lat_deg, lon_deg) - self.error_m
-
-    def fuse(self, truth: TrueState, measured: PositionMeasurement) -> None:
-        """Move the estimate towards a measurement; the velocity is right from then on."""
-        self.error_m += _TAKEN_SHARE * self.innovation_m(truth, measured.lat_deg, measured.lon_deg)
-        self.drift_m_s = 0j
-        self.sd_m = max(_LEAST_SD_M, min(self.sd_m, measured.sd_m))
-
-    def reset_to(self, truth: TrueState, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
-        """Set the estimate to a point measured `age_s` seconds ago, plus the distance flown since by its velocity, with
-        the standard deviation `sd_m`."""
-        moved_m = (truth.velocity_m_s + self.drift_m_s) * age_s
-        self.error_m += self.innovation_m(truth, lat_deg, lon_deg) + moved_m
-        self.sd_m = max(_LEAST_SD_M, sd_m)

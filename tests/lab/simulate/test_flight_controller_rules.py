@@ -198,7 +198,7 @@ def test_px4_takes_a_fix_while_it_reckons_and_names_no_frame():
     assert flown.wait(60).error_m > 200
     assert flown.fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=math.nan, param3=math.nan) == ACCEPTED
     assert flown.error_m < 1
-    assert flown.controller.brain.reckoning.sd_m == 50, "where the sender says none"
+    assert flown.controller.brain.sd_m == 50, "where the sender says none"
     assert flown.fix(param2=math.nan) == NOT_NOW
     assert flown.fix(x=1_000_000_000) == FAILED
 
