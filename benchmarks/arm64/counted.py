@@ -2,10 +2,8 @@
 by which `edgevpr profile` estimates ARM boards."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
-from edgevpr.runtime.preflight.scale import CountedWork
 from edgevpr.techniques import create
 
 SMALL, LARGE = 1_000, 10_000  # places of the two maps whose scans were counted
@@ -22,12 +20,12 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
         scan_per_place = (large - small) / (LARGE - SMALL)
         technique = create("cohog", {"camera": camera})
         full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
-        work = CountedWork(
-            encode=encode,
-            match_per_place=(parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
-            compare_once=full,
-            scan_per_place=scan_per_place,
-            scan_once=small - SMALL * scan_per_place,
-        )
-        content[camera] = {stage: round(count) for stage, count in asdict(work).items()}
+        work = {
+            "encode": encode,
+            "match_per_place": (parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
+            "compare_once": full,
+            "scan_per_place": scan_per_place,
+            "scan_once": small - SMALL * scan_per_place,
+        }
+        content[camera] = {stage: round(count) for stage, count in work.items()}
     return {**content, **{kind: round(parts[name]) for kind, name in _ROUNDS.items()}}

@@ -1,7 +1,6 @@
 """Automatic choice of a technique if none is named, and the check whether the board can afford the one that flies."""
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from edgevpr import techniques
@@ -41,11 +40,14 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
     """
     board = load_board(board_name)
     demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
-    wanted = [
-        option
-        for technique in _usable(board, preferred(board, camera), camera)
-        for option in options(board, _label(technique), technique.spec.name, _costs_on(technique, board), demand)
-    ]
+    wanted: list[Option] = []
+    for name in preferred(board, camera):
+        try:
+            technique = made_for(board.threads, name, camera_setting(name, camera))
+        except ModelError as error:
+            _log.warning("technique %s is passed over: %s", name, error)
+            continue
+        wanted += options(board, _label(technique), name, _costs_on(technique, board), demand)
     if not wanted:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
     taken = best(wanted, board)
@@ -132,12 +134,3 @@ def camera_setting(name: str, camera: str | None) -> dict[str, str]:
     """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
     (None) or the technique has no such parameter."""
     return {"camera": camera} if camera and "camera" in techniques.parameters(name) else {}
-
-
-def _usable(board: Board, names: tuple[str, ...], camera: str | None) -> Iterator[Technique]:
-    """Create and yield each technique. If its network cannot be used here, it is left out and logged."""
-    for name in names:
-        try:
-            yield made_for(board.threads, name, camera_setting(name, camera))
-        except ModelError as error:
-            _log.warning("technique %s is passed over: %s", name, error)

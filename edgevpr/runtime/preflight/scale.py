@@ -7,7 +7,7 @@ counted: these are of the board's own instruction set, and other programs cannot
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,22 +33,13 @@ class Ratios:
     passes: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CountedWork:
-    """Instructions of `cohog` on an ARM core, counted for the fields of `TechniqueCosts` of the same names."""
-
-    encode: float
-    match_per_place: float
-    compare_once: float
-    scan_per_place: float
-    scan_once: float
-
-
-def counted_work(name: str, parameters: Mapping[str, Any]) -> CountedWork | None:
-    """Return the counted instructions of the technique `name` with these parameters; None if they were not counted."""
+def counted_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
+    """Return the instructions of the technique `name` with these parameters on an ARM core, counted for fields of
+    `TechniqueCosts`; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
-    return CountedWork(**_counted()[parameters.get("camera", "forward")])
+    work: dict[str, float] = _counted()[parameters.get("camera", "forward")]
+    return work
 
 
 def is_same(here: Board, board: Board) -> bool:
@@ -72,14 +63,16 @@ def ratios(here: Board, board: Board) -> Ratios | None:
     return Ratios(products / own_products, passes / own_passes)
 
 
-def on_board(costs: TechniqueCosts, here: Board, board: Board, work: CountedWork | None = None) -> TechniqueCosts:
+def on_board(
+    costs: TechniqueCosts, here: Board, board: Board, work: Mapping[str, float] | None = None
+) -> TechniqueCosts:
     """Convert costs measured on the machine `here` to `board`: by the counted instructions (`work`) if they and the
     board's `arm64_mips` are known, else by the ratios. Without ratios the times stay unchanged."""
     if is_same(here, board):
         return costs
     if work and (mips := board.benchmark_score.arm64_mips):
-        times = {stage: StageCost(*2 * (count / (1e6 * mips),)) for stage, count in asdict(work).items()}
-        return replace(costs, **times)  # type: ignore[arg-type]  # a field of TechniqueCosts for each of CountedWork
+        times = {stage: StageCost(*2 * (count / (1e6 * mips),)) for stage, count in work.items()}
+        return replace(costs, **times)  # type: ignore[arg-type]  # they are fields of TechniqueCosts
     ratio = ratios(here, board)
     if ratio is None:
         return costs

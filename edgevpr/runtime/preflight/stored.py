@@ -29,11 +29,7 @@ from edgevpr.runtime.preflight.trial import Trial, model_of, trial_of
 
 _FORMAT = 4  # another one for each change of `Trial` or `TechniqueCosts`
 _MAX_FILE_BYTES = 10_000_000
-_PACKAGES = {
-    "numpy": ("numpy",),
-    "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
-    "onnxruntime": ("onnxruntime", "onnxruntime-gpu"),
-}
+_PACKAGES = ("numpy", "opencv", "onnxruntime")  # what the names of packages begin with that the times depend on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +67,7 @@ def identity(root: Path = Path("/")) -> dict[str, Any]:
         "usable cores": machine.cores(root),
         "kernel": platform.release(),
         "edgevpr": __version__,
-        **{name: _version(packages) for name, packages in _PACKAGES.items()},
+        **{each.name: each.version for each in metadata.distributions() if (each.name or "").startswith(_PACKAGES)},
     }
 
 
@@ -109,8 +105,8 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
         fields["score"] = build(MachineSpeed, fields["score"], "score")
         fields["trials"] = tuple(map(trial_of, fields["trials"]))
         figures, here = StoredFigures(**fields), identity()
-        there = figures.identity
-        different = [f"{key}: {there.get(key)} there, {here[key]} here" for key in here if there.get(key) != here[key]]
+        both = {key: (figures.identity.get(key), here.get(key)) for key in {**here, **figures.identity}}
+        different = [f"{key}: {there} there, {now} here" for key, (there, now) in both.items() if there != now]
     except FileNotFoundError:
         return None, None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ConfigError):
@@ -169,10 +165,3 @@ def _same_settings(trial: Trial, offer: Trial) -> bool:
     """Tell whether an offer asks for the settings that were tried. A setting that is not named has its default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}
-
-
-def _version(packages: tuple[str, ...]) -> str | None:
-    for package in packages:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            return metadata.version(package)
-    return None
