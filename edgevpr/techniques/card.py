@@ -4,6 +4,7 @@ training and the commands for models use it. Every error in a card is reported w
 import hashlib
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -138,55 +139,34 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
     if not needs_hash:
         values = {**values, "sha256": values.get("sha256") or ""}
     card = build(Card, {"path": path, **values}, str(path))
-    for is_wrong, remedy in _problems(card, "[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?"):
-        if is_wrong:
-            raise ModelError(f"{path}: {remedy}")
+    for problem in _problems(card, "[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?"):
+        raise ModelError(f"{path}: {problem}")
     return card
 
 
-def _problems(card: Card, sha256: str) -> tuple[tuple[bool, str], ...]:
-    """Return, for each rule that types and ranges do not hold, whether the card breaks it, and what to do then."""
+def _problems(card: Card, sha256: str) -> Iterator[str]:
+    """Yield what is wrong with a card that types and ranges do not tell, and what to do."""
     boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
-    dynamic = [] if rule is None else list(rule.dynamic.values())
     per_channel = f"write one number or {channels}, one a channel"
-    return (
-        (
-            not re.fullmatch(sha256, card.sha256),
-            f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints.",
-        ),
-        (
-            card.file in ("", ".", "..") or "/" in card.file,
-            f"`file` is `{card.file}`: write the name of a file that lies beside the card.",
-        ),
-        (
-            card.file.lower().endswith((".yaml", ".yml")),
-            f"`file` is `{card.file}`, which is the name of a card: write that of the ONNX file.",
-        ),
-        (
-            not any(asdict(card.outputs).values()),
-            "`outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of memorability.",
-        ),
-        (
-            (boxes is None) != (rule is None),
-            "a detector needs both `outputs.boxes` and the section `detector`: write both.",
-        ),
-        (
-            boxes is not None and not (boxes and all(isinstance(name, str) for name in boxes)),
-            f"`outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs.",
-        ),
-        (
-            rule is not None and not (dynamic and all(type(each) is int and 0 <= each < 10_000 for each in dynamic)),
-            "`detector.dynamic` needs names of classes with their numbers, {car: 2}.",
-        ),
-        (
-            not _are_per_channel(card.input.mean, channels, -1e9),
-            f"`input.mean` is {card.input.mean!s:.80}: {per_channel}.",
-        ),
-        (
-            not (card.input.std is None or _are_per_channel(card.input.std, channels, 0)),
-            f"`input.std` is {card.input.std!s:.80}: {per_channel}, all above 0.",
-        ),
-    )
+    if not re.fullmatch(sha256, card.sha256):
+        yield f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints."
+    if card.file in ("", ".", "..") or "/" in card.file:
+        yield f"`file` is `{card.file}`: write the name of a file that lies beside the card."
+    if card.file.lower().endswith((".yaml", ".yml")):
+        yield f"`file` is `{card.file}`, which is the name of a card: write that of the ONNX file."
+    if not any(asdict(card.outputs).values()):
+        yield "`outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of memorability."
+    if (boxes is None) != (rule is None):
+        yield "a detector needs both `outputs.boxes` and the section `detector`: write both."
+    if boxes is not None and not (boxes and all(isinstance(name, str) for name in boxes)):
+        yield f"`outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs."
+    numbers = [0] if rule is None else list(rule.dynamic.values())
+    if not numbers or not all(type(number) is int and 0 <= number < 10_000 for number in numbers):
+        yield "`detector.dynamic` needs names of classes with their numbers, {car: 2}."
+    if not _are_per_channel(card.input.mean, channels, -1e9):
+        yield f"`input.mean` is {card.input.mean!s:.80}: {per_channel}."
+    if card.input.std is not None and not _are_per_channel(card.input.std, channels, 0):
+        yield f"`input.std` is {card.input.std!s:.80}: {per_channel}, all above 0."
 
 
 def _are_per_channel(values: list[float], channels: int, above: float) -> bool:
