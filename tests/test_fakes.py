@@ -14,8 +14,7 @@ from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.motion import TrueState
-from edgevpr.mavlink.link import LinkStats
-from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
+from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.requests import Wish
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.clock import Clock
@@ -153,16 +152,6 @@ def test_where_the_vehicle_is_and_whether_it_listens(link):
     assert vehicle.is_fresh_at(clock.now_s)
     seen = link.vehicle_at(clock.now_s)
     assert (seen.lat_deg, seen.lon_deg, seen.heading_deg, seen.roll_deg) == (50.0, 8.0, None, None)
-
-
-def test_messages_and_health_are_taken(link):
-    link, _ = link
-    link.send(status_text(Severity.INFO, "one"), status_text(Severity.INFO, "two"))
-    link.set_health(Health.ACTIVE)
-    wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 2)
-    stats = link.stats()
-    assert isinstance(stats, LinkStats)
-    assert (stats.connected, stats.autopilot_heard, stats.autopilot_system_id) == (True, True, 1)
 
 
 @pytest.mark.parametrize("kind", ["real", "fake"])

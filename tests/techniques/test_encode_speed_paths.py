@@ -28,12 +28,6 @@ def _stripes() -> np.ndarray:
     return np.where(np.arange(128) // 3 % 2, 64, 192).astype(np.uint8)[None].repeat(128, axis=0)
 
 
-def _every_ending(seed: int) -> np.ndarray:
-    """Every disc has all 64 values of the last six bits, and far more than 64 values."""
-    ending = np.add.outer(28 * np.arange(128), 63 * np.arange(128)) & 63
-    return (ending + 64 * np.random.default_rng(seed).integers(0, 4, ending.shape)).astype(np.uint8)
-
-
 def _patchwork(seed: int) -> np.ndarray:
     """Squares of very different contrast: bounds are tight here and loose there."""
     rng = np.random.default_rng(seed)
@@ -49,7 +43,6 @@ PICTURES = {
     "noise": _noise(4),
     "ramp": np.add.outer(np.arange(128), np.arange(128)).astype(np.uint8),
     "stripes": _stripes(),
-    "every ending": _every_ending(7),
     "patchwork": _patchwork(5),
     "blurred patchwork": cv2.GaussianBlur(_patchwork(6), (0, 0), 1.5),
 }

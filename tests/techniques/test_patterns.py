@@ -24,10 +24,6 @@ def test_patterns_have_length_one_and_stand_at_right_angles(bins):
     np.testing.assert_allclose(patterns.T @ patterns, np.eye(patterns.shape[1]), atol=1e-6)
 
 
-def test_of_eight_orientations_twenty_of_thirty_two_numbers_are_left():
-    assert slow_patterns(8).shape == (32, 20)
-
-
 def test_nearly_as_many_regions_agree_as_if_all_numbers_were_compared():
     technique = create("cohog")
     scene = textured(5, 544, 544)

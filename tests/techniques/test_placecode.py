@@ -99,10 +99,3 @@ def test_of_many_places_the_best_are_looked_at_under_every_shift(town, right, do
     assert (ahead <= full + 1e-6).all()
     assert (ahead < full).mean() > 0.5  # the rest were not
     np.testing.assert_array_equal(placecode.scan_ahead(asked, codes), placecode.scan(asked, codes))
-
-
-def test_every_shift_leaves_at_least_the_least_overlap():
-    overlap = np.prod(12 - abs(placecode.SHIFTS.astype(int)), axis=1) / 144
-    assert overlap.min() >= 0.5
-    assert len(np.unique(placecode.SHIFTS, axis=0)) == len(placecode.SHIFTS)
-    assert [0, 0] in placecode.SHIFTS.tolist()

@@ -115,33 +115,6 @@ def test_a_moved_and_turned_camera_finds_the_place_and_its_rotation(town, right,
     assert abs(off_deg) <= 15
 
 
-def test_of_many_pairs_only_the_best_vote_and_they_come_first(town, monkeypatch):
-    technique, grounds, rows = town
-    many = np.random.default_rng(3).permuted(np.tile(rows[:6], (50, 1)), axis=1)
-    many = np.concatenate([many, rows])
-    query = technique.encode(view(grounds[9], 16, 16, 75))
-    full = technique.coarse_scores(query, many, None, None, 1.0)[1][:, AS_MAPPED]
-    monkeypatch.setattr(placewords, "_VOTED_EACH", 40)
-    some = technique.coarse_scores(query, many, None, None, 1.0)[1][:, AS_MAPPED]
-    assert some.argmax() == full.argmax()
-    assert np.mean(some < full) > 0.2
-    assert (some <= full).all()
-
-
-def test_a_known_heading_is_the_full_scan_of_three_rotations(town):
-    technique, grounds, rows = town
-    rng = np.random.default_rng(2)
-    many = rows[rng.integers(len(rows), size=120)]  # so few that all vote
-    expected = rng.integers(-1, 24, 120)
-    turned_deg = np.where(expected < 0, np.nan, 15.0 * expected)
-    query = technique.encode(view(grounds[1], 20, 20, 33))
-    full, near = (technique.coarse_scores(query, many, None, hint, 1.0)[1][:, AS_MAPPED] for hint in (None, turned_deg))
-    apart = abs((np.arange(24) - expected[:, None] + 12) % 24 - 12)
-    scanned = (apart <= 1) | (expected[:, None] < 0)
-    np.testing.assert_array_equal(near[scanned], full[scanned])
-    assert np.isneginf(near[~scanned]).all()
-
-
 def test_numbers_that_are_no_words_count_as_none(town):
     technique, grounds, rows = town
     query = technique.encode(view(grounds[4], 16, 0, 30))

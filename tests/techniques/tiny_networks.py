@@ -74,7 +74,6 @@ def _network(fault: str | None):
         size[0] = "batch"
     if fault == "other size":
         size = [1, 1, HEIGHT, WIDTH + 8]
-    kind = TensorProto.DOUBLE if fault == "double" else TensorProto.FLOAT
     nodes = [
         helper.make_node("Conv", ["picture", "weights", "bias"], ["conv"], strides=[2, 2]),
         helper.make_node("Relu", ["conv"], ["features"]),
@@ -85,15 +84,7 @@ def _network(fault: str | None):
         nodes.insert(1, helper.make_node("Loop", ["many", "true", "conv"], ["turned"], body=_turn()))
         nodes[2].input[0] = "turned"
     inputs = [helper.make_tensor_value_info("picture", TensorProto.FLOAT, size)]
-    if fault == "double":
-        inputs = [helper.make_tensor_value_info("picture64", kind, size)]
-        nodes.insert(0, helper.make_node("Cast", ["picture64"], ["picture"], to=TensorProto.FLOAT))
-    if fault == "two inputs":
-        inputs.append(helper.make_tensor_value_info("scale", TensorProto.FLOAT, [1]))
     outputs = [helper.make_tensor_value_info(each, TensorProto.FLOAT, None) for each in ("descriptor", "features")]
-    if fault == "whole numbers":
-        nodes.append(helper.make_node("ArgMax", ["features"], ["number"], axis=1))
-        outputs.append(helper.make_tensor_value_info("number", TensorProto.INT64, None))
     initial = [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(bias, "bias")]
     if fault == "endless":
         initial += [numpy_helper.from_array(np.array(2**62), "many"), numpy_helper.from_array(np.array(True), "true")]

@@ -7,12 +7,10 @@ from edgevpr.frames.images import cv2
 from edgevpr.lab.training.pictures import (
     TARGET_LENGTH,
     batch,
-    gradients_of,
     read_pictures,
     small_grey,
     two_sights,
 )
-from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 
 @pytest.fixture
@@ -32,12 +30,6 @@ def test_a_batch_has_the_form_the_network_takes(picture):
     assert targets.max() <= 1
 
 
-def test_the_target_is_the_hog_of_the_unchanged_sight(picture):
-    sight, _ = two_sights(picture, np.random.default_rng(1))
-    cells = oriented_cells(sight, 8, 9, signed=False)
-    np.testing.assert_allclose(gradients_of(sight), normalised_blocks(cells).ravel(), atol=1e-6)
-
-
 def test_both_sights_show_the_same_ground(picture):
     """The changed sight correlates with its own original, and much less with others."""
     rng = np.random.default_rng(5)
@@ -47,11 +39,6 @@ def test_both_sights_show_the_same_ground(picture):
     own = np.diag(correlation)
     assert own.mean() > np.median(correlation) + 0.3
     assert (own < 0.9999).all()  # and is changed
-
-
-def test_a_portrait_picture_fills_the_sight(picture):
-    sight, changed = two_sights(np.ascontiguousarray(picture.T), np.random.default_rng(1))
-    assert sight.shape == changed.shape == (120, 160)
 
 
 def test_what_cannot_be_read_is_left_out_and_said(tmp_path, capsys):

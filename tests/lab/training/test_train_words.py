@@ -12,7 +12,7 @@ from edgevpr.core.files import shipped
 from edgevpr.lab.training import words as training_words
 from edgevpr.lab.training.pictures import read_pictures
 from edgevpr.techniques.session import open_backbone
-from edgevpr.techniques.words import load_words, local_descriptors, nearest, sharpness_of, vlad
+from edgevpr.techniques.words import load_words, local_descriptors, sharpness_of, vlad
 
 
 @pytest.fixture(autouse=True)
@@ -52,18 +52,6 @@ def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
         assert train(folder, "--kind", "vlad", "--count", "8", "--whiten", "6", "--out", str(tmp_path / out)) == 0
     first, again = ((tmp_path / out / "mine_vlad8.npz").read_bytes() for out in ("a", "b"))
     assert first == again
-
-
-@pytest.mark.slow
-def test_words_lie_among_the_descriptors(folder):
-    """Each descriptor is nearer to its word than to the mean of all, by far."""
-    assert train(folder, "--kind", "vlad", "--count", "16") == 0
-    words = load_words("mine", "vlad", 16).words
-    backbone = open_backbone("mine", "features")
-    local = np.concatenate([local_descriptors(backbone.run(p)) for p in read_pictures([folder], "reading")])
-    to_word = np.square(local - words[nearest(local, words)]).sum(axis=1).mean()
-    assert to_word < 0.6 * np.square(local - local.mean(axis=0)).sum(axis=1).mean()
-    assert len(np.unique(nearest(local, words))) == 16
 
 
 @pytest.mark.slow
