@@ -16,7 +16,7 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Answers, Kind, kind_of
 from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.ports import open_port
-from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
+from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
 
 HEARTBEAT_S = 1.0
@@ -47,7 +47,7 @@ class Inquiry:
         address: LinkAddress,
         component_id: int = 197,
         system_id: int | None = None,
-        signing: NotSigning = NOT_SIGNING,
+        signing: Signing = NOT_SIGNING,
     ) -> None:
         """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first one that is
         heard). Raises LinkError where the link cannot be opened: see `open_port`, or its other end is missing."""

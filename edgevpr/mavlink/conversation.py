@@ -17,7 +17,7 @@ from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.requests import Requests, Wish, Wished
-from edgevpr.mavlink.signing import NOT_SIGNING, NotSigning
+from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
 
@@ -51,7 +51,7 @@ class LinkSettings:
     clock: Callable[[], float] = time.monotonic
     listener: Listener = _NOBODY
     tap: Tap = untapped
-    signing: NotSigning = NOT_SIGNING
+    signing: Signing = NOT_SIGNING
     origin: Position | None = None
     tape: Tape = NO_TAPE
 
@@ -85,7 +85,7 @@ class Conversation:
 
     @property
     def channel(self) -> Channel:
-        """The channel by which the autopilot is told messages."""
+        """The channel by which the autopilot is told positions."""
         return self.autopilot.interview.choice.channel
 
     @property

@@ -13,10 +13,9 @@ import os
 import stat
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from threading import Lock, Thread
-from types import MappingProxyType
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import open_file, read_file, write_whole
@@ -135,35 +134,12 @@ class TimeStamps:
                 log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
 
 
-class NotSigning:
-    """Signs nothing and admits every message: in place of `Signing` where there is no key."""
-
-    refused: Mapping[str, int] = MappingProxyType({})
-
-    def of_ground(self) -> "NotSigning":
-        """Return the signing object for the link to the ground."""
-        return self
-
-    def take_verdicts(self) -> list[str | None]:
-        """Return, for each message since the last call, why it was refused, or None if it was admitted."""
-        return []
-
-    def stamp(self, packer: Message) -> None:
-        """Prepare a pymavlink packer, so that it signs its next message."""
-
-    def admits(self, message: Message) -> bool:
-        """Return True if a received message may be processed."""
-        return True
-
-
-NOT_SIGNING = NotSigning()
-
-
-class Signing(NotSigning):
+class Signing:
     """Signs the messages that one link sends. Admits received messages that are signed with the same key and are not
-    older than earlier ones. `refused` counts the others by reason; each reason is logged once."""
+    older than earlier ones. `refused` counts the others by reason; each reason is logged once. Without a key (no
+    `stamps`) nothing is signed, and every message is admitted."""
 
-    def __init__(self, key: bytes, stamps: TimeStamps, link_id: int = TO_AUTOPILOT) -> None:
+    def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()
         self._key, self._stamps, self._link_id = key, stamps, link_id
         self._verdicts: list[str | None] = []
@@ -173,16 +149,22 @@ class Signing(NotSigning):
         return Signing(self._key, self._stamps, TO_GROUND)
 
     def take_verdicts(self) -> list[str | None]:
+        """Return, for each message since the last call, why it was refused, or None if it was admitted."""
         verdicts, self._verdicts = self._verdicts, []
         return verdicts
 
     def stamp(self, packer: Message) -> None:
-        signing = packer.signing
-        signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
-        signing.timestamp = self._stamps.next()
+        """Prepare a pymavlink packer, so that it signs its next message."""
+        if self._stamps:
+            signing = packer.signing
+            signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
+            signing.timestamp = self._stamps.next()
 
     def admits(self, message: Message) -> bool:
-        reason = self._refusal(message.get_msgbuf(), message.get_header())
+        """Return True if a received message may be processed."""
+        if not self._stamps:
+            return True
+        reason = self._refusal(self._stamps, message.get_msgbuf(), message.get_header())
         self._verdicts.append(reason)
         if reason is None:
             return True
@@ -191,7 +173,7 @@ class Signing(NotSigning):
         self.refused[reason] += 1
         return False
 
-    def _refusal(self, packet: bytes, header: Message) -> str | None:
+    def _refusal(self, stamps: TimeStamps, packet: bytes, header: Message) -> str | None:
         """Return why a message is refused (None: it is admitted). A RADIO_STATUS needs no signature, since a radio has
         no key, but must not have the component id of an autopilot."""
         if not header.incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED:
@@ -202,10 +184,13 @@ class Signing(NotSigning):
         if not hmac.compare_digest(expected, packet[-6:]):
             return WRONG
         stamp = int.from_bytes(packet[-12:-6], "little")
-        return self._stamps.refusal((header.srcSystem, header.srcComponent, packet[-13]), stamp)
+        return stamps.refusal((header.srcSystem, header.srcComponent, packet[-13]), stamp)
 
 
-def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> NotSigning:
+NOT_SIGNING = Signing()
+
+
+def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> Signing:
     """Read the key and the kept time, and return the object that signs; without a key, one that does not. `state_path`
     is the file of the kept time (None: beside the key); with `to_ask` (questions before the flight) it is only read.
     Raises ConfigError."""

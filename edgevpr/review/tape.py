@@ -8,7 +8,7 @@ sent."""
 import json
 import logging
 from base64 import b64decode
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -19,7 +19,7 @@ from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.line import LOST
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.signing import KEY_BYTES, NotSigning
+from edgevpr.mavlink.signing import KEY_BYTES, Signing
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.review.compare import Packets
 from edgevpr.runtime.flight.world import StopNow
@@ -137,13 +137,12 @@ class SupposedGround(GroundLink, SupposedLink):
     """The link to the ground station, replayed as `SupposedLink` is."""
 
 
-class ReplayedSigning(NotSigning):
+class ReplayedSigning(Signing):
     """Signing without the real key: signs with a key of zeros, and admits the messages that the flight admitted.
     `verdicts` has, for each of the next messages, why the flight refused it (None: it did not)."""
 
     def __init__(self) -> None:
-        self._refused: Counter[str] = Counter()
-        self.refused = self._refused
+        super().__init__()
         self.verdicts: deque[str | None] = deque()
 
     def of_ground(self) -> "ReplayedSigning":
@@ -159,7 +158,7 @@ class ReplayedSigning(NotSigning):
         """Return True if the flight accepted this message's signature."""
         reason = self.verdicts.popleft() if self.verdicts else None
         if reason:
-            self._refused[reason] += 1
+            self.refused[reason] += 1
         return reason is None
 
 

@@ -11,7 +11,7 @@ from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.signing import NotSigning
+from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.wire import Tap
 from edgevpr.power.boards import Board
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -93,7 +93,7 @@ class World:
     open_source: Callable[[float], Source]
     link: type[Link]
     ground: type[GroundLink]
-    signing: NotSigning
+    signing: Signing
     tap: Tap
     stop: Stop
     status: StatusFile | None
