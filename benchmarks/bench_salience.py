@@ -28,8 +28,7 @@ from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.runtime.recognise.detector import Detector
-from edgevpr.runtime.recognise.memorability import Memorability
+from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.salience_gate import Thresholds, maps_of, scores_of, worth_of
 from edgevpr.techniques.card import load_card
 

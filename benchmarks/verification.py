@@ -23,11 +23,10 @@ from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
+from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement, Verification
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import Technique
 
 LEAST_OVERLAP = 0.3

@@ -21,8 +21,7 @@ from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.files import own_models, read_file, write_whole
 from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
-from edgevpr.runtime.recognise.detector import Detector
-from edgevpr.runtime.recognise.memorability import CROPS, Memorability
+from edgevpr.runtime.recognise.gate_networks import CROPS, Detector, Memorability
 from edgevpr.techniques.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.session import backbone_of, file_sha256, import_onnxruntime
 

@@ -1,21 +1,30 @@
-"""Agreement of two pictures: how many of their landmarks coincide after one rotation, one scaling and one shift.
+"""Verification of the best place by landmarks, which had no part in finding it, and the agreement of two pictures: how
+many of their landmarks coincide after one rotation, one scaling and one shift.
 
-Used by `verify` to check a match: the query is the picture that is looked for, a place a picture of the map. Points are
-complex numbers here, x + iy (to the right, down), as shares of the longest side from the picture's middle. A *way* to
-lay the query on the place is two of them: a point is multiplied by the first (rotation and scale), then the second (the
-shift) is added.
+It is for cameras that look straight down only: ahead, near and far landmarks shift by different amounts. The query is
+the picture that is looked for, a place a picture of the map. Points are complex numbers here, x + iy (to the right,
+down), as shares of the longest side from the picture's middle. A *way* to lay the query on the place is two of them: a
+point is multiplied by the first (rotation and scale), then the second (the shift) is added.
 
 Two landmarks match if each is the most similar one of the other picture. Every two of the best matches define one way.
 The way that most of all matches follow is taken. Nothing is random: the same pictures always give the same result.
 """
 
+from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
-from edgevpr.runtime.recognise.landmarks import Landmarks
+from edgevpr.core.contract import Technique, TechniqueSpec
+from edgevpr.core.errors import PlaceError
+from edgevpr.frames.level import Levelled
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Ranking, elsewhere
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
 
 # Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
 # expected as their match says, 31 had four inliers, 7 five, 3 six and none more (benchmarks/verification.py). Of
@@ -37,6 +46,7 @@ _FEWEST = 3
 # Relief and tilt move neighbouring landmarks alike: so many of them count as one independent landmark. With this, half
 # of the errors on aerial_caliterra and aerial_garfield28 are within the bound that the covariance gives for half.
 _ALIKE = 40.0
+_MAY_BE_THE_SAME = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +159,78 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
     )
 
 
+def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
+    """Return the landmarks of a picture as a map stores them; None for a technique that does not look straight down."""
+    return packed(describe(picture.image, picture.mask, OF_PLACE)) if technique.spec.cells else None
+
+
+class Verification:
+    """Compares the landmarks of one query with those of places. They are computed when first needed."""
+
+    def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
+        self._spec, self.picture = spec, picture
+        self._index, self._map = index, place_map
+        self._query: Landmarks | None = None
+
+    def proof(self, ranking: Ranking) -> Agreement | None:
+        """Compare the landmarks of the query with those of the best place, expected as its match says. None if they
+        cannot be compared: the place has no landmarks, or its match no shift or rotation.
+
+        Raises PlaceError if the landmarks of the place cannot be read; the place is then left out.
+        """
+        expected, known = self._place(ranking, int(ranking.slots[0]))
+        return held_against(self._of_query(), known, expected) if expected and known is not None else None
+
+    def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
+        """Return the number of landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) that agree as
+        its own match expects: 0 if there is no such place, and the largest possible number if its landmarks are
+        unknown. The places with the numbers `same` are not elsewhere. Raises PlaceError as `proof`."""
+        away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
+        if not len(away):
+            return 0
+        expected, known = self._place(ranking, int(away[0]))
+        return OF_PLACE if known is None else agreement(self._of_query(), known, expected).inliers
+
+    def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
+        """Return the numbers of the first places that show the same ground as the best one: their landmarks agree with
+        those of the best place as both matches expect. Empty if places have positions, which then tell. Raises as
+        `proof`."""
+        slots = ranking.compared_slots[:_MAY_BE_THE_SAME]
+        if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
+            return ()
+        expected, known = self._place(ranking, slots[0])
+        if expected is None or known is None:
+            return ()
+        others = {int(self._index.place_ids[slot]): self._place(ranking, slot) for slot in slots[1:]}
+        return tuple(
+            place_id
+            for place_id, (other, landmarks) in others.items()
+            if other and landmarks and agreement(known, landmarks, onto(expected, other)).inliers >= CONFIRMED
+        )
+
+    def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
+        """Return the overlay of the query on a place by its match, and the place's landmarks (None: unknown)."""
+        match, cells = ranking.compared.get(slot), self._spec.cells
+        if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
+            return None, None
+        dx, dy = match.shift_cells
+        expected = Overlay((dx / cells, dy / cells), match.rotation_deg, match.height_ratio)
+        try:
+            blob = self._map.landmarks_of(int(self._index.place_ids[slot]))
+        except PlaceError as error:
+            self._map.left_out.setdefault(error.place_id, error.problem)
+            raise
+        with suppress(ValueError):
+            return expected, None if blob is None else unpacked(blob)
+        return expected, None
+
+    def _of_query(self) -> Landmarks:
+        """Return the landmarks of the query, computed at the first call."""
+        if self._query is None:
+            self._query = describe(self.picture.image, self.picture.mask, OF_QUERY)
+        return self._query
+
+
 def _complex(landmarks: Landmarks) -> Array:
     """Return the points of landmarks as complex64 (K,), x + iy."""
     return np.ascontiguousarray(landmarks.points, np.float32).view(np.complex64).ravel()
@@ -166,8 +248,7 @@ def _turn_scale(expected: Overlay) -> np.complex64:
 
 
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
-    """Return bool (N, M): which landmark of the place (M) each of the query (N) can be, judged by the expected
-    position, direction and size. `asked` (N,) and `known` (M,) are their points, complex."""
+    """Return bool (N, M): which landmark of the place each of the query can be, by position, direction and size."""
     factor = _factor(expected)
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
@@ -184,9 +265,8 @@ def _factor(expected: Overlay) -> float:
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Return True for each of N ways, complex (N,) each or one number each, that is near to the expected one: bool like
-    `shift`. Without an expectation (None), only the scale is limited."""
-    if expected is None:
+    """Return bool like `shift`: True for each way that is near to the expected one."""
+    if expected is None:  # only the scale is limited
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)
     turned, stretched = np.abs(np.angle(beside, deg=True)), np.abs(np.log(np.abs(beside)))
@@ -195,9 +275,7 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
-    """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one.
-    `asked` and `known` are the points of the matches, complex (n,). The closer a match follows a way, the more it
-    counts."""
+    """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]
@@ -223,10 +301,10 @@ def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
 
 
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the shift along each axis, shares squared, from the inliers `asked` and `known`, complex
-    (n,). The farther they are from the picture's middle, the more a wrong rotation moves the middle."""
+    """Return the variance of the shift along each axis, shares squared, from the inliers, complex (n,) each."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()
     spread = float((np.abs(asked - middle) ** 2).mean())
+    # The farther the inliers are from the picture's middle, the more a wrong rotation moves the middle.
     return float(per_axis * _ALIKE / len(asked) * (1 + abs(middle) ** 2 / max(spread, 1e-9)))

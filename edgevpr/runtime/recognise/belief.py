@@ -1,7 +1,8 @@
 """Belief where the aircraft is, updated from query to query by a Bayes filter over the places of a map (see `follow`).
 
-The aircraft is *lost* (off the map, or on it where no query has recognised it), or near one of at most `MOST`
-hypotheses. Each is a Gaussian position, in the units of the map's `MapScale`. Being lost has a probability of its own.
+Positions are in the plane of the map: metres east and north of a fixed origin or, in a map without positions (an
+*ordinal* one), the number of the place and 0. The aircraft is *lost* (off the map, or on it where no query has
+recognised it), or near one of at most 64 hypotheses: Gaussian positions. Being lost has a probability of its own.
 
 The probabilities of a query alone are divided by the prior they were made with, which gives likelihoods. Without
 history the result is thus that of the query. Three things keep a history from being believed too much:
@@ -14,17 +15,13 @@ history the result is thus that of the query. Three things keep a history from b
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.runtime.recognise import hypotheses
-from edgevpr.runtime.recognise.hypotheses import Hypotheses, MapScale, Proposals, Way, apart, mean_of
 
-MOST = 64  # hypotheses kept
-PRIOR_LOST = 0.5  # the prior with which the probabilities of a query are made
-
+_MOST = 64  # hypotheses kept
 # Chances between two queries to leave the map, to be anywhere on it, and to enter it. The odds for a history are at
 # most 1 to the sum of the first two.
 _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
@@ -37,59 +34,108 @@ _REACH_SD = 1.5  # the reach in standard deviations
 _LEARNS = 0.2  # weight of the newest displacement in the mean velocity
 _SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight is dropped
-_MOSTLY = 0.5  # a larger share is most of it
 _LEAST = 1e-300  # instead of zero, where a number divides
 _OF_LENGTH_SD = 0.15  # standard deviation of a credible displacement by odometry, as a share of its length
 _LONGEST_S = 3600.0  # longest time that counts
+_ROUNDING = 1e-12  # relative error of the difference of two squares
+_THINNEST = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
+_FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
+_LEAST_SD = 0.25  # least standard deviation of a position, in spacings of the map
+_FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
+
+
+@dataclass(frozen=True, slots=True)
+class _Hypotheses:
+    """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
+    `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
+    unknown). `credited` (M,) is the log likelihood ratio already counted for the ground around `anchor` (M, 2)."""
+
+    w: Doubles
+    at: Doubles
+    covariance: Doubles
+    velocity: Doubles
+    heading: Doubles
+    credited: Doubles
+    anchor: Doubles
+
+    def __getitem__(self, index: Ints) -> "_Hypotheses":
+        return _Hypotheses(*(getattr(self, name)[index] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """One way in which each of M hypotheses can have moved: its probability `share` (M,), and the Gaussian of the new
+    position, mean `at` (M, 2) and `covariance` (M, 2, 2). The density is nowhere below `least`."""
+
+    share: Doubles
+    at: Doubles
+    covariance: Doubles
+    least: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapScale:
+    """Distances that count in a map. `spacing` is the distance after which a picture is new evidence: about half a
+    footprint, or 1 in an ordinal map (`is_ordinal`). Hypotheses within `near` of each other count as one position."""
+
+    spacing: float
+    near: float
+    is_ordinal: bool = False
+
+    @property
+    def cell(self) -> float:
+        """Extent of one place: an area, or a length in an ordinal map."""
+        return self.spacing if self.is_ordinal else self.spacing**2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposals:
+    """Positions that one query proposes by itself, K of them. `p` (K,) is the probability of each; the rest up to 1 is
+    that of none. They assume the prior that the aircraft is off the map with probability 1/2, else at any place alike.
+    `at` (K, 2) is the position with its `covariance` (K, 2, 2), and `heading_deg` (K,) the heading (NaN: unknown)."""
+
+    p: Doubles
+    at: Doubles
+    covariance: Doubles
+    heading_deg: Doubles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
     """Motion of the aircraft since the previous query. `reach` is how far it can have moved, in the unit of the map
-    (metres, or places), in `elapsed_s` seconds. `by` (2,) is its displacement by odometry (None: unknown), with the
-    `covariance` (2, 2), in the same unit."""
+    (metres, or places), in `elapsed_s` seconds. `by` (2,) is its displacement by odometry, in the same unit (None:
+    unknown)."""
 
     reach: float
     elapsed_s: float
     by: Doubles | None = None
-    covariance: Doubles = field(default_factory=lambda: np.zeros((2, 2)))
-
-
-@dataclass(frozen=True, slots=True)
-class PlaneEstimate:
-    """Position `at` (2,) in the plane of the map, its `covariance` (2, 2), and the heading (degrees, None: unknown)."""
-
-    at: Doubles
-    covariance: Doubles
-    heading_deg: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
-    and the `estimate` of the position (None: no hypothesis). `mass` is the probability of all hypotheses near it."""
+    and an estimate of the position: `at` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
+    probability of all hypotheses near it; without any, the estimate is NaN."""
 
     lost: float
     p: Doubles
     mass: float
-    estimate: PlaneEstimate | None
+    at: Doubles
+    covariance: Doubles
+    heading_deg: float | None = None
 
 
-def moved(
-    elapsed_s: float | None, usual_s: float, speed_max: float, velocity: tuple[float, float] | None = None
-) -> Moved:
-    """Return the motion in `elapsed_s` seconds; `usual_s` is taken if they are unknown (None) or not above 0, because
-    the clock stood still or was set back. `speed_max` is the highest speed, in units of the map a second, and
-    `velocity` (east, north) that of odometry (None: unknown), which is not used without a time or if it is too high to
-    be true."""
+def moved(elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None) -> Moved:
+    """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
+    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
+    unknown), which is not used without a time or if it is too high to be true."""
     if elapsed_s is None or not elapsed_s > 0:
-        return Moved(reach=speed_max * usual_s, elapsed_s=usual_s)
+        return Moved(reach=speed_max, elapsed_s=1.0)
     elapsed_s = min(elapsed_s, _LONGEST_S)
     reach = speed_max * elapsed_s
     if velocity is None or not math.hypot(*velocity) <= 2 * speed_max:  # NaN, or too fast even if it is twice the truth
         return Moved(reach=reach, elapsed_s=elapsed_s)
-    by = elapsed_s * np.asarray(velocity, float)
-    return Moved(reach=reach, elapsed_s=elapsed_s, by=by, covariance=(_OF_LENGTH_SD**2 * by @ by) * np.eye(2))
+    return Moved(reach=reach, elapsed_s=elapsed_s, by=elapsed_s * np.asarray(velocity, float))
 
 
 class Belief:
@@ -97,18 +143,16 @@ class Belief:
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
-        self._lost, self._enters = 1.0, 1 - PRIOR_LOST
-        self._now, self._strongest = hypotheses.NOWHERE, 0.0
+        self._lost, self._enters = 1.0, 0.5  # as in the prior of the proposals
+        self._strongest = 0.0
+        self._now = _Hypotheses(*(np.zeros((0, *rest)) for rest in ((), (2,), (2, 2), (2,), (2,), (), (2,))))
 
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little), the motion
-        since the previous query, and the number of places in the map now.
-
-        Never raises for invalid numbers: a candidate that is not finite counts as not proposed.
-        """
+        since the previous query, and the number of places in the map now. A candidate that is not finite counts as not
+        proposed."""
         odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
         now, lost, appears = self._left()
-        places = max(1, places)
         ways = self._ways(now, moved, places)
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
@@ -117,27 +161,25 @@ class Belief:
             after = _unseen(now, ways, 1.0)
         else:
             self._enters = _ENTERS
-            numbers, proposed = hypotheses.usable(proposed, self._scale, MOST)
+            numbers, proposed = _usable(proposed, self._scale)
             there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
             unseen = _unseen(now, ways, _MISSED)
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
-            after = hypotheses.joined(replace(there, w=there.w * max(1.0, kept) ** staleness), unseen)
+            there = replace(there, w=there.w * max(1.0, kept) ** staleness)
+            pairs = ((getattr(there, name), getattr(unseen, name)) for name in _Hypotheses.__slots__)
+            after = _Hypotheses(*map(np.concatenate, pairs))
         share = after.w / (lost + float(after.w.sum()))
         p[numbers] = share[: len(numbers)]
-        strongest = np.argsort(-share, kind="stable")[:MOST]
+        strongest = np.argsort(-share, kind="stable")[:_MOST]
         self._now = replace(after, w=share)[strongest[share[strongest] > _FORGOTTEN]]
         self._lost = max(0.0, 1 - float(self._now.w.sum()))
         return self._posterior(p)
 
-    def _left(self) -> tuple[Hypotheses, float, float]:
-        """Apply the chances of leaving, entering and jumping between two queries. Returns
-
-        * the hypotheses, with less weight; the evidence credited to them shrinks as being lost becomes more probable,
-        * the probability of being lost,
-        * the probability of having appeared anywhere on the map.
-        """
+    def _left(self) -> tuple[_Hypotheses, float, float]:
+        """Apply the chances of leaving, entering and jumping between two queries. Returns the hypotheses, with less
+        weight and credit, and the probabilities of being lost and of having appeared anywhere on the map."""
         held = float(self._now.w.sum())
         lost = (1 - self._enters) * self._lost + _LEAVES * held
         stays = 1 - _LEAVES - _JUMPS
@@ -147,7 +189,7 @@ class Belief:
         now = replace(self._now, w=stays * self._now.w, credited=credited)
         return now, lost, self._enters * self._lost + _JUMPS * held
 
-    def _ways(self, now: Hypotheses, moved: Moved, places: int) -> list[Way]:
+    def _ways(self, now: _Hypotheses, moved: Moved, places: int) -> list[_Way]:
         """Return the ways in which each hypothesis can have moved: by odometry, on as before, or anywhere in reach."""
         scale, ways = self._scale, []
         area = places * scale.cell
@@ -159,22 +201,21 @@ class Belief:
         ahead *= (moved.reach / np.maximum(np.hypot(*ahead.T), max(moved.reach, _LEAST)))[:, None]
         left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * scale.spacing)
         if moved.by is not None:
-            spread = moved.covariance + (_ODOMETRY_SD * scale.spacing) ** 2 * np.eye(2)
-            ways.append(Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
+            spread = (_OF_LENGTH_SD**2 * moved.by @ moved.by + (_ODOMETRY_SD * scale.spacing) ** 2) * np.eye(2)
+            ways.append(_Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
             left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, scale.spacing + math.hypot(*moved.by))
         variance = (_GOES_ON_SD * scale.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
         going = now.covariance + variance[:, None, None] * np.eye(2)
-        ways.append(Way(_GOES_ON * is_going * left, now.at + ahead, going))
+        ways.append(_Way(_GOES_ON * is_going * left, now.at + ahead, going))
         anywhere = now.covariance + sd**2 * np.eye(2)
-        ways.append(Way((1 - _GOES_ON * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
+        ways.append(_Way((1 - _GOES_ON * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
         return ways
 
     def _credit(
-        self, proposed: Proposals, now: Hypotheses, ways: list[Way], elapsed_s: float, appears: float, places: int
-    ) -> tuple[Hypotheses, float, float, float]:
-        """Weigh the candidates by the hypotheses that can have moved to them. `appears` is the probability of having
-        appeared anywhere, and `places` the size of the map. Returns
+        self, proposed: Proposals, now: _Hypotheses, ways: list[_Way], elapsed_s: float, appears: float, places: int
+    ) -> tuple[_Hypotheses, float, float, float]:
+        """Weigh the candidates by the hypotheses that can have moved to them. Returns
 
         * one hypothesis for each candidate,
         * the likelihood of the query if lost, relative to that on ground that never resembles the map,
@@ -183,37 +224,37 @@ class Belief:
         """
         scale, at, of_step = self._scale, proposed.at, proposed.covariance
         rest = max(_LEAST_REST, 1 - float(proposed.p.sum()))
-        ratio = np.log(np.maximum(proposed.p, _LEAST) * places * PRIOR_LOST / ((1 - PRIOR_LOST) * rest))
+        ratio = np.log(np.maximum(proposed.p, _LEAST) * places / rest)
         born = appears / places * np.exp(ratio)
 
         # A picture of the same ground repeats the evidence of the one before. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
-        fresh = np.clip((apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
+        fresh = np.clip((_apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
-        led = [way.share[:, None] * evidence * hypotheses.density(way, at, of_step, scale.is_ordinal) for way in ways]
+        led = [way.share[:, None] * evidence * _density(way, at, of_step, scale.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
         by = sum(led) / np.maximum(weight, _LEAST)
         stale = by * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
-        newest = float(ratio[stale.sum(0) > _MOSTLY].max(initial=-math.inf))
+        newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         left = math.exp(min(0.0, newest - before))
         agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * proposed.p.sum()))
         alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
-        at_before, of_before = mean_of(
+        at_before, of_before = _mean_of(
             np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
             np.concatenate([way.at for way in ways]),
             np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = hypotheses.fused(at, of_step, at_before, of_before)
+        at_both, of_both = _fused(at, of_step, at_before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
         is_led, heading = (weight > born)[:, None], np.radians(proposed.heading_deg)
-        there = Hypotheses(
+        there = _Hypotheses(
             w=math.exp(-staleness * same) * (weight + born),
             at=np.where(is_led, at_both, at),
             covariance=np.where(is_led[..., None], of_both, of_step),
@@ -228,18 +269,18 @@ class Belief:
         """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
         now = self._now
         if not len(now.w):
-            return Posterior(self._lost, p, 0.0, None)
-        is_near = apart(now.at, now.at) <= self._scale.near
+            return Posterior(self._lost, p, 0.0, np.full(2, np.nan), np.full((2, 2), np.nan))
+        is_near = _apart(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
-        (at,), (covariance,) = mean_of(share[None], now.at[there], now.covariance[there])
+        (at,), (covariance,) = _mean_of(share[None], now.at[there], now.covariance[there])
         north, east = (share @ now.heading[there]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
-        return Posterior(self._lost, p, mass, PlaneEstimate(at, covariance, heading_deg))
+        return Posterior(self._lost, p, mass, at, covariance, heading_deg)
 
 
-def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
+def _unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
     """Return the hypotheses after their motion, if the query sees none of them, which has the probability `chance`."""
     share = np.stack([way.share for way in ways], 1)[..., None]
     at = np.stack([way.at for way in ways], 1)
@@ -248,3 +289,62 @@ def _unseen(now: Hypotheses, ways: list[Way], chance: float) -> Hypotheses:
     off = at - mean[:, None]
     spread = (share[..., None] * (covariance + off[..., :, None] * off[..., None, :])).sum(1)
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
+
+
+def _apart(one: Doubles, other: Doubles) -> Doubles:
+    """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
+    return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
+
+
+def _density(way: _Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
+    """Return the density (M, K), by a way of M hypotheses, of positions `at` (K, 2) with `covariance` (K, 2, 2)."""
+    xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
+    if is_ordinal:
+        xy, yy, dy = np.zeros(()), np.full((), _FLAT), np.zeros(())
+    determinant = np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy)
+    squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
+    gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
+    return np.maximum(gaussian, way.least)
+
+
+def _firm(covariance: Doubles, least: float) -> Doubles:
+    """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
+    more: Doubles = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    return covariance + more[:, None, None] * np.eye(2)
+
+
+def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
+    """Combine two estimates of K positions (K, 2), with covariances (K, 2, 2), by covariance intersection (Julier and
+    Uhlmann 1997), because errors of the map are common to both."""
+    traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
+    share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
+    by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)
+    covariance = np.linalg.inv(by_one + by_other)
+    at = covariance @ (by_one @ one[..., None] + by_other @ other[..., None])
+    return at[..., 0], covariance
+
+
+def _mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
+    `covariance` (M, 2, 2), weighted by `share` (K, M)."""
+    middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
+    off = at - middle
+    second = covariance + off[:, :, None] * off[:, None]
+    mean = share @ off
+    spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
+    return middle + mean, _firm(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
+
+
+def _usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
+    """Keep the likeliest finite proposals, invertible and with a sum of 1 at most; their indices come first."""
+    is_near = (np.abs(proposed.at) < _FARTHEST).all(1) & (np.abs(proposed.covariance) < _FARTHEST**2).all((1, 2))
+    numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & is_near)
+    numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:_MOST]]
+    p = proposed.p[numbers]
+    return numbers, Proposals(
+        p=p / max(1.0, float(p.sum())),
+        at=proposed.at[numbers],
+        covariance=_firm(proposed.covariance[numbers], (_LEAST_SD * scale.spacing) ** 2),
+        heading_deg=proposed.heading_deg[numbers],
+    )

@@ -234,9 +234,8 @@ def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:
 
 
 def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
-    """Return the weighted mean of each place's share with those of the place before and after it in the index. A place
-    that was not compared counts with the least share of all."""
-    least = min(share.values())
+    """Return the weighted mean of each place's share with those of the places before and after it in the index."""
+    least = min(share.values())  # stands for a place that was not compared
     return {
         slot: (own + _BESIDE * (share.get(slot - 1, least) + share.get(slot + 1, least))) / (1 + 2 * _BESIDE)
         for slot, own in share.items()

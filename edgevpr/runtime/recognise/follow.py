@@ -16,10 +16,9 @@ from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.belief import Belief, Moved, PlaneEstimate, moved
+from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Posterior, Proposals, moved
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import votes_of
-from edgevpr.runtime.recognise.hypotheses import MapScale, Proposals
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of
 
@@ -53,9 +52,8 @@ class Followed:
 
 
 class _Survey:
-    """Distances and origin of a map, measured when it has this number of `places`: its `scale`, the `origin` of
-    positions in its plane (None: the map has no positions; numbers of places are used), and `spread`, the standard
-    deviation of the position of a place without a pose."""
+    """Distances and `origin` of a map (None: it has no positions) when it has this number of `places`; `spread` is the
+    standard deviation of the position of a place without a pose."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
@@ -133,11 +131,10 @@ class Follower:
             slot, at = int(slots[best]), proposed.at[best]
             is_near = np.hypot(*(proposed.at - at).T) <= near
             confidence = float(posterior.p[is_near].sum())
-            off = np.hypot(*(posterior.estimate.at - at)) if posterior.estimate else np.inf
-            if confidence > _HALF and off <= near:
+            if confidence > _HALF and np.hypot(*(posterior.at - at)) <= near:
                 confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this look
             confidence = self._not_by_repetition(at, confidence, float(proposed.p[is_near].sum()))
-        estimate = _on_earth(posterior.estimate, survey.origin)
+        estimate = _on_earth(posterior, survey.origin)
         return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)
 
     def saw_nothing(self, index: PlaceIndex) -> None:
@@ -154,12 +151,11 @@ class Follower:
 
     def _moved(self, survey: _Survey) -> Moved:
         if survey.scale.is_ordinal or self._elapsed_s is None:
-            return moved(None, 1.0, _PLACES_A_QUERY * survey.scale.spacing)
-        return moved(self._elapsed_s, 1.0, self._fastest_m_s, self._velocity_m_s)
+            return moved(None, _PLACES_A_QUERY * survey.scale.spacing)
+        return moved(self._elapsed_s, self._fastest_m_s, self._velocity_m_s)
 
     def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Limit a confidence while the pictures show the same ground: it is at most that of the first picture there, or
-        that of this look alone (`by_itself`), whichever is higher."""
+        """Limit a confidence over the same ground to that of the first picture there or that of this look alone."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence
@@ -168,22 +164,18 @@ class Follower:
         return min(confidence, max(arrived[1], by_itself))
 
 
-def _on_earth(estimate: PlaneEstimate | None, origin: Position | None) -> Located | None:
-    if estimate is None or origin is None:
+def _on_earth(posterior: Posterior, origin: Position | None) -> Located | None:
+    if origin is None or not posterior.mass:
         return None
-    lat_deg, lon_deg = moved_by(origin.lat_deg, origin.lon_deg, *estimate.at.tolist())
-    (var_east, cov), (_, var_north) = estimate.covariance.tolist()
-    return Located(Position(lat_deg, lon_deg), (var_east, cov, var_north), estimate.heading_deg)
+    lat_deg, lon_deg = moved_by(origin.lat_deg, origin.lon_deg, *posterior.at.tolist())
+    (var_east, cov), (_, var_north) = posterior.covariance.tolist()
+    return Located(Position(lat_deg, lon_deg), (var_east, cov, var_north), posterior.heading_deg)
 
 
 def _proposals(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Turn a ranking into proposals. Returns
-
-    * the slots of the places proposed, int (K,),
-    * the proposals, in the same order.
-    """
+    """Turn a ranking into proposals; the slots of their places, int (K,), come first."""
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
     covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))

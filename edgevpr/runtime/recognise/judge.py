@@ -187,8 +187,7 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
 
 
 def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | None:
-    """Return the reason if a match fails the limits of `rule`, else None. `ahead` is the lead of its `score` over the
-    best place elsewhere (None: there is none)."""
+    """Return the reason if a match with this score and lead (None: no place elsewhere) fails the limits, else None."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
         return f"score {score:.3f} is below {least:.3f}"
@@ -234,9 +233,8 @@ def _disproves(proof: Agreement, score: float) -> str | None:
 
 
 def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:
-    """Return the reason if what agrees may be a display drawn over every frame, else None. Only a camera that looks
-    down can tell: ahead, places along the way agree without a shift."""
-    best = int(ranking.slots[0])
+    """Return the reason if what agrees may be a display drawn over every frame, else None."""
+    best = int(ranking.slots[0])  # only a camera that looks down gives a shift: ahead, this cannot be told
     if not _is_at_rest(ranking.compared.get(best)):
         return None
     others = ranking.slots[elsewhere(index, best, ranking.slots, rule.neighbour_m)]

@@ -80,8 +80,7 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
 
 
 def _spread(at_px: Singles, most: int) -> Ints:
-    """Choose at most `most` points, float32 (K, 2) in pixels, best first: the best of every cell, then the second best,
-    and so on. Returns their indices, int (n,)."""
+    """Choose at most `most` points (K, 2), best first: the best of every cell, then the second best, and so on."""
     # Keep only the best of the points of one corner.
     _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)

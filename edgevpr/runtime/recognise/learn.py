@@ -38,6 +38,10 @@ _SURE = 0.9  # least probability of being lost, or of being where the flight so 
 _CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the position of a place may err by more than its covariance says
 
 
+class _LeftOut(Exception):
+    """Why a frame becomes no place."""
+
+
 class Learner:
     """Adds places to an open map, then to the index in RAM: every place in the index is already safe on disk.
 
@@ -82,11 +86,8 @@ class Learner:
             return None
         place = None
         try:
-            here, objection = self._placed(frame, event.vehicle)
-            here = laid(here, event.view)
-            if objection or here.position is None or (objection := self._objection(here.position, seen, event)):
-                self.passed_over[objection or "without a position"] += 1
-                return None
+            here = laid(self._placed(frame, event.vehicle), event.view)
+            self._require_worth(here.position, seen, event)
             here = self._tied(here, event)
             self._map.require_unchanged()  # a place written to a deleted file would be lost
             worth = event.worth
@@ -104,18 +105,45 @@ class Learner:
                 pose=here.pose,
             )
             self._growing.add(place_id, here.position, seen.coarse, here.heading_deg)
+        except _LeftOut as reason:
+            self.passed_over[str(reason)] += 1
         except MapBusyError:
             if place is None:
                 self.passed_over["while another program was writing"] += 1
         except MapError as error:
             self.trouble = str(error)
         if place:
-            self._recogniser.extend(self._growing.index, place.place_id, here.t_mono_s)
+            self._recogniser.extend(self._growing.index, place.place_id, frame.t_mono_s)
         return place
 
+    def _placed(self, frame: Frame, vehicle: Vehicle | None) -> Frame:
+        """Return the frame, with the position at which to learn it. Raises _LeftOut if it is not to be trusted."""
+        if frame.position:  # it comes from the recording, so it does not repeat our fixes
+            return frame
+        if vehicle is None or not vehicle.is_fresh_at(frame.t_mono_s):
+            raise _LeftOut("without a fresh position")
+        if not vehicle.has_gps:  # without GPS the reported position is only an estimate
+            raise _LeftOut("without GPS")
+        if frame.t_mono_s - vehicle.t_fix_s < _ECHO_S:
+            raise _LeftOut("just after a fix")
+        position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
+        return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock())
+
+    def _require_worth(self, position: Position | None, seen: Descriptor, event: Recognition) -> None:
+        """Raise _LeftOut if there is a reason against learning a place at this position."""
+        if position is None:
+            raise _LeftOut("without a position")
+        if event.says_nothing or not seen.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
+            raise _LeftOut("of low quality")
+        # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
+        if nearest_m(self._map, position, self._spacing_m) is not None:
+            raise _LeftOut("near a place")
+        _require_no_contradiction(event.followed, position)
+        if event.worth and event.worth.reason and nearest_m(self._map, position, self._gap_m) is not None:
+            raise _LeftOut("not memorable")
+
     def _tied(self, frame: Frame, event: Recognition) -> Frame:
-        """Correct the position of a frame by the places around it, if they agree with its recorded position. They only
-        count in part, so that errors do not grow from place to place. Returns the frame, with a pose if corrected."""
+        """Correct the position of a frame by the places around it, if they agree with its recorded position."""
         recogniser = self._recogniser
         if frame.pose or frame.position is None or event.ranking is None or recogniser.technique.spec.cells is None:
             return frame
@@ -129,48 +157,17 @@ class Learner:
         learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
         return replace(frame, position=learnt[0], pose=learnt[1]) if learnt else frame
 
-    def _placed(self, frame: Frame, vehicle: Vehicle | None) -> tuple[Frame, str | None]:
-        """Return
 
-        * the frame, with the position at which to learn it,
-        * the reason against learning it there (None: no reason).
-        """
-        if frame.position:  # it comes from the recording, so it does not repeat our fixes
-            return frame, None
-        if vehicle is None or not vehicle.is_fresh_at(frame.t_mono_s):
-            return frame, "without a fresh position"
-        if not vehicle.has_gps:  # without GPS the reported position is only an estimate
-            return frame, "without GPS"
-        if frame.t_mono_s - vehicle.t_fix_s < _ECHO_S:
-            return frame, "just after a fix"
-        position = Position(vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m)
-        return replace(frame, position=position, heading_deg=vehicle.heading_deg, t_utc_s=self._utc_clock()), None
-
-    def _objection(self, position: Position, seen: Descriptor, event: Recognition) -> str | None:
-        """Return the reason against learning a place at a position, None if there is none."""
-        if event.says_nothing or not seen.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
-            return "of low quality"
-        # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
-        if nearest_m(self._map, position, self._spacing_m) is not None:
-            return "near a place"
-        if objection := _unsure(event.followed, position):
-            return objection
-        if event.worth and event.worth.reason and nearest_m(self._map, position, self._gap_m) is not None:
-            return "not memorable"
-        return None
-
-
-def _unsure(followed: Followed | None, position: Position) -> str | None:
-    """Return the reason against learning a place if the flight so far contradicts its position or is unsure, else None.
-    By the flight, the aircraft must very probably be off the map, or at this position."""
+def _require_no_contradiction(followed: Followed | None, position: Position) -> None:
+    """Raise _LeftOut unless the flight so far says that the aircraft is very probably off the map, or at this place."""
     if followed is None or followed.estimate is None or followed.lost >= _SURE:
-        return None
+        return
     if followed.mass < _SURE:
-        return "while not sure where it is"
+        raise _LeftOut("while not sure where it is")
     here, there = position, followed.estimate.position
     away_m = float(distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg))
-    sd_m = math.hypot(followed.estimate.sd_m, GPS_SD_M)
-    return "where the flight so far contradicts it" if away_m > _CONTRADICTS_SD * sd_m + _ROOM_M else None
+    if away_m > _CONTRADICTS_SD * math.hypot(followed.estimate.sd_m, GPS_SD_M) + _ROOM_M:
+        raise _LeftOut("where the flight so far contradicts it")
 
 
 def check_positions(config: Config, positions: Path | None) -> None:

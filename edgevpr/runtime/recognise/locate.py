@@ -8,7 +8,6 @@ the same position, and their mean is more exact. Without a pose, as ahead, the p
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import numpy as np
 
@@ -61,9 +60,8 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lies:
-    """Estimate of how the query lies on a place at `position` with a `pose`. `step` (2,) is the shift of the query's
-    middle, to the right and down, as a share of the place's longest side, with its `covariance` (2, 2). `rotation_deg`
-    and `height_ratio` are as in `FineMatch`."""
+    """How the query lies on a place: `step` (2,) from the place's middle, right and down, as a share of its longest
+    side, with its `covariance` (2, 2); the others as in `FineMatch`."""
 
     place_id: int
     position: Position
@@ -76,17 +74,19 @@ class _Lies:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """Position of the aircraft by one place: `at_m` (2,) east and north of the best place, metres. Its covariances (2,
-    2) are `of_step`, from the shift, and `of_pose`, from the pose."""
+    """Position of the aircraft by one place: `at_m` (2,) east and north of the best place, metres, with its covariances
+    (2, 2) `of_step` and `of_pose`."""
 
+    lies: _Lies
     at_m: Doubles
     of_step: Doubles
     of_pose: Doubles
 
-    def apart(self, other: "_Said") -> float:
-        """Return how far apart the positions by two places are, in standard deviations. Relative to each other, poses
-        are known far better than on the Earth, so only half of the variance of each counts."""
-        return in_sd(self.at_m - other.at_m, self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2)
+    def agrees_with(self, other: "_Said") -> bool:
+        """Return True if both positions are about the same. Relative to each other, poses are known far better than on
+        the Earth, so only half of the variance of each counts."""
+        covariance = self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2
+        return in_sd(self.at_m - other.at_m, covariance) <= _DISAGREES
 
 
 def at_place(position: Position, accuracy_m: float) -> Located:
@@ -113,28 +113,30 @@ def located(
     heard = [best, *(lies for lies in others if lies and _shows_the_same(lies, best))]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
         heard.insert(0, _by_landmarks(best, proof))
-    said = [_said(lies, best.position, view.aside or (0.0, 0.0)) for lies in heard]
-    first = said[0]
-    agree = [True, *(first.apart(each) <= _DISAGREES for each in said[1:])]
-    against_m = [float(np.hypot(*(each.at_m - first.at_m))) for each, ok in zip(said, agree, strict=True) if not ok]
-    heard, said = list(compress(heard, agree)), list(compress(said, agree))
-    at_m, covariance = _joined(said[:_SAYING])
-    way = heard[0]
+    first, *more = (_said(lies, best.position, view.aside or (0.0, 0.0)) for lies in heard)
+    agreeing, against_m = [first], 0.0
+    for said in more:
+        if first.agrees_with(said):
+            agreeing.append(said)
+        else:
+            against_m = max(against_m, float(np.hypot(*(said.at_m - first.at_m))))
+    at_m, covariance = _joined(agreeing[:_SAYING])
+    way, footprint_m = first.lies, best.pose.footprint_m
     if view.lean_m is not None:
         at_m = at_m + view.lean_m
     elif view.aside is None:
-        covariance += (UNTOLD_TILT * best.pose.footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
+        covariance += (UNTOLD_TILT * footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection = None
-    if max(against_m, default=0.0) > _CONTRADICTS * best.pose.footprint_m:
-        objection = f"places of the same ground say positions that are {max(against_m):.0f} m apart"
+    if against_m > _CONTRADICTS * footprint_m:
+        objection = f"places of the same ground say positions that are {against_m:.0f} m apart"
     lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
         position=Position(lat_deg, lon_deg, best.position.alt_m),
         covariance_m2=_triple(covariance),
         heading_deg=(best.pose.up_deg + way.rotation_deg) % 360,
         height_ratio=way.height_ratio and way.height_ratio * view.zoom,
-        footprint_m=best.pose.footprint_m * (way.height_ratio or 1.0),
-        places=tuple(dict.fromkeys(lies.place_id for lies in heard)),
+        footprint_m=footprint_m * (way.height_ratio or 1.0),
+        places=tuple(dict.fromkeys(said.lies.place_id for said in agreeing)),
         objection=objection,
     )
 
@@ -170,11 +172,7 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Combine positions by several places. Returns
-
-    * the position, east and north (2,) of the best place, metres,
-    * its covariance (2, 2).
-    """
+    """Combine positions by several places: east and north (2,) of the best place, metres, and the covariance (2, 2)."""
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:
@@ -220,8 +218,7 @@ def _shows_the_same(lies: _Lies, best: _Lies) -> bool:
 
 
 def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
-    """Compute the position of the aircraft by one place, relative to `origin`. `aside` (right, up) is the point below
-    it in the query's picture, as shares of the longest side from the middle."""
+    """Compute the position of the aircraft by one place; `aside` is as in `View`."""
     pose = lies.pose
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
@@ -236,11 +233,8 @@ def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
     of_pose = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
     of_pose += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
     upwards = lies.covariance * [[1, -1], [-1, 1]]  # y up instead of down
-    return _Said(
-        at_m=_off_m(origin, lies.position) + off_m,
-        of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose,
-        of_pose=matrix_of(pose.covariance_m2),
-    )
+    of_step = pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose
+    return _Said(lies, _off_m(origin, lies.position) + off_m, of_step, matrix_of(pose.covariance_m2))
 
 
 def _off_m(origin: Position, position: Position) -> Doubles:

@@ -19,13 +19,12 @@ from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.detector import Detector
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
-from edgevpr.runtime.recognise.memorability import Memorability
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
 from edgevpr.techniques.card import load_card

@@ -20,6 +20,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.agreement import Verification, landmarks_of
 from edgevpr.runtime.recognise.evidence import evidence_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, expected_of, other_heights
@@ -36,7 +37,6 @@ from edgevpr.runtime.recognise.levelling import Levelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
-from edgevpr.runtime.recognise.verify import Verification, landmarks_of
 
 _log = logging.getLogger(__name__)
 _Judged = tuple[Verdict, Candidate, Located | None]  # with the best place, and the position of the aircraft

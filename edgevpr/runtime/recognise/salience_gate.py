@@ -16,8 +16,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image, Mask, Singles
 from edgevpr.core.types import Salience
-from edgevpr.runtime.recognise.detector import Detector
-from edgevpr.runtime.recognise.memorability import Memorability, as_map
+from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
 
 MOST_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different

@@ -9,7 +9,7 @@ import pytest
 
 from edgevpr.core.config import load_config
 from edgevpr.core.files import shipped
-from edgevpr.runtime.recognise.memorability import Memorability
+from edgevpr.runtime.recognise.gate_networks import Memorability
 from edgevpr.techniques.card import load_card
 from edgevpr.techniques.session import open_backbone
 from edgevpr.techniques.words import load_words

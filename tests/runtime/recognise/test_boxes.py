@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.detector import fastestdet, nanodet, yolox
+from edgevpr.runtime.recognise.gate_networks import fastestdet, nanodet, yolox
 
 RNG = np.random.default_rng(3)
 

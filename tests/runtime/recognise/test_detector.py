@@ -8,7 +8,7 @@ pytest.importorskip("onnx", reason="the test networks are written with onnx (pip
 from tiny_detectors import CELLS, write_detector
 
 from edgevpr.core.errors import ModelError
-from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.gate_networks import Detector
 from edgevpr.techniques.card import load_card
 
 PICTURE = np.full((128, 256), 90, np.uint8)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgevpr.frames.images import read_image
-from edgevpr.runtime.recognise.detector import Detector
+from edgevpr.runtime.recognise.gate_networks import Detector
 from edgevpr.techniques.card import load_card
 
 DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")

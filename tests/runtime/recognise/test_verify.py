@@ -23,11 +23,11 @@ from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.agreement import Verification
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
-from edgevpr.runtime.recognise.verify import Verification
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
