@@ -15,7 +15,7 @@ history the result is thus that of the query. Three things keep a history from b
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ _LEAST_SD = 0.25  # least standard deviation of a position, in spacings of the m
 _FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Hypotheses:
     """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
     `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
@@ -59,7 +59,7 @@ class _Hypotheses:
     anchor: Doubles
 
     def __getitem__(self, index: Ints) -> "_Hypotheses":
-        return _Hypotheses(*(getattr(self, name)[index] for name in self.__slots__))
+        return _Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class Moved:
     by: Doubles | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
     and an estimate of the position: `at` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
@@ -119,9 +119,9 @@ class Posterior:
 
     lost: float
     p: Doubles
-    mass: float
-    at: Doubles
-    covariance: Doubles
+    mass: float = 0.0
+    at: Doubles = field(default_factory=lambda: np.full(2, np.nan))
+    covariance: Doubles = field(default_factory=lambda: np.full((2, 2), np.nan))
     heading_deg: float | None = None
 
 
@@ -143,9 +143,10 @@ class Belief:
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
-        self._lost, self._enters = 1.0, 0.5  # as in the prior of the proposals
-        self._strongest = 0.0
-        self._now = _Hypotheses(*(np.zeros((0, *rest)) for rest in ((), (2,), (2, 2), (2,), (2,), (), (2,))))
+        self._strongest, self._lost, self._enters = 0.0, 1.0, 0.5  # as in the prior of the proposals
+        shapes = {"w": 0, "at": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
+        shapes |= {"credited": 0, "anchor": (0, 2)}
+        self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little), the motion
@@ -168,8 +169,8 @@ class Belief:
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
             there = replace(there, w=there.w * max(1.0, kept) ** staleness)
-            pairs = ((getattr(there, name), getattr(unseen, name)) for name in _Hypotheses.__slots__)
-            after = _Hypotheses(*map(np.concatenate, pairs))
+            both = {name: (getattr(there, name), getattr(unseen, name)) for name in _Hypotheses.__slots__}
+            after = _Hypotheses(**{name: np.concatenate(pair) for name, pair in both.items()})
         share = after.w / (lost + float(after.w.sum()))
         p[numbers] = share[: len(numbers)]
         strongest = np.argsort(-share, kind="stable")[:_MOST]
@@ -269,7 +270,7 @@ class Belief:
         """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
         now = self._now
         if not len(now.w):
-            return Posterior(self._lost, p, 0.0, np.full(2, np.nan), np.full((2, 2), np.nan))
+            return Posterior(lost=self._lost, p=p)
         is_near = _apart(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
@@ -277,7 +278,7 @@ class Belief:
         (at,), (covariance,) = _mean_of(share[None], now.at[there], now.covariance[there])
         north, east = (share @ now.heading[there]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
-        return Posterior(self._lost, p, mass, at, covariance, heading_deg)
+        return Posterior(lost=self._lost, p=p, mass=mass, at=at, covariance=covariance, heading_deg=heading_deg)
 
 
 def _unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
@@ -315,8 +316,7 @@ def _firm(covariance: Doubles, least: float) -> Doubles:
 
 
 def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
-    """Combine two estimates of K positions (K, 2), with covariances (K, 2, 2), by covariance intersection (Julier and
-    Uhlmann 1997), because errors of the map are common to both."""
+    """Combine K positions and K others by covariance intersection (Julier and Uhlmann 1997): errors are common."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
     by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)

@@ -20,7 +20,7 @@ from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Posterior,
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import votes_of
 from edgevpr.runtime.recognise.judge import Sureness
-from edgevpr.runtime.recognise.locate import Located, matrix_of
+from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
@@ -168,8 +168,8 @@ def _on_earth(posterior: Posterior, origin: Position | None) -> Located | None:
     if origin is None or not posterior.mass:
         return None
     lat_deg, lon_deg = moved_by(origin.lat_deg, origin.lon_deg, *posterior.at.tolist())
-    (var_east, cov), (_, var_north) = posterior.covariance.tolist()
-    return Located(Position(lat_deg, lon_deg), (var_east, cov, var_north), posterior.heading_deg)
+    at, covariance_m2 = Position(lat_deg, lon_deg), triple(posterior.covariance)
+    return Located(position=at, covariance_m2=covariance_m2, heading_deg=posterior.heading_deg)
 
 
 def _proposals(

@@ -1,5 +1,5 @@
-"""What the gate sees of a frame by networks with a card: how well its parts can be remembered, and which of its pixels
-show nothing movable.
+"""Networks of the gate, each with a card: one tells how well the parts of a frame can be remembered, the other which of
+its pixels show nothing movable.
 
 Memorability (thesis 3.2.1): the picture is cut into 5x5 crops that do not overlap. For each crop the network gives its
 memorability, 0..1. Between the middles of the crops values are interpolated. `benchmarks/matchability.py` fits a

@@ -39,7 +39,7 @@ _CONTRADICTS_SD, _ROOM_M = 4.0, 20.0  # the position of a place may err by more 
 
 
 class _LeftOut(Exception):
-    """Why a frame becomes no place."""
+    """Reason why a frame becomes no place."""
 
 
 class Learner:

@@ -30,7 +30,7 @@ HEARD = 12  # places looked at; in a dense map so many show the same ground
 _SAYING = 5  # of these determine the position
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
@@ -60,8 +60,8 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lies:
-    """How the query lies on a place: `step` (2,) from the place's middle, right and down, as a share of its longest
-    side, with its `covariance` (2, 2); the others as in `FineMatch`."""
+    """Estimate of how the query lies on a place: `step` (2,) from the place's middle, right and down, as a share of its
+    longest side, with its `covariance` (2, 2); the others as in `FineMatch`."""
 
     place_id: int
     position: Position
@@ -132,7 +132,7 @@ def located(
     lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
         position=Position(lat_deg, lon_deg, best.position.alt_m),
-        covariance_m2=_triple(covariance),
+        covariance_m2=triple(covariance),
         heading_deg=(best.pose.up_deg + way.rotation_deg) % 360,
         height_ratio=way.height_ratio and way.height_ratio * view.zoom,
         footprint_m=footprint_m * (way.height_ratio or 1.0),
@@ -164,7 +164,7 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
     pose = Pose(
         up_deg=where.heading_deg,
         footprint_m=where.footprint_m,
-        covariance_m2=_triple(covariance),
+        covariance_m2=triple(covariance),
         recorded=Position(recorded.lat_deg, recorded.lon_deg),
     )
     lat_deg, lon_deg = moved(recorded.lat_deg, recorded.lon_deg, *(gain @ off_m).tolist())
@@ -242,5 +242,6 @@ def _off_m(origin: Position, position: Position) -> Doubles:
     return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 
-def _triple(covariance: Doubles) -> Covariance:
+def triple(covariance: Doubles) -> Covariance:
+    """Return a covariance matrix (2, 2) as its three numbers."""
     return float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])

@@ -19,7 +19,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
-from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -160,7 +160,7 @@ def test_after_a_fix_of_ours_the_autopilot_may_only_repeat_it(bench):
 
 def by_flight(lost, mass, north_m=0.0, sd_m=3.0, has_estimate=True):
     """What a flight knows that is likeliest so far to the north."""
-    there = Located(Position(50 + north_m * METRE_DEG, 8.0), (sd_m**2, 0.0, sd_m**2), None)
+    there = at_place(Position(50 + north_m * METRE_DEG, 8.0), sd_m)
     return Followed(slot=0, confidence=mass, lost=lost, mass=mass, estimate=there if has_estimate else None)
 
 
