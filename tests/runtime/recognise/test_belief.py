@@ -213,13 +213,6 @@ def test_a_clock_that_goes_back_or_jumps_does_not_mislead(elapsed_s):
     assert is_at(posteriors[-1], 40)
 
 
-def test_a_map_of_one_place():
-    belief = Belief(IN_ORDER)
-    assert belief.update(seen([0], [0.9]), STEP, 1).mass == pytest.approx(0.9)
-    assert [belief.update(seen([0], [0.01]), STEP, 1).mass for _ in range(3)][-1] < 0.1
-    assert all(belief.update(seen([0], [0.9]), STEP, 1).mass < 0.95 for _ in range(50))
-
-
 def test_where_all_places_look_the_same_none_is_believed():
     belief = Belief(IN_ORDER)
     for _ in range(60):
@@ -250,3 +243,22 @@ def test_any_numbers_at_all_pass(ground, places):
         posterior = belief.update(query, moved(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
         assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
         assert not posterior.mass or np.linalg.eigvalsh(posterior.covariance)[0] > 0
+
+
+def test_odometry_says_how_far_even_at_twice_the_highest_speed():
+    motion = moved(2.0, 30.0, (3.0, -4.0))
+    np.testing.assert_allclose(motion.by, [6, -8])
+    assert (motion.reach, motion.elapsed_s) == (60, 2)
+    assert moved(1.0, 30.0, (60.0, 0.0)).by is not None
+
+
+@pytest.mark.parametrize("elapsed_s", [None, -1.0, 0.0, float("nan"), -float("inf")])
+def test_a_time_that_makes_no_sense_is_the_usual_one_and_says_nothing_of_the_way(elapsed_s):
+    motion = moved(elapsed_s, 30.0, (3.0, 4.0))
+    assert (motion.by, motion.reach, motion.elapsed_s) == (None, 30, 1.0)
+
+
+@pytest.mark.parametrize("velocity", [None, (np.nan, 1.0), (np.inf, 0.0), (61.0, 0.0)])
+def test_a_velocity_that_cannot_be_is_none(velocity):
+    motion = moved(2.0, 30.0, velocity)
+    assert (motion.by, motion.reach) == (None, 60)

@@ -7,9 +7,6 @@ import pytest
 
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.mapmaking.mapping import Gaps
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Worth
 
@@ -19,16 +16,11 @@ NORTH_M = 1 / 111_195  # degrees
 
 
 def event(number, short_by=0.0, north_m=None):
-    meter = QueryMeter(load_board("this"), Pack(4, 5200), 0.85)
-    meter.begin()
     position = None if north_m is None else Position(50 + north_m * NORTH_M, 8.0)
     lacks = "entropy" if short_by else None
     return Recognition(
         frame=Frame(image=np.zeros((8, 8), np.uint8), name=str(number), t_mono_s=float(number), position=position),
         worth=Worth(Salience(None, None, 0.4 - short_by), short_by, lacks, lacks and "not memorable"),
-        reason="",
-        steps=meter.steps(),
-        cost=meter.cost(),
     )
 
 

@@ -10,7 +10,6 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, judge
@@ -19,12 +18,12 @@ from edgevpr.techniques import create
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 
 
-def judged(scores=(0.2, 0.1), rule=RULE, evidence=None):
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
-    slots = np.array([0, 9])[: len(scores)]
-    matches = {int(slot): FineMatch(score) for slot, score in zip(slots, scores, strict=True)}
-    ranking = Ranking(slots, np.array(scores, np.float32), matches)
-    return judge(Findings(ranking, evidence=evidence), index, rule)
+def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
+    """The verdict on a best place and places elsewhere with these scores; `more` is known of the best."""
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
+    slots = np.array([0, 10, 20])[: len(scores)]
+    compared = dict(zip(slots.tolist(), matches or map(FineMatch, scores), strict=True))
+    return judge(Findings(Ranking(slots, np.array(scores, np.float32), compared), **more), index, rule)
 
 
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():
@@ -38,10 +37,13 @@ CLEAR = {"agree": -1.6, "lead": 0.7, "coverage": -0.5}
 
 @pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
 def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted):
-    verdict = judged(rule=sure_rule(lambda evidence: confidence), evidence=CLEAR)
+    rule = sure_rule(lambda evidence: confidence)
+    verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
     assert verdict.reason.startswith(f"confidence {confidence:.4f}, 0.9000 needed: 2.01 times as many regions agree")
-    assert judged((0.2,), sure_rule(lambda evidence: confidence), CLEAR).accepted is accepted, "no place elsewhere"
+    assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
+        "no place elsewhere"
+    )
 
 
 def test_a_match_that_offers_no_evidence_is_never_sure():
@@ -56,7 +58,7 @@ def test_limits_come_on_top_of_a_confidence(limit):
 
 @pytest.mark.parametrize("score", [math.nan, 0.019])
 def test_a_score_that_says_nothing_makes_up_for_no_confidence(score):
-    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, worth_a_look=0.02), CLEAR).accepted
+    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, worth_a_look=0.02), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("kind", [DOWN, DOWN_BARE])
@@ -77,15 +79,9 @@ def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
 
 
 def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
-    """The verdict on a best place and two places elsewhere: the score, step and rotation of each."""
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
-    slots = np.array([0, 10, 20])[: 1 + len(others)]
-    matches = {
-        int(slot): FineMatch(score, shift_cells=step, rotation_deg=turn, coverage=0.5)
-        for slot, (score, step, turn) in zip(slots, (best, *others), strict=True)
-    }
-    ranking = Ranking(slots, np.array([match.score for match in matches.values()], np.float32), matches)
-    return judge(Findings(ranking), index, RULE)
+    """The verdict on a best place and places elsewhere: the score, step and rotation of each."""
+    matches = [FineMatch(score, shift_cells=step, rotation_deg=turn) for score, step, turn in (best, *others)]
+    return judged([match.score for match in matches], matches=matches)
 
 
 @pytest.mark.parametrize("step", [(0.0, 0.0), (-1.4, 1.4)])
@@ -111,19 +107,6 @@ def test_a_picture_that_has_moved_is_no_display():
     assert behind(still, best=(0.3, (0.0, 0.0), None)).accepted, "looking ahead"
 
 
-def test_in_a_sequence_the_newest_query_need_not_be_sure_by_itself():
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
-    search, verdicts = SequenceSearch(2), []
-    for query in range(2):
-        scores = np.full(10, 0.02, np.float32)
-        scores[4 + query] = 0.3
-        slots = np.argsort(-scores, kind="stable")
-        matches = {int(slot): FineMatch(float(scores[slot]), coverage=0.01) for slot in slots}
-        ranking = search.follow(Ranking(slots, scores[slots], matches), index, float(query))
-        verdicts.append(judge(Findings(ranking), index, RULE, search))
-    assert verdicts[-1].accepted, verdicts[-1].reason
-
-
 def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
     """An agreement of so many landmarks."""
     return Agreement(
@@ -138,22 +121,15 @@ def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
     )
 
 
-def held(score, ahead, proof, rival=0, rule=RULE, evidence=None):
-    """The verdict on a match that scores so much, so far ahead of a place elsewhere."""
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 10, None)
-    scores = np.array([score, score - ahead], np.float32)
-    matches = {slot: FineMatch(float(value)) for slot, value in zip((0, 9), scores, strict=True)}
-    ranking = Ranking(np.array([0, 9]), scores, matches)
-    return judge(Findings(ranking, proof=proof, rival=rival, evidence=evidence), index, rule)
-
-
 @pytest.mark.parametrize(
     ("lead", "inliers", "rival", "accepted"),
     [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.5, 20, 11, True)],
 )
 def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5, "landmarks": math.log1p(inliers)}
-    verdict = held(0.15, 0.01, found(inliers), rival, sure_rule(lambda evidence: 1.0), evidence)
+    verdict = judged(
+        (0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=found(inliers), rival=rival, evidence=evidence
+    )
     assert verdict.accepted is accepted
     if not accepted:
         assert verdict.reason.startswith("11 landmarks of a place elsewhere agree as well")
@@ -171,4 +147,4 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
     ],
 )
 def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
-    assert held(score, 0.1, proof).accepted == accepted
+    assert judged((score, score - 0.1), proof=proof).accepted == accepted

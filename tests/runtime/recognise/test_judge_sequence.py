@@ -59,29 +59,22 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
     assert any("no longer" in why for _, why, _ in found[11:14])
 
 
-def test_a_score_too_low_for_one_query_is_too_low_for_the_newest():
+@pytest.mark.parametrize(
+    ("queries", "least", "goes_on"),
+    [
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.299, True),
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.31, False),  # too low for one query
+        ([(5, 0.9), (60, 0.1), (20, 0.1)], 0.0, False),  # the newest was not compared with the place
+    ],
+)
+def test_the_newest_query_must_still_see_the_place(queries, least, goes_on):
     sequence, near = SequenceSearch(3), abs(np.arange(PLACES) - 7) <= 2
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
     index.place_ids[:] = np.arange(PLACES)
-    for query, score in enumerate((0.5, 0.4, 0.3)):
-        slots, scores = np.array([5 + query, 50, 60]), np.array([score, 0.1, 0.1], np.float32)
+    for query, (slot, score) in enumerate(queries):
+        slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
         sequence.follow(Ranking(slots, scores, {}), index, float(query))
-    assert sequence.goes_on(near, min_score=0.3 - 1e-6)
-    assert not sequence.goes_on(near, min_score=0.31)
-
-
-def test_a_place_that_the_newest_query_was_not_compared_with_is_not_seen():
-    sequence, near = SequenceSearch(3), abs(np.arange(PLACES) - 7) <= 2
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), PLACES, None)
-    index.place_ids[:] = np.arange(PLACES)
-    for query, (slot, score) in enumerate([(5, 0.9), (60, 0.1), (20, 0.1)]):
-        ranking = Ranking(np.array([slot]), np.array([score], np.float32), {})
-        sequence.follow(ranking, index, float(query))
-    assert not sequence.goes_on(near, min_score=0.0)
-
-
-def test_an_aircraft_twice_as_fast_is_told_why():
-    assert "speed" in flown(2.0, 5)[-1][1]
+    assert sequence.goes_on(near, min_score=least) == goes_on
 
 
 def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():

@@ -10,7 +10,7 @@ from fakes import FakeClock, vehicle_at
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.types import Frame, Position, QueryCost, Steps
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -29,16 +29,6 @@ TECHNIQUE = create("hog", {"w1": 32})
 SPACING_M = 10.0
 GAP_M = 100.0
 METRE_DEG = 1 / 111_195  # of latitude
-COST = QueryCost(
-    t_encode_s=0.1,
-    t_match_s=0.1,
-    u_encode=0.5,
-    u_match=0.5,
-    cpu_s=0.1,
-    rss_mb=80.0,
-    used_mah=0.01,
-    marginal_mah=0.01,
-)
 
 
 class Bench:
@@ -84,11 +74,8 @@ class Bench:
             vehicle=vehicle,
             picture=Levelled(frame.image, None, view),
             descriptor=Descriptor(coarse=part, quality=quality),
-            reason="",
             failed=failed,
             followed=followed,
-            steps=Steps(),
-            cost=COST,
         )
         return self.learner.learn(event)
 

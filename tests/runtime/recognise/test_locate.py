@@ -24,6 +24,11 @@ def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, t
     return Candidate(place, match)
 
 
+def landmarks_say(shift_share, **more):
+    found = {"inliers": 20, "matched": 30, "possible": 250, "rotation_deg": 0.0, "scale": 1.0}
+    return Agreement(shift_share=shift_share, covariance_share2=(1e-5, 0.0, 1e-5), **found | more)
+
+
 def off_m(position):
     east_m, north_m = metres(np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg]))
     return east_m[1], north_m[1]
@@ -68,30 +73,14 @@ def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_de
 
 
 def test_what_is_aside_of_a_query_from_higher_up_is_farther():
-    proof = Agreement(
-        inliers=20,
-        matched=30,
-        possible=250,
-        shift_share=(0.0, 0.0),
-        rotation_deg=0.0,
-        scale=2.0,
-        covariance_share2=(1e-5, 0.0, 1e-5),
-    )
+    proof = landmarks_say((0.0, 0.0), scale=2.0)
     found = located([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_landmarks_are_heard_before_the_vote():
-    proof = Agreement(
-        inliers=20,
-        matched=30,
-        possible=250,
-        shift_share=(0.11, -0.05),
-        rotation_deg=4.0,
-        scale=1.0,
-        covariance_share2=(1e-5, 0.0, 1e-5),
-    )
+    proof = landmarks_say((0.11, -0.05), rotation_deg=4.0)
     by_vote = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
     found = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says

@@ -188,14 +188,6 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
         assert event.evidence["lead"] > math.log(1.5), "places of the same ground are no rivals"
 
 
-def test_where_places_have_positions_these_tell(tmp_path, technique):
-    path = made(tmp_path / "m.gpkg", technique, [frame(1, -25, -10), frame(2), frame(1, 25, 10), frame(3)])
-    event, best, same = same_ground(path, technique, frame(1, 3, 2))
-    assert best in (1, 3)
-    assert same == set()
-    assert event.accepted
-
-
 def test_places_without_landmarks_or_with_damaged_ones_are_not_the_same_ground(overlapping, technique, tmp_path):
     path = shutil.copy(overlapping, tmp_path / "m.gpkg")
     with closing(sqlite3.connect(path)) as db, db:
@@ -243,20 +235,3 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
 
 def test_a_sequence_is_not_held_against_landmarks(mapped, technique):
     assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).proof is None
-
-
-def test_verification_is_a_step_of_its_own_and_counts_as_matching(mapped, technique, monkeypatch):
-    clock = FakeClock()
-    look = Verification.proof
-    monkeypatch.setattr(Verification, "proof", lambda self, ranking: (clock.work(0.02), look(self, ranking))[1])
-    with PlaceMap.open(mapped) as place_map:
-        walk = Recogniser(
-            Matcher(technique, load_index(place_map, technique, 10**7), replace(RULE, worth_a_look=0.04)),
-            place_map,
-            meter(clock),
-            WalkSettings(candidates=technique.candidates),
-        )
-        event = walk.step(frame(1, 20, -10))
-        nothing = walk.step(Frame(image=np.zeros((240, 320), np.uint8), name="nothing", t_mono_s=0.0))
-    assert (event.steps.verify.wall_s, event.cost.t_match_s) == pytest.approx((0.02, 0.02))
-    assert nothing.steps.verify.wall_s == 0
