@@ -14,8 +14,6 @@ from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-# Placeholder texts of firmware whose maker has filled in nothing.
-_FILLERS = re.compile(r"to be filled|default string|system (product|manufacturer)|o\.?e\.?m\.?$|none$|x\.x", re.I)
 # Arm's part numbers in /proc/cpuinfo (implementer 0x41), of processors that companion computers have.
 _ARM_PARTS = {
     "0xc07": "Cortex-A7", "0xc0f": "Cortex-A15", "0xd03": "Cortex-A53", "0xd04": "Cortex-A35", "0xd05": "Cortex-A55",
@@ -31,14 +29,9 @@ def model(root: Path = _ROOT) -> str | None:
 
 
 def dmi_model(root: Path = _ROOT) -> str | None:
-    """Return maker and product from the firmware (DMI) of an x86 machine, or those of its mainboard if the product is
-    not filled in. None if neither is."""
-    for names in (("sys_vendor", "product_name"), ("board_vendor", "board_name")):
-        maker, product = (text(root / "sys/class/dmi/id" / name) or "none" for name in names)
-        if not _FILLERS.search(product):
-            is_named = _FILLERS.search(maker) or product.startswith(maker)
-            return product if is_named else f"{maker} {product}"
-    return None
+    """Return maker and product from the firmware (DMI) of an x86 machine; None if it says neither."""
+    names = (text(root / "sys/class/dmi/id" / name) for name in ("sys_vendor", "product_name"))
+    return " ".join(filter(None, names)) or None
 
 
 def cpu(root: Path = _ROOT) -> str:

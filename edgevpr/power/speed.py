@@ -34,15 +34,10 @@ def micro_benchmark() -> MachineSpeed:
     cores = len(os.sched_getaffinity(0))
     products, all_products = (hz / REFERENCE_PRODUCTS_HZ for hz in _rates_hz(product_round, cores))
     passes, all_passes = (hz / REFERENCE_PASSES_HZ for hz in _rates_hz(pass_round, cores))
-    figures = {
-        "single": math.sqrt(products * passes),
-        "multi": math.sqrt(all_products * all_passes),
-        "products": products,
-        "passes": passes,
-    }
-    rounded = {name: float(f"{value:.3g}") for name, value in figures.items()}
+    figures = (math.sqrt(products * passes), math.sqrt(all_products * all_passes), products, passes)
+    single, multi, products, passes = (float(f"{value:.3g}") for value in figures)
     source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
-    return MachineSpeed(**rounded, verified=True, source=source)
+    return MachineSpeed(single=single, multi=multi, products=products, passes=passes, verified=True, source=source)
 
 
 def product_round() -> Callable[[], object]:
@@ -75,10 +70,8 @@ def pass_round() -> Callable[[], object]:
 
 
 def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
-    """Return two rates in rounds per second. `make` returns the work of one round, once for each thread.
-    - The rate of one thread, by its quickest round, since a slower one was disturbed by something else.
-    - The total rate of `threads` threads at once, which NumPy lets run in parallel."""
-    alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))
+    """Return the rounds per second of one thread, and of `threads` at once; `make` returns the work of a round."""
+    alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))  # a slower round was disturbed by something else
     start = Barrier(threads)
     with ThreadPoolExecutor(threads) as pool:
         together = list(pool.map(lambda work: _round_times_s(work, start), [make() for _ in range(threads)]))
@@ -86,8 +79,7 @@ def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[f
 
 
 def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
-    """Return the seconds of each round of `work`, after an uncounted first one and the barrier `start` of all
-    threads."""
+    """Return the seconds of each round of `work`, after an uncounted first one and the barrier of all threads."""
     work()
     start.wait()
     times_s: list[float] = []

@@ -12,7 +12,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.files import shipped
 from edgevpr.core.types import StageCost
-from edgevpr.power import machine, sensors, speed
+from edgevpr.power import calibrate, machine, speed
 from edgevpr.power.boards import board_names, load_board
 from edgevpr.runtime.preflight import accuracy, trial
 from edgevpr.runtime.preflight.probe import TechniqueCosts
@@ -40,7 +40,7 @@ def alone(monkeypatch, tmp_path):
     """Nobody's stored figures, no meter, and a micro-benchmark without patience."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr(speed, "_LEAST_S", 0.01)
-    monkeypatch.setattr(sensors, "find_meters", tuple)
+    monkeypatch.setattr(calibrate, "find_meters", tuple)
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_what_was_measured_is_kept_used_and_dated(capsys, tmp_path, monkeypatch)
     said = run(capsys, "--measure")
     assert "measuring techniques" in said.err
     kept = tmp_path / "data/edgevpr/measured.json"
-    assert f"kept in {kept}: `--places N` uses them.\n{sensors.NO_METER}" in said.out
+    assert f"kept in {kept}: `--places N` uses them.\n{calibrate.NO_METER}" in said.out
     fields = json.loads(kept.read_text())
     assert [trial["label"] for trial in fields["trials"]] == ["cohog", "seqslam"]
     assert fields["trials"][0]["costs"]["encode"]["cpu_s"] > 0
@@ -170,7 +170,7 @@ def test_figures_of_another_machine_are_refused_and_tried_anew(capsys, tmp_path,
 def test_figures_are_kept_where_one_says_and_can_be_had_as_json(capsys, tmp_path, tried):
     found = json.loads(run(capsys, "--measure", "--out", tmp_path / "m.json", "--json").out)
     assert found["file"] == str(tmp_path / "m.json")
-    assert (found["profile"], found["power"]) == (None, sensors.NO_METER)
+    assert (found["profile"], found["power"]) == (None, calibrate.NO_METER)
     assert json.loads((tmp_path / "m.json").read_text())["trials"] == found["trials"]
     assert not (tmp_path / "data").exists()
 

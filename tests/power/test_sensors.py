@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgevpr.power.sensors import Meter, MeterError, find_meters, mean_power
+from edgevpr.power.calibrate import Meter, MeterError, find_meters, mean_power
 
 HWMON = "sys/class/hwmon"
 

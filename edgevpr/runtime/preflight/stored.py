@@ -145,8 +145,7 @@ def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, s
     `figures`. Raises MeterError. Returns two things:
     - the path of the profile (None: there is no meter);
     - a sentence for the user."""
-    from edgevpr.power.calibrate import calibrate
-    from edgevpr.power.sensors import NO_METER, find_meters
+    from edgevpr.power.calibrate import NO_METER, calibrate, find_meters
 
     meter = next(iter(find_meters()), None)
     if meter is None:

@@ -8,9 +8,9 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import StageCost
-from edgevpr.power import calibrate, sensors
+from edgevpr.power import calibrate
 from edgevpr.power.boards import MachineSpeed, load_board, own_profile
-from edgevpr.power.sensors import Meter, MeterError
+from edgevpr.power.calibrate import Meter, MeterError
 from edgevpr.runtime.preflight import stored as measured
 from edgevpr.runtime.preflight import trial
 from edgevpr.runtime.preflight.probe import TechniqueCosts
@@ -180,7 +180,7 @@ def held(monkeypatch):
 
 def test_the_watts_of_a_meter_are_fitted_and_written_into_a_profile_that_names_it(monkeypatch, tmp_path, held, capsys):
     meter = meter_at(held, lambda share: 2.0 + 4.5 * share)
-    monkeypatch.setattr(sensors, "find_meters", lambda: (meter,))
+    monkeypatch.setattr(calibrate, "find_meters", lambda: (meter,))
     path, said = measured_profile(tmp_path / "measured.json", SCORE)
     board = load_board(str(path))
     assert (board.idle_w, board.full_w, board.verified) == (pytest.approx(2.0), pytest.approx(6.5), True)
@@ -193,13 +193,13 @@ def test_the_watts_of_a_meter_are_fitted_and_written_into_a_profile_that_names_i
 
 
 def test_without_a_meter_it_is_one_line_and_no_file(monkeypatch, tmp_path):
-    monkeypatch.setattr(sensors, "find_meters", tuple)
-    assert measured_profile(tmp_path / "m.json", SCORE) == (None, sensors.NO_METER)
+    monkeypatch.setattr(calibrate, "find_meters", tuple)
+    assert measured_profile(tmp_path / "m.json", SCORE) == (None, calibrate.NO_METER)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_meter_that_says_nonsense_leaves_no_file(monkeypatch, tmp_path, held):
-    monkeypatch.setattr(sensors, "find_meters", lambda: (meter_at(held, lambda share: float("nan")),))
+    monkeypatch.setattr(calibrate, "find_meters", lambda: (meter_at(held, lambda share: float("nan")),))
     with pytest.raises(MeterError, match="nan W"):
         measured_profile(tmp_path / "m.json", SCORE)
     assert not list(tmp_path.iterdir())
