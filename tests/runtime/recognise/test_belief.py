@@ -202,17 +202,6 @@ def test_tracks_that_cross_are_told_apart():
     assert posterior.mass > 0.99
 
 
-@pytest.mark.parametrize("elapsed_s", [-5.0, 0.0, float("nan"), float("inf"), 1e12, None])
-def test_a_clock_that_goes_back_or_jumps_does_not_mislead(elapsed_s):
-    rng, belief = np.random.default_rng(8), Belief(IN_ORDER)
-    fly(belief, range(10, 30), rng)
-    after = belief.update(view_of(30, rng), moved(elapsed_s, 3.0), PLACES)
-    assert after.mass < SURE or is_at(after, 30)
-    posteriors = fly(belief, range(31, 41), rng, p=0.9)
-    assert posteriors[-1].mass >= SURE
-    assert is_at(posteriors[-1], 40)
-
-
 def test_where_all_places_look_the_same_none_is_believed():
     belief = Belief(IN_ORDER)
     for _ in range(60):

@@ -141,16 +141,6 @@ def test_what_the_best_place_leaves_is_shared_by_the_others(flight):
     assert not followed.leads_from(40)
 
 
-def test_the_flight_tells_two_places_apart_that_look_alike(flight):
-    flight.over(range(10, 40, STRIDE), 0.9)
-    for place in range(40, 52, STRIDE):
-        # The other place has the better score.
-        followed = flight.look(place + 80, 0.5, of_map=0.98, others=(place,), lead=0.01)
-    assert followed.slot == 49
-    assert followed.leads_from(129)
-    assert followed.confidence > 0.9
-
-
 def test_positions_are_those_of_the_places(posed_map, bare_map):
     posed, bare = Flight(posed_map, IN_METRES), Flight(bare_map, IN_METRES)
     for place in np.arange(10, 60, 2.5):
