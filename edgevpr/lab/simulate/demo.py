@@ -4,8 +4,7 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,6 @@ from edgevpr.runtime.flight.wholeflight import flight_of
 _SEED = 1
 _RATE_HZ = 5.0
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
-_END_TIMEOUT_S = 10.0
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
 RIGHT_M = 55.0
 _PICTURE_PX = (1600, 1050)
@@ -152,40 +150,33 @@ def _flown(folder: Path) -> dict[str, Any]:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
     # The flight controller is started first: it listens long before the map is built.
-    with _edgevpr("simulate", "autopilot", "--link", f"udpin:{address}", "--json") as autopilot:
-        build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
-        with _edgevpr(*build) as building:
-            _output(building)
-        flags = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
-        with _edgevpr("run", "--map", map_path, "--source", second, *_CAMERA, *flags) as flying:
-            _output(flying)
-        autopilot.terminate()
-        heard: dict[str, Any] = json.loads(_output(autopilot))
+    command = _command("simulate", "autopilot", "--link", f"udpin:{address}", "--json")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as autopilot:
+        try:
+            _run("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
+            flags = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
+            _run("run", "--map", map_path, "--source", second, *_CAMERA, *flags)
+        finally:
+            autopilot.terminate()
+        said, _ = autopilot.communicate()
+    _require_success(command, autopilot.returncode)
+    heard: dict[str, Any] = json.loads(said)
     return heard
 
 
-@contextmanager
-def _edgevpr(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Context manager: run the real program in a process of its own, which ends with the block at the latest."""
-    command = [sys.executable, "-m", "edgevpr", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
-            try:
-                process.wait(_END_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
+def _command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "edgevpr", *map(str, arguments)]
 
 
-def _output(process: subprocess.Popen[str]) -> str:
-    """Wait for a process and return everything that it has written. Raises EdgevprError if it fails."""
-    output, _ = process.communicate()
-    if process.returncode:
-        command = " ".join(process.args[2:]) if isinstance(process.args, list) else process.args
-        raise EdgevprError(f"`{command!s}` ended with exit code {process.returncode}: see what it said above.")
-    return output
+def _run(*arguments: object) -> None:
+    """Run the real program in a process of its own. Raises EdgevprError if it fails."""
+    command = _command(*arguments)
+    _require_success(command, subprocess.run(command, stdout=subprocess.DEVNULL).returncode)
+
+
+def _require_success(command: list[str], code: int) -> None:
+    if code:
+        raise EdgevprError(f"`{' '.join(command[2:])}` ended with exit code {code}: see what it said above.")
 
 
 def read_answers(log_path: Path, mapped: Path, flown: Path) -> list[JudgedAnswer]:
