@@ -1,6 +1,7 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
 import json
+import math
 import socket
 import subprocess
 import sys
@@ -13,8 +14,8 @@ from edgevpr.cli.main import main
 from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot
-from edgevpr.lab.simulate.controller import VEHICLES
-from edgevpr.lab.simulate.motion import TrueState, read_track, truth_at
+from edgevpr.lab.simulate.controller import VEHICLES, FlightController
+from edgevpr.lab.simulate.motion import AlongTrack, TrueState, read_track, truth_at
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -131,23 +132,14 @@ def test_it_says_how_fast_it_flies_along_the_track():
 
 def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
     csv = tmp_path / "positions.csv"
-    csv.write_text(
-        "file,lat,lon,alt,rel_alt,yaw_deg,roll_deg,pitch_deg,time\n"
-        "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z\n"
-    )
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}") as link:
-        link.want_position()
-        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
-
-        def with_attitude():
-            vehicle = link.vehicle_at(time.monotonic())
-            return vehicle if vehicle and vehicle.roll_deg is not None else None
-
-        seen = wait_until(with_attitude)
-        autopilot.finish()
-    assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-12, 7, 300), abs=1e-3)
-    assert seen.height_m == 80.5
+    row = "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z"
+    csv.write_text(f"file,lat,lon,alt,rel_alt,yaw_deg,roll_deg,pitch_deg,time\n{row}\n")
+    controller = FlightController("px4-copter", AlongTrack(read_track(csv)), gps=True)
+    said = {message.get_type(): message for message in controller.advance(1.0)}
+    attitude, position = said["ATTITUDE"], said["GLOBAL_POSITION_INT"]
+    degrees = [math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw)]
+    assert degrees == pytest.approx((-12, 7, -60), abs=1e-3)
+    assert (position.relative_alt, position.hdg) == (80_500, 30_000)
 
 
 def test_a_track_without_times_is_refused(tmp_path):
