@@ -159,21 +159,6 @@ def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_a
     assert len(taken()) == 3 * PLACES + 2 * 3
 
 
-def test_a_plan_names_videos_beside_its_file(films, tmp_path, capsys):
-    plan = tmp_path / "sets.yaml"
-    plan.write_text(
-        "sets:\n  fast: {query: later.mkv, ref: mapping.mkv, within_m: 20}\n"
-        "  slow: {query: later.mkv, ref: mapping.mkv, rate_hz: 1}\nrows:\n"
-        "  hog: {technique: hog, parameters: {w1: 64}}\n"
-    )
-    assert main(["eval", "--sets", str(plan), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["results"]
-    assert [(row["set"], row["queries"], row["references"]) for row in found] == [
-        ("fast", PLACES - 1, PLACES),
-        ("slow", 2, 3),
-    ]
-
-
 def test_frames_without_a_position_are_left_out_and_said(films, capsys):
     table = films[0].with_suffix(".csv")
     header, _, *rest = table.read_text().splitlines()

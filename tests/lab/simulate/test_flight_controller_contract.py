@@ -166,18 +166,6 @@ def test_with_gps_again_all_is_well(pilot):
 
 
 @copter
-def test_a_second_gps_must_report_before_arming(pilot):
-    pilot.command(mavlink.MAV_CMD_DO_SET_MODE, 1, GUIDED)
-    pilot.until(lambda: any("GPS 2: Bad fix" in text for text in pilot.texts) or not _tried(pilot), "GPS 2: Bad fix")
-
-
-def _tried(pilot) -> bool:
-    """Try to arm; it must not."""
-    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == FAILED
-    return False
-
-
-@copter
 def test_a_second_gps_takes_over(pilot):
     pilot.on_truth = lambda truth: _play_gps(pilot, truth)
     pilot.wait(10)

@@ -181,17 +181,6 @@ def test_a_source_set_is_chosen_by_command():
     assert Flown("px4-copter").command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == UNSUPPORTED
 
 
-@pytest.mark.parametrize(("rate_hz", "is_healthy"), [(10, True), (8, True), (4, False)])
-def test_a_second_gps_has_to_report_often_enough(rate_hz, is_healthy):
-    flown = Flown("arducopter", GPS2_TYPE=14).wait(10)
-    for _ in range(10 * rate_hz):
-        flown.tell(mavlink.MAVLink_gps_input_message(0, 1, 0, 0, 0, 3, 0, 0, 0, 1, 1, 0, 0, 0, 1, 1, 1, 12))
-        flown.wait(1 / rate_hz)
-    assert flown.controller.is_second_healthy == is_healthy
-    flown.wait(5)
-    assert flown.controller.brain.receivers.second.fix_type == 1
-
-
 def test_px4_takes_a_fix_while_it_reckons_and_names_no_frame():
     flown = lost("px4-plane").wait(0.5)
     assert flown.fix() == NOT_NOW
