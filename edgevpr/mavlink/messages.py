@@ -206,17 +206,7 @@ def report_requests(target_system: int, firmware: int, is_continuous: bool = Fal
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). On many autopilots the companion's port sends none of them unless asked. `firmware` is a MAV_AUTOPILOT; a
     continuous channel (`is_continuous`) needs more."""
-    rates_hz = {
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE: _DENSE_HZ if is_continuous else 10,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
-        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 2,
-        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 2,
-    }
-    if is_continuous:
-        rates_hz[mavlink.MAVLINK_MSG_ID_SCALED_IMU] = _DENSE_HZ
-        rates_hz[mavlink.MAVLINK_MSG_ID_SYSTEM_TIME] = 1
-        rates_hz[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = 1
+    rates_hz = _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
     interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
@@ -299,7 +289,20 @@ def status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
-_DENSE_HZ = 25  # an ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second
+_REPORTS_HZ = {
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 10,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 2,
+    mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 2,
+}
+# An ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second.
+_CONTINUOUS_HZ = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 25,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 25,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
+    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: 1,
+}
 _UNUSED = 2**32 - 1
 # Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
 _FILTER_REPORTS = {

@@ -86,8 +86,8 @@ class UdpOutPort(Port):
 
     def write(self, data: bytes) -> int:
         for _ in range(2):
-            with suppress(BlockingIOError, ConnectionRefusedError):
-                return self._sock.send(data)
+            with suppress(ConnectionRefusedError):
+                return super().write(data)
         return 0
 
 

@@ -33,11 +33,6 @@ def peer(port, link):
 
 
 @pytest.fixture
-def link_and_peer(link, peer):
-    return link, peer
-
-
-@pytest.fixture
 def autopilot():
     """An autopilot in a conversation without a port."""
     return Autopilot()

@@ -119,7 +119,6 @@ class TcpServer:
     def __init__(self, number: int) -> None:
         self._listener = socket.create_server(("127.0.0.1", number))
         self._listener.settimeout(PATIENCE_S)
-
         self._clients: list[socket.socket] = []
 
     def accept(self) -> socket.socket:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import stat
 import time
 from contextlib import closing
 
@@ -12,7 +11,6 @@ from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import (
-    _MAKE_ONE,
     FUTURE,
     NOT_SIGNING,
     OLD,
@@ -245,10 +243,3 @@ def test_a_credential_of_systemd_is_taken(key_file, monkeypatch):
     key_file.chmod(0o444)
     with pytest.raises(ConfigError, match="chmod"):
         read_key(str(key_file))
-
-
-def test_what_makes_a_key_makes_one_that_is_taken(tmp_path):
-    command = _MAKE_ONE.split("`")[1].replace("FILE", str(tmp_path / "key"))
-    assert os.system(command) == 0
-    assert len(read_key(str(tmp_path / "key"))) == 32
-    assert stat.S_IMODE((tmp_path / "key").stat().st_mode) == 0o600

@@ -44,6 +44,9 @@ def test_the_newest_text_of_a_topic_takes_the_place_of_one_that_waits(texts):
     texts.put(WARNING, "map left", "map")
     texts.put(WARNING, "camera frozen", "camera")
     assert [text for _, text in told(texts)] == ["camera frozen", "map left"]
+    texts.put(INFO, "map found again", "map")
+    texts.put(WARNING, "map left", "map")
+    assert told(texts, 100.0) == [], "what comes and goes again before its turn is no change"
 
 
 def test_a_new_warning_ends_the_note_that_all_is_well(texts):
@@ -54,16 +57,6 @@ def test_a_new_warning_ends_the_note_that_all_is_well(texts):
     texts.put(WARNING, "camera lost", "camera")
     texts.put(INFO, "camera is back", "camera")
     assert [text for _, text in told(texts, 100.0)] == ["camera lost", "camera is back"], "a note hides no warning"
-
-
-def test_what_comes_and_goes_again_before_its_turn_is_no_change(texts):
-    texts.put(WARNING, "map left", "map")
-    assert [text for _, text in told(texts)] == ["map left"]
-    texts.put(INFO, "map found again", "map")
-    texts.put(WARNING, "map left", "map")
-    assert told(texts, 100.0) == []
-    texts.put(INFO, "map found again", "map")
-    assert [text for _, text in told(texts, 100.0)] == ["map found again"]
 
 
 def test_a_flood_drops_notes_first_and_says_what_it_drops(texts, caplog):
