@@ -42,9 +42,7 @@ _MOST_SCANS = 100  # of a progressive JPEG, which has about ten; each costs the 
 
 def list_images(folder: str | Path) -> list[Path]:
     """List the paths of the images directly in `folder`, sorted by name, numbers in counting order (2 before 10).
-
-    Raises SourceError for a folder that is missing, cannot be read or has no images.
-    """
+    Raises SourceError for a folder that cannot be read or has no images."""
     folder = Path(folder)
     try:
         names = sorted((path.name for path in folder.iterdir() if is_image(path.name)), key=counting_order)
@@ -115,8 +113,7 @@ def as_jpeg(image: Image) -> bytes:
 def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
     """Encode a picture, uint8 (H, W[, 3]), as a small JPEG for people to look at: its longest side is scaled down to
     `longest_px` if it is longer."""
-    scale = min(1.0, longest_px / max(image.shape[:2]))
-    if scale < 1:
+    if (scale := longest_px / max(image.shape[:2])) < 1:
         width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
         image = resized(image, (width, height))
     return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
@@ -143,11 +140,8 @@ def _is_incomplete(data: bytes) -> bool:
 
 
 def jpeg_is_whole(data: bytes) -> bool:
-    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there.
-
-    Segments are skipped by their length, so that the end mark of an EXIF thumbnail is not mistaken for the image's. An
-    image of more than 100 scans counts as damaged.
-    """
+    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there, after 100 scans
+    at most. Segments are skipped by their length, so that an EXIF thumbnail's end mark is not taken for the image's."""
     position, scans = 2, 0
     while marker := _MARKER.search(data, position):
         code = data[marker.end() - 1]

@@ -92,21 +92,23 @@ def levelled(
     frame, or where it has none those of `vehicle` (None: no report).
 
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
-    scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). The middle of the result
-    shows the same point as the middle of the picture or, with `below`, the point under the camera. `overlay`, bool
-    (H, W), is False where the picture shows no ground (None: nowhere). If no warp is needed, or the picture is tilted
-    too far (see `View.reason`), the image is returned as it is. No value of frame or vehicle raises.
+    scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). Its middle shows the
+    same point as before or, with `below`, the point under the camera. `overlay`, bool (H, W), is False where the
+    picture shows no ground (None: nowhere). An image that needs or bears no warp is returned as it is. No value of
+    frame or vehicle raises.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
         return Levelled(frame.image, overlay, known)
     taking = _Taking(frame, vehicle, lens)
-    if reason := taking.objection:
-        return Levelled(frame.image, overlay, View(up_deg=taking.top_deg, reason=reason))
+    if taking.is_too_tilted:
+        view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
+        return Levelled(frame.image, overlay, view)
     zoom = taking.own_m / footprint_m if taking.own_m and footprint_m else 1.0
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
         zoom = 1.0
-    if taking.tilt_deg < _LEAST_TILT_DEG and taking.turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
+    turn_deg = abs(((taking.top_deg or 0.0) + 180) % 360 - 180)
+    if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=taking.aside(taking.straight, 1.0))
         return Levelled(frame.image, overlay, view)
 
@@ -159,8 +161,10 @@ class _Taking:
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
     looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
-    `straight` is the rotation from lens to level picture without a turn. `own_m` is the ground length of the longest
-    side if the picture were level (None: height unknown). `corners` (3, 4) are homogeneous pixels."""
+    `straight` is the rotation from lens to level picture without a turn, `tilt_deg` the angle between the viewing
+    direction and straight down, and `is_too_tilted` says that it bears no warp. `top_deg` is the compass direction of
+    the picture's top (None: unknown). `own_m` is the ground length of the longest side if the picture were level (None:
+    height unknown). `corners` (3, 4) are homogeneous pixels."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
@@ -178,27 +182,11 @@ class _Taking:
         across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)
         self.corners = np.array([[*across, *across[::-1]], [along[0], along[0], along[1], along[1]], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
-        # Degrees between the viewing direction and straight down.
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
-
-    @property
-    def top_deg(self) -> float | None:
-        """Compass direction of the picture's top, None if unknown."""
-        return None if self.heading_deg is None else (self.heading_deg + self._lens.up_deg) % 360
-
-    @property
-    def turn_deg(self) -> float:
-        """Degrees between the top of the picture and north (0..180), 0 if the heading is unknown."""
-        return 0.0 if self.top_deg is None else abs((self.top_deg + 180) % 360 - 180)
-
-    @property
-    def objection(self) -> str | None:
-        """The reason why the picture is tilted too far to be warped, None if it is not."""
         rays = self.straight @ self.lens_from_pixel @ self.corners
         lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
-        if self.tilt_deg <= MOST_TILT_DEG and lowest >= math.cos(math.radians(_MOST_OFF_DOWN_DEG)):
-            return None
-        return f"it is tilted {self.tilt_deg:.0f} degrees"
+        self.is_too_tilted = self.tilt_deg > MOST_TILT_DEG or lowest < math.cos(math.radians(_MOST_OFF_DOWN_DEG))
+        self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""

@@ -20,13 +20,9 @@ _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take 
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
 
-def open_camera(device: str, clock: Callable[[], float]) -> "DeviceCapture":
-    """Open a V4L2 device (/dev/video0, /dev/v4l/by-id/...). If that fails, the first `read` returns None."""
-    return DeviceCapture(cv2.VideoCapture(device, cv2.CAP_V4L2), clock)
-
-
 class DeviceCapture:
-    """A camera opened with OpenCV: a `Capture`. OpenCV does not report damaged pictures, so none is rejected here."""
+    """A V4L2 camera opened with OpenCV: a `Capture`. If it cannot be opened, the first `read` returns None. OpenCV does
+    not report damaged pictures, so none is rejected here."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
@@ -78,7 +74,7 @@ class LiveSource:
 
     @property
     def condition(self) -> Condition:
-        """The state of the source, see `Condition`."""
+        """Condition of the source."""
         return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
@@ -101,9 +97,8 @@ class LiveSource:
             atexit.unregister(self._end_thread)
 
     def _end_thread(self) -> None:
-        """Wait for the thread before Python exits: a thread that returns from FFmpeg during the exit would crash it."""
         self._closing.set()
-        self._thread.join(_EXIT_TIMEOUT_S)
+        self._thread.join(_EXIT_TIMEOUT_S)  # a thread that returns from FFmpeg while Python exits would crash it
 
     def _capture(self) -> None:
         wait_s = 0.0

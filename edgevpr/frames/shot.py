@@ -1,5 +1,4 @@
-"""One picture of a camera or stream (`Shot`), the contract of devices and streams that give pictures (`Capture`), and
-the detection of repeated pictures (`Newness`). `frames.live` uses them.
+"""One picture of a camera or stream (`Shot`), what gives them (`Capture`), and the detection of repeated ones (`Newness`).
 
 A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But from the
 air no two pictures are exactly equal, because of the camera's noise. Pictures are compared by coarse grey copies, in
@@ -58,8 +57,8 @@ class Refusal(Enum):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
     """A complete picture. `t_mono_s`: time at which it was taken, as far as known, at most that of its arrival (seconds
-    of the monotonic clock). `look`: coarse grey copy, uint8 (h, w), see `coarse`. `pixels`: function that converts and
-    returns the picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for pictures that are used."""
+    of the monotonic clock). `look`: coarse grey copy, uint8 (h, w). `pixels`: function that converts and returns the
+    picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for pictures that are used."""
 
     t_mono_s: float
     look: Image

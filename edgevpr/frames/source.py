@@ -17,8 +17,8 @@ from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
-from edgevpr.frames.images import EXTENSIONS, list_images, read_image
-from edgevpr.frames.live import LiveSource, open_camera
+from edgevpr.frames.images import EXTENSIONS, cv2, list_images, read_image
+from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, Refusal
 
@@ -192,18 +192,15 @@ def is_live(uri: str) -> bool:
 
 
 def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
-    """Return a function that opens the camera or stream `uri` and returns None if that fails. Raises SourceError if
-    opening can never succeed."""
+    """Return a function that opens the camera or stream `uri`. Raises SourceError if that can never succeed."""
     if "://" in uri:
         _check_address(uri)
     elif not Path(uri).exists():
         raise SourceError(f"There is nothing at `{uri}`: connect the camera or correct the name.")
     elif not os.access(uri, os.R_OK):
-        raise SourceError(
-            f"{uri} may not be read by this user: add the user to the group that owns it (often `video`)."
-        )
+        raise SourceError(f"{uri} may not be read by this user: add the user to the group of the file, often `video`.")
     elif uri.startswith("/dev/"):
-        return lambda: open_camera(uri, clock)
+        return lambda: DeviceCapture(cv2.VideoCapture(uri, cv2.CAP_V4L2), clock)
     from edgevpr.frames.streams import open_stream  # loads FFmpeg
 
     return lambda: open_stream(uri, clock)

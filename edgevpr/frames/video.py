@@ -25,8 +25,8 @@ class VideoSource(RecordingSource):
     """The frames of the video file `path`, at least `step_s` seconds of video time apart (0: every frame); every run
     gives the same frames. `track` has the positions of the frames (None: unknown).
 
-    Damaged frames, and those decoded with their help, are left out. `read` raises ImageError once for each run of
-    damaged frames, and once if the end of the file is missing."""
+    Damaged frames, and those decoded with their help, are left out: `read` raises ImageError once for each run of them,
+    and once if the end of the file is missing."""
 
     def __init__(
         self,
@@ -93,8 +93,7 @@ class VideoSource(RecordingSource):
             self._ready.extend(pictures)
 
     def _advance(self, picture: "VideoFrame") -> bool:
-        """Set the current frame number and video time to those of `picture`. Return True if at least `step_s` of video
-        time have passed since the last frame that was returned."""
+        """Go on to `picture`. Return True if `step_s` of video time have passed since the last one returned."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
         # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
@@ -129,5 +128,5 @@ def _promised_s(whole: WholePictures) -> float:
     """Return the duration in seconds that the file's header states; 0 if it states none."""
     if not whole.is_stamped:
         return 0.0
-    stream = whole.stream
-    return float(stream.duration * whole.time_base) if stream.duration else (whole.container.duration or 0) / 1e6
+    duration = whole.stream.duration
+    return float(duration * whole.time_base) if duration else (whole.container.duration or 0) / 1e6
