@@ -16,6 +16,7 @@ from datetime import date
 import numpy as np
 from scipy.optimize import minimize
 
+from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
@@ -86,12 +87,8 @@ def ask(
         if (slot := slots.get(place_id)) is None:
             continue
         may_be_same = _same_ground(index, slot, near_m)
-        others = _without(index, may_be_same)
-        for way, seen, among in (
-            (THERE, picture, index),
-            (LEFT_OUT, picture, others),
-            (MIRRORED, _mirrored(picture), index),
-        ):
+        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.only(~may_be_same)))
+        for way, seen, among in (*ways, (MIRRORED, _mirrored(picture), index)):
             if not len(among):
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
@@ -106,7 +103,7 @@ def ask(
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
-            best = int(np.flatnonzero(index.place_ids == event.best.place.place_id)[0])
+            best = slots[event.best.place.place_id]
             right = way == THERE and not elsewhere(index, slot, np.array([best]), near_m)[0]
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
@@ -128,31 +125,27 @@ def calibrate(
     Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
     pictures are found. Raises MapError for a file that cannot be read or written.
     """
+
+    def require(is_so: object, lacking: str) -> None:
+        if not is_so:
+            raise UsageError(
+                f"{place_map.path} cannot be calibrated, and flies with the shipped confidence: {lacking}."
+            )
+
     kinds = kinds_of(technique.spec)
-    if not kinds:
-        raise UsageError(
-            f"{place_map.path} is of {technique.spec.name}, whose matches are judged by score and margin: only `cohog` "
-            "has a confidence to calibrate."
-        )
+    require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-    if len(index) < FEWEST_PLACES:
-        raise UsageError(
-            f"{place_map.path} has {len(index)} places, and {FEWEST_PLACES} are needed to calibrate it: the shipped "
-            "confidence is used."
-        )
-    if technique.spec.cells is not None and np.isnan(index.lat_deg).mean() > _MOST_WITHOUT_POSITION:
-        raise UsageError(
-            f"{place_map.path}: its places have no positions, so nobody knows which of them show the same ground: the "
-            "shipped confidence is used."
-        )
+    require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
+    is_placed = technique.spec.cells is None or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
+    require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
     as_mapped = _as_mapped(technique, place_map, pictures, watch, preparation or Preparation())
     answers = list(ask(technique, place_map, index, accept_rule(technique, config), meter, as_mapped))
     at_hand = len({answer.place_id for answer in answers})
-    if at_hand < FEWEST_PLACES:
-        raise UsageError(
-            f"Of {place_map.path} the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are "
-            "needed: give the pictures that it was made of, with the same camera and mask."
-        )
+    require(
+        at_hand >= FEWEST_PLACES,
+        f"the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are needed; give the pictures "
+        "that it was made of, with the same camera and mask",
+    )
     calibration = _calibration(answers, kinds, config.accept_precision)
     place_map.record_calibration(calibration_text(calibration))
     return calibration
@@ -166,8 +159,7 @@ def asked_of(technique: Technique) -> int:
 def _as_mapped(
     technique: Technique, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], preparation: Preparation
 ) -> Iterator[tuple[int, Levelled]]:
-    """Yield pairs of a place's number and its prepared picture. A picture that only has the name of a place's picture,
-    and another content, is left out."""
+    """Yield (a place's number, its prepared picture), without pictures that share only the name with a place's."""
     ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
@@ -182,8 +174,7 @@ def _as_mapped(
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the model of that one of `kinds` of evidence that most answers have, and count the matches that it accepts
-    at the required `precision` (share of right matches among the accepted)."""
+    """Fit the model of the one of `kinds` of evidence that most answers have, and count what it accepts."""
     counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
     kind = max(kinds, key=lambda kind: counts[kind])
     of_kind = [answer for answer in answers if answer.evidence and kind_of(answer.evidence) == kind]
@@ -194,36 +185,30 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
         for answer in answers
         if (seen := answer.evidence) and not answer.refused and sure.confidence(seen) >= sure.threshold(seen)
     ]
-    asked = sum(answer.way == THERE for answer in answers)
+    there = [answer for answer in answers if answer.way == THERE]
+    of_place: dict[int, list[float]] = {}  # confidence of each query, 0 for a wrong or refused match
+    for answer in there:
+        seen = answer.evidence if answer.right and not answer.refused else None
+        of_place.setdefault(answer.place_id, []).append(sure.confidence(seen) if seen else 0.0)
     return MapCalibration(
         models={kind: model},
         made=date.today().isoformat(),
-        asked=asked,
+        asked=len(there),
         precision=precision,
-        accepted=sum(answer.way == THERE for answer in accepted) / asked,
+        accepted=sum(answer.way == THERE for answer in accepted) / len(there),
         accepted_wrong=sum(not answer.right for answer in accepted),
-        recognisable=_by_place(answers, sure),
+        recognisable={place_id: round(float(np.mean(each)), 4) for place_id, each in sorted(of_place.items())},
     )
-
-
-def _by_place(answers: Sequence[MapAnswer], sure: Sureness) -> dict[int, float]:
-    """Return the mean confidence of each place's THERE queries, by its number; a wrong or refused match counts as 0."""
-    of_place: dict[int, list[float]] = {}
-    for answer in answers:
-        if answer.way == THERE:
-            seen = answer.evidence if answer.right and not answer.refused else None
-            of_place.setdefault(answer.place_id, []).append(sure.confidence(seen) if seen else 0.0)
-    return {place_id: round(float(np.mean(values)), 4) for place_id, values in sorted(of_place.items())}
 
 
 def adapted(model: Model, answers: Iterable[MapAnswer], made_of: str) -> Model:
     """Return a copy of `model` fitted to the answers of a map; those without evidence are ignored. `made_of` is the
     note in the model on what it was fitted to."""
-    answers = [answer for answer in answers if answer.evidence]
-    right = [answer for answer in answers if answer.right]
-    nowhere = [answer for answer in answers if answer.way == MIRRORED]
-    wrong = [answer for answer in answers if answer.way == THERE and not answer.right]
-    left_out = [answer for answer in answers if answer.way == LEFT_OUT]
+    known = [answer for answer in answers if answer.evidence]
+    right = [answer for answer in known if answer.right]
+    nowhere, wrong, left_out = (
+        [answer for answer in known if answer.way == way and not answer.right] for way in (MIRRORED, THERE, LEFT_OUT)
+    )
     return Model(
         of_map=_adapted(model.of_map, right, nowhere, 1.0, _PULL_OF_MAP),
         of_place=_adapted(model.of_place, right + wrong, left_out, _LEFT_OUT_COUNTS, _PULL_OF_PLACE),
@@ -233,18 +218,15 @@ def adapted(model: Model, answers: Iterable[MapAnswer], made_of: str) -> Model:
     )
 
 
-def _adapted(
-    start: Logistic, found: Sequence[MapAnswer], beside: Sequence[MapAnswer], counts: float, pull: float
-) -> Logistic:
-    answers = [*found, *beside]
-    if all(answer.right for answer in answers):  # wrong ones are needed to fit anything
+def _adapted(start: Logistic, found: list[MapAnswer], beside: list[MapAnswer], counts: float, pull: float) -> Logistic:
+    right = np.array([answer.right for answer in found + beside], bool)
+    if right.all():  # wrong ones are needed to fit anything
         return start
-    right = np.array([answer.right for answer in answers], bool)
     weights = np.repeat([1.0, counts], [len(found), len(beside)])
-    return fitted(start, [answer.evidence for answer in answers if answer.evidence], right, weights, pull)
+    return fitted(start, [answer.evidence for answer in found + beside if answer.evidence], right, weights, pull)
 
 
-def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights: np.ndarray, pull: float) -> Logistic:
+def fitted(start: Logistic, rows: Sequence[Evidence], right: Bools, weights: Doubles, pull: float) -> Logistic:
     """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
     `weights`, float (N,), are their weights.
 
@@ -255,7 +237,7 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights
     middle = np.array(start.weights) * scales
     sign = np.where(right, 1.0, -1.0)
 
-    def cost(at: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost(at: Doubles) -> tuple[float, Doubles]:
         logit = mine @ at[:-1] + at[-1]
         off = at[:-1] - middle
         loss = weights @ np.logaddexp(0, -sign * logit) + pull / 2 * off @ off
@@ -266,7 +248,7 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: np.ndarray, weights
     return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
 
 
-def evidence_matrix(rows: Sequence[Evidence], names: Sequence[str]) -> np.ndarray:
+def evidence_matrix(rows: Sequence[Evidence], names: Sequence[str]) -> Doubles:
     """Return the evidence of N matches as a matrix, float64 (N, F), with a column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
@@ -276,13 +258,8 @@ def _mirrored(picture: Levelled) -> Levelled:
     return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
 
 
-def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> np.ndarray:
-    """Return which of the N places may show ground of the place in row `slot` of the index, bool (N,). `near_m` is the
-    ground length of a picture in metres. Without positions, the places mapped just before and after count."""
+def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:
+    """Return which of the N places may show ground of the place `slot`, bool (N,). Pictures are `near_m` wide."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
     beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
     return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * near_m)
-
-
-def _without(index: PlaceIndex, left_out: np.ndarray) -> PlaceIndex:
-    return PlaceIndex(**{name: array[~left_out] for name, array in index.arrays.items()}, mean=index.mean)

@@ -46,10 +46,12 @@ class OrthophotoSource(RecordingSource):
         if self.ended:
             return None
         lattice, at = self._lattice, self._read
-        row, column = map(_numbered, (lattice.rows[at], lattice.columns[at]), lattice.shape)
         self._read += 1
         if self._read == self.total:
             self.end()
+        numbers = zip((lattice.rows[at], lattice.columns[at]), lattice.shape, strict=True)
+        # With leading zeros, so that names sort in the order of the numbers.
+        row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
         name = f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
@@ -63,19 +65,9 @@ class OrthophotoSource(RecordingSource):
             self.without_data += 1
             return None
         return Frame(
-            image=image,
-            name=name,
-            t_mono_s=self._clock(),
-            position=position,
-            heading_deg=0.0,
-            pose=self._pose,
+            image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=self._pose
         )
 
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
-
-
-def _numbered(number: int, count: int) -> str:
-    """Write a number in 0..`count` - 1 with leading zeros, so that names sort in its order."""
-    return str(number).zfill(max(3, len(str(count - 1))))

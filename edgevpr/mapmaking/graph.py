@@ -78,109 +78,125 @@ def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.n
     """Solve the pose graph of N places, `recorded` at complex (N,) metres. `recorded_sd_m`, float (N,), are standard
     deviations of these positions, where known in advance (NaN: one common value is estimated). `log`, complex (N,), are
     the known logs (NaN: unknown; None: all are unknown)."""
-    count = len(recorded)
-    known = np.full(count, np.nan + 0j) if log is None else log
-    _, component = connected_components(_graph(ties, count), directed=False)
-    position, log = _first(recorded, known, ties, component)
-    own = np.isnan(recorded_sd_m)
+    count, own = len(recorded), np.isnan(recorded_sd_m)
+    _, component = connected_components(_matrix(ties, count), directed=False)
+    graph = _Graph(recorded, np.full(count, np.nan + 0j) if log is None else log, ties, component)
     times, scatter_m = _FIRST, _FIRST_M
-    variance = np.zeros(2 * count)
     for _ in range(_ROUNDS):
         sd_m = np.where(own, scatter_m, recorded_sd_m)
-        position, log, normal, agree = _settled(position, log, recorded, sd_m, known, ties, times)
+        normal, agree = graph.settle(sd_m, times)
         variance = 2 * _inverse_diagonal(normal)  # the weights are of one axis, the variance of both
-        steps, turns, off = _residuals(position, log, recorded, ties)
         before = times, scatter_m
         if len(ties):
             # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
             spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
-            off_ties = float(np.median(_off_ties(steps, turns, ties)))
-            times = max(_LEAST, off_ties / _MEDIAN_OF_FOUR / np.sqrt(spare))
+            times = max(_LEAST, float(np.median(graph.off_ties())) / _MEDIAN_OF_FOUR / np.sqrt(spare))
+        off_m = abs(graph.position - recorded)
         if own.any():
             # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
-            scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off[own]) ** 2 + np.median(variance[:count][own]) / 2)))
+            scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off_m[own]) ** 2 + np.median(variance[:count][own]) / 2)))
         if abs(np.log(before[0] / times)) < _SETTLED and abs(np.log(before[1] / scatter_m)) < _SETTLED:
             break
     return Solved(
-        position=position,
-        log=log,
+        position=graph.position,
+        log=graph.log,
         position_var=variance[:count],
         log_var=variance[count:],
         component=component,
         times=times,
         recorded_sd_m=scatter_m,
-        recorded_counts=_agree(abs(off) / sd_m) >= _GONE,
+        recorded_counts=_agree(off_m / sd_m) >= _GONE,
         ties_count=agree >= _GONE,
     )
 
 
-def _settled(
-    position: np.ndarray,
-    log: np.ndarray,
-    recorded: np.ndarray,
-    sd_m: np.ndarray,
-    known: np.ndarray,
-    ties: Ties,
-    times: float,
-) -> tuple[np.ndarray, np.ndarray, csc_matrix, np.ndarray]:
-    """Solve for positions and logs with given scatters, by Gauss-Newton steps. Returns positions and logs, complex (N,)
-    each, the normal matrix (2 N, 2 N), and the robust weight of each tie, float (T,), 0..1."""
-    count = len(position)
-    for _ in range(_MOVES):
-        steps, turns, off = _residuals(position, log, recorded, ties)
-        agree = _agree(_off_ties(steps, turns, ties) / times)
-        by_step, by_turn = (agree / (times * each) ** 2 for each in (ties.step_sd, ties.turn_sd))
-        weights = by_step, by_turn, _agree(abs(off) / sd_m) / sd_m**2
-        jacobian, rest = _linear(position, log, recorded, known, ties, weights)
-        normal = (jacobian.conj().T @ jacobian).tocsc()
-        move = splu(normal + _NOTHING * identity(2 * count)).solve(-(jacobian.conj().T @ rest))
-        # A long move is shortened: far from the solution the logs are not linear.
-        share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
-        position, log = position + share * move[:count], log + share * move[count:]
-        if (abs(move[:count]) < _STAYS * np.exp(log.real)).all():
-            break
-    return position, log, normal, agree
+class _Graph:
+    """N places with T ties, the recorded positions and known logs, and the `position` and `log` found so far, (N,)."""
+
+    def __init__(self, recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> None:
+        """Chain each component's places along its most exact ties, and fit it to its recorded positions and logs."""
+        self._recorded, self._known, self._ties = recorded, known, ties
+        count = len(recorded)
+        position, log = np.zeros(count, complex), np.zeros(count, complex)
+        tree = minimum_spanning_tree(_matrix(ties, count))
+        tie_of = {}
+        for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most exact tie of a pair comes last
+            query, place, step, turn = int(ties.query[at]), int(ties.place[at]), ties.step[at], ties.turn[at]
+            tie_of[query, place], tie_of[place, query] = (step, turn), (-step * np.exp(-turn), -turn)
+        for number in range(component.max(initial=-1) + 1):
+            members = np.flatnonzero(component == number)
+            order, before = breadth_first_order(tree, members[0], directed=False)
+            for at in order[1:].tolist():
+                base = int(before[at])
+                step, turn = tie_of[at, base]
+                position[at], log[at] = position[base] + np.exp(log[base]) * step, log[base] + turn
+            scale, offset = _laid_over(position[members], recorded[members])
+            at_known = members[~np.isnan(known[members])]
+            if len(at_known):
+                scale = np.exp(np.mean(known[at_known] - log[at_known]))
+                offset = np.mean(recorded[members] - scale * position[members])
+            position[members] = scale * position[members] + offset
+            log[members] += np.log(scale)
+        self.position, self.log = position, log
+
+    def settle(self, sd_m: np.ndarray, times: float) -> tuple[csc_matrix, np.ndarray]:
+        """Solve for positions and logs with given scatters, by Gauss-Newton steps. Returns the normal matrix (2 N, 2 N)
+        and the robust weight of each tie, float (T,), 0..1."""
+        count, ties = len(self.position), self._ties
+        for _ in range(_MOVES):
+            agree = _agree(self.off_ties() / times)
+            by_step, by_turn = (agree / (times * each) ** 2 for each in (ties.step_sd, ties.turn_sd))
+            by_recorded = _agree(abs(self.position - self._recorded) / sd_m) / sd_m**2
+            jacobian, rest = self._linear(*map(np.sqrt, (by_step, by_turn, by_recorded)))
+            normal = (jacobian.conj().T @ jacobian).tocsc()
+            move = splu(normal + _NOTHING * identity(2 * count)).solve(-(jacobian.conj().T @ rest))
+            # A long move is shortened: far from the solution the logs are not linear.
+            share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
+            self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
+            if (abs(move[:count]) < _STAYS * np.exp(self.log.real)).all():
+                break
+        return normal, agree
+
+    def off_ties(self) -> Floats:
+        """Return how far each tie is off, in its standard deviations, float (T,)."""
+        steps, turns = self._residuals()
+        off: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
+        return off
+
+    def _residuals(self) -> tuple[Complexes, Complexes]:
+        """Return the residuals of steps and turns, complex (T,) each."""
+        position, log, ties = self.position, self.log, self._ties
+        steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
+        turns = log[ties.query] - log[ties.place] - ties.turn
+        return steps, turns.real + 1j * ((turns.imag + np.pi) % (2 * np.pi) - np.pi)
+
+    def _linear(
+        self, by_step: np.ndarray, by_turn: np.ndarray, by_recorded: np.ndarray
+    ) -> tuple[csc_matrix, np.ndarray]:
+        """Return the weighted Jacobian (R, 2 N) and residuals (R,): steps, turns, recorded positions, known logs."""
+        count, many, ties = len(self._recorded), len(self._ties), self._ties
+        steps, turns = self._residuals()
+        unit = np.exp(-self.log[ties.place])
+        row, at_known = np.arange(many), np.flatnonzero(~np.isnan(self._known))
+        sure, last = np.full(len(at_known), 1 / _SURE), 2 * many + count
+        entries = (  # rows, columns and values
+            (row, ties.query, by_step * unit),
+            (row, ties.place, -by_step * unit),
+            (row, count + ties.place, -by_step * (steps + ties.step)),
+            (many + row, count + ties.query, by_turn),
+            (many + row, count + ties.place, -by_turn),
+            (2 * many + np.arange(count), np.arange(count), by_recorded),
+            (last + np.arange(len(at_known)), count + at_known, sure),
+        )
+        rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
+        jacobian = coo_matrix((values, (rows, columns)), shape=(last + len(at_known), 2 * count)).tocsc()
+        from_recorded = by_recorded * (self.position - self._recorded)
+        from_known = sure * (self.log - self._known)[at_known]
+        return jacobian, np.concatenate([by_step * steps, by_turn * turns, from_recorded, from_known])
 
 
-def _off_ties(steps: Complexes, turns: Complexes, ties: Ties) -> Floats:
-    off: Floats = np.hypot(abs(steps) / ties.step_sd, abs(turns) / ties.turn_sd)
-    return off
-
-
-def _graph(ties: Ties, count: int) -> csc_matrix:
+def _matrix(ties: Ties, count: int) -> csc_matrix:
     return coo_matrix((ties.step_sd, (ties.query, ties.place)), (count, count)).tocsc()
-
-
-def _first(recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first positions and logs, complex (N,) each: chain each component's places along its most exact ties, then
-    fit the component to its recorded positions and known logs."""
-    count = len(recorded)
-    position, log = np.zeros(count, complex), np.zeros(count, complex)
-    tree = minimum_spanning_tree(_graph(ties, count))
-    of_pair = {}
-    for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most exact tie of a pair comes last
-        of_pair[int(ties.query[at]), int(ties.place[at])] = at
-    for number in range(component.max(initial=-1) + 1):
-        members = np.flatnonzero(component == number)
-        order, before = breadth_first_order(tree, members[0], directed=False)
-        for at in order[1:].tolist():
-            base = int(before[at])
-            if (at, base) in of_pair:
-                tie = of_pair[at, base]
-                position[at] = position[base] + np.exp(log[base]) * ties.step[tie]
-                log[at] = log[base] + ties.turn[tie]
-            else:
-                tie = of_pair[base, at]
-                log[at] = log[base] - ties.turn[tie]
-                position[at] = position[base] - np.exp(log[at]) * ties.step[tie]
-        scale, offset = _laid_over(position[members], recorded[members])
-        at = members[~np.isnan(known[members])]
-        if len(at):
-            scale = np.exp(np.mean(known[at] - log[at]))
-            offset = np.mean(recorded[members] - scale * position[members])
-        position[members] = scale * position[members] + offset
-        log[members] += np.log(scale)
-    return position, log
 
 
 def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
@@ -200,43 +216,6 @@ def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, comple
         off = abs(scale * shape + offset - recorded)
         weight = _agree(off / max(_LEAST_M, _scatter(off))) + 1e-6
     return scale, offset
-
-
-def _residuals(
-    position: np.ndarray, log: np.ndarray, recorded: np.ndarray, ties: Ties
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
-    turns = log[ties.query] - log[ties.place] - ties.turn
-    turns = turns.real + 1j * ((turns.imag + np.pi) % (2 * np.pi) - np.pi)
-    return steps, turns, position - recorded
-
-
-def _linear(
-    position: np.ndarray,
-    log: np.ndarray,
-    recorded: np.ndarray,
-    known: np.ndarray,
-    ties: Ties,
-    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[csc_matrix, np.ndarray]:
-    """Return the Jacobian (R, 2 N) and the residuals (R,), weighted: steps, turns, recorded positions, known logs."""
-    count, many = len(recorded), len(ties)
-    steps, turns, off = _residuals(position, log, recorded, ties)
-    by_step, by_turn, by_recorded = map(np.sqrt, weights)
-    unit = np.exp(-log[ties.place])
-    row, at_known = np.arange(many), np.flatnonzero(~np.isnan(known))
-    sure = np.full(len(at_known), 1 / _SURE)
-    last = 2 * many + count
-    rows = [row, row, row, many + row, many + row, 2 * many + np.arange(count), last + np.arange(len(at_known))]
-    columns = [ties.query, ties.place, count + ties.place, count + ties.query, count + ties.place]
-    columns += [np.arange(count), count + at_known]
-    values = [by_step * unit, -by_step * unit, -by_step * (steps + ties.step), by_turn, -by_turn, by_recorded, sure]
-    shape = (last + len(at_known), 2 * count)
-    jacobian = coo_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
-    ).tocsc()
-    from_known = sure * (log - known)[at_known]
-    return jacobian, np.concatenate([by_step * steps, by_turn * turns, by_recorded * off, from_known])
 
 
 def _agree(off: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Doubles, Ints
 from edgevpr.core.errors import UsageError
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, local_crs
@@ -20,10 +21,10 @@ class Lattice:
     """N places of a grid, in arrays (N,): `rows`, int, counted from the north, and `columns`, from the west; `lat_deg`
     and `lon_deg` in degrees of WGS-84. `shape` is the number of (rows, columns) of the whole grid."""
 
-    rows: np.ndarray
-    columns: np.ndarray
-    lat_deg: np.ndarray
-    lon_deg: np.ndarray
+    rows: Ints
+    columns: Ints
+    lat_deg: Doubles
+    lon_deg: Doubles
     shape: tuple[int, int]
 
     def __len__(self) -> int:
@@ -41,18 +42,33 @@ def lattice_of(
     places or more than `MOST_PLACES`.
     """
     plane = local_crs(orthophoto.middle)
-    x_m, y_m = orthophoto.outline(plane)
-    low, high = np.array([x_m.min(), y_m.min()]), np.array([x_m.max(), y_m.max()])
-    _require_fitting(orthophoto, footprint_m, spacing_m, high - low)
+    outline_m = np.array(orthophoto.outline(plane))
+    low, high = outline_m.min(axis=1), outline_m.max(axis=1)
+    size_m = high - low
+    for flag, given_m, most_m in (
+        ("--footprint-m", footprint_m, size_m.min()),
+        ("--spacing-m", spacing_m, size_m.max()),
+    ):
+        if not 0 < given_m <= most_m:  # false for NaN
+            raise UsageError(
+                f"{flag} is {given_m:g}, and {orthophoto.path} is {size_m[0]:.0f} m by {size_m[1]:.0f} m: give more "
+                "than 0 and no more than that."
+            )
     low, high = low + footprint_m / 2, high - footprint_m / 2
     count = ((high - low) / spacing_m).astype(int) + 1
     first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
     begin, end = np.zeros(2, int), count
     if area:
-        _require_touching(orthophoto, area)
-        area_low, area_high = _box(area, plane, margin_m)
-        if (area_high < low).any() or (area_low > high).any():
-            raise _elsewhere(orthophoto, area)
+        polygons_m = [[_metres(ring, plane) for ring in rings] for rings in area.polygons]
+        paths_m = [_metres([(way.lat_deg, way.lon_deg) for way in path], plane) for path in area.paths]
+        corners = [ring for rings in polygons_m for ring in rings]
+        corners += [path + off_m for path in paths_m for off_m in (-margin_m, margin_m)]
+        area_low, area_high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+        if not ((area_low <= high) & (area_high >= low)).all():  # false for what cannot be projected, too
+            raise UsageError(
+                f"The area does not touch {orthophoto.path}: it is at {extent_words(area.extent_deg)}, the orthophoto "
+                f"at {extent_words(orthophoto.extent_deg)}."
+            )
         begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
         end = np.clip(np.floor((area_high - first) / spacing_m) + 1, begin, count).astype(int)
     _require_bounded((end - begin).prod(), _MOST_POINTS if area else MOST_PLACES, spacing_m)
@@ -60,7 +76,10 @@ def lattice_of(
     y_m = y_m[::-1]
     wanted = np.ones((len(y_m), len(x_m)), bool)
     if area and wanted.size:
-        wanted = _inside(area, plane, margin_m, x_m, y_m, spacing_m)
+        wanted = _inside(polygons_m, x_m, y_m, spacing_m)
+        for path in paths_m:
+            for start, stop in zip(path, path[1:] if len(path) > 1 else path, strict=False):
+                _add_near(wanted, x_m, y_m, start, stop, margin_m)
     rows, columns = np.nonzero(wanted)
     _require_bounded(len(rows), MOST_PLACES, spacing_m)
     if not len(rows):
@@ -68,24 +87,10 @@ def lattice_of(
             f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.path}: give a smaller spacing "
             "or a larger margin."
         )
-    lon_deg, lat_deg = transform(plane, WGS84, x_m[columns], y_m[rows])
-    return Lattice(
-        rows=rows + count[1] - end[1],
-        columns=columns + begin[0],
-        lat_deg=np.array(lat_deg),
-        lon_deg=np.array(lon_deg),
-        shape=(int(count[1]), int(count[0])),
-    )
-
-
-def _require_fitting(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, size_m: np.ndarray) -> None:
-    size = f"{orthophoto.path} is {size_m[0]:.0f} m by {size_m[1]:.0f} m"
-    for flag, metres, most_m in (
-        ("--footprint-m", footprint_m, size_m.min()),
-        ("--spacing-m", spacing_m, size_m.max()),
-    ):
-        if not 0 < metres <= most_m:  # false for NaN
-            raise UsageError(f"{flag} is {metres:g}, and {size}: give more than 0 and no more than that.")
+    lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
+    shape = (int(count[1]), int(count[0]))
+    rows, columns = rows + count[1] - end[1], columns + begin[0]
+    return Lattice(rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
 
 
 def _require_bounded(count: int, most: int, spacing_m: float) -> None:
@@ -97,66 +102,29 @@ def _require_bounded(count: int, most: int, spacing_m: float) -> None:
         )
 
 
-def _require_touching(orthophoto: Orthophoto, area: Area) -> None:
-    (south, west, north, east), (other_south, other_west, other_north, other_east) = (
-        orthophoto.extent_deg,
-        area.extent_deg,
-    )
-    if south > other_north + 1 or other_south > north + 1 or west > other_east + 1 or other_west > east + 1:
-        raise _elsewhere(orthophoto, area)  # too far away to be projected to this plane
-
-
-def _elsewhere(orthophoto: Orthophoto, area: Area) -> UsageError:
-    return UsageError(
-        f"The area does not touch {orthophoto.path}: it lies at {extent_words(area.extent_deg)}, the orthophoto at "
-        f"{extent_words(orthophoto.extent_deg)}."
-    )
-
-
 def extent_words(extent_deg: tuple[float, float, float, float]) -> str:
     """Format a bounding box (south, west, north, east) for messages."""
     south, west, north, east = extent_deg
     return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"
 
 
-def _box(area: Area, plane: CRS, margin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest (x, y) of the area with its margin, float64 (2,) each, in metres of `plane`."""
-    points_m = [np.concatenate([_metres(ring, plane) for ring in rings]) for rings in area.polygons]
-    low, high = [each.min(axis=0) for each in points_m], [each.max(axis=0) for each in points_m]
-    for path in _paths_m(area, plane):
-        low.append(path.min(axis=0) - margin_m)
-        high.append(path.max(axis=0) + margin_m)
-    return np.min(low, axis=0), np.max(high, axis=0)
-
-
-def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> np.ndarray:
+def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> Doubles:
     lat_deg, lon_deg = zip(*points, strict=True)
     return np.column_stack(transform(WGS84, plane, lon_deg, lat_deg))
 
 
-def _paths_m(area: Area, plane: CRS) -> list[np.ndarray]:
-    return [_metres([(way.lat_deg, way.lon_deg) for way in path], plane) for path in area.paths]
-
-
-def _inside(area: Area, plane: CRS, margin_m: float, x_m: np.ndarray, y_m: np.ndarray, step_m: float) -> np.ndarray:
-    """Return which points of the grid are in the area, bool (rows, columns). `x_m` are the x of the columns, ascending,
-    and `y_m` the y of the rows, descending, in metres of `plane`; `step_m` is their distance."""
+def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m: float) -> Bools:
+    """Return which points of the grid of ascending x and descending y are in the polygons, bool (rows, columns)."""
     shape = len(y_m), len(x_m)
-    inside = np.zeros(shape, bool)
-    if area.polygons:
-        grid = rasterio.Affine(step_m, 0, x_m[0] - step_m / 2, 0, -step_m, y_m[0] + step_m / 2)
-        rings_m = [[_metres(ring, plane).tolist() for ring in rings] for rings in area.polygons]
-        polygons = [{"type": "Polygon", "coordinates": rings} for rings in rings_m]
-        inside |= geometry_mask(polygons, shape, grid, invert=True)
-    for points_m in _paths_m(area, plane):
-        for begin, end in zip(points_m, points_m[1:] if len(points_m) > 1 else points_m, strict=False):
-            _near(inside, x_m, y_m, begin, end, margin_m)
+    if not polygons_m:
+        return np.zeros(shape, bool)
+    grid = rasterio.Affine(step_m, 0, x_m[0] - step_m / 2, 0, -step_m, y_m[0] + step_m / 2)
+    shapes = [{"type": "Polygon", "coordinates": [ring.tolist() for ring in rings]} for rings in polygons_m]
+    inside: Bools = geometry_mask(shapes, shape, grid, invert=True)
     return inside
 
 
-def _near(
-    inside: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, begin: np.ndarray, end: np.ndarray, margin_m: float
-) -> None:
+def _add_near(inside: Bools, x_m: Doubles, y_m: Doubles, begin: Doubles, end: Doubles, margin_m: float) -> None:
     """Set the points of the grid `inside` to True that are within `margin_m` of the line `begin`-`end`, (2,) each."""
     low, high = np.minimum(begin, end) - margin_m, np.maximum(begin, end) + margin_m
     columns = slice(*np.searchsorted(x_m, (low[0], high[0])))

@@ -4,7 +4,8 @@ confidence. This is the work of the commands `edgevpr map build`, `map refine` a
 import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.mapping import Gaps, MappingResult, Selection, build_map
+from edgevpr.mapmaking.mapping import Gaps, MappingResult, build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import info_of
@@ -98,15 +99,12 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """Result of `make_map`.
-
-    `technique`, `cells`: the technique's name, and its `TechniqueSpec.cells`.
-    `places`, `with_position`: number of places in the map, and of those that have a position.
+    """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of those
+    that have a position.
     `result`: counts of the frames read. `refined`, `calibration`: results of these two steps (None: not done).
     `without_data`: places of an orthophoto that were left out for lack of data (None: not of an orthophoto)."""
 
     technique: str
-    cells: int | None
     places: int
     with_position: int
     result: MappingResult
@@ -118,19 +116,16 @@ class MadeMap:
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
     """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
     cannot be used. `shown` shows progress. Raises EdgevprError."""
-    path, is_cut = map_path(order.path), isinstance(order.pictures, Cuttings)
-    camera = _camera(config.source.camera, is_cut)
-    source = order.pictures.open()
-    mask = None if is_cut else mask_of(config.source.mask)
+    path, here, pictures = map_path(order.path), load_board("this"), order.pictures
     is_new = not (order.append and path.exists())
+    mask = None if isinstance(pictures, Cuttings) else mask_of(config.source.mask)
     if is_new:
-        technique = _new_technique(order, camera, source.total)
+        source, technique = _opened(order, config, None)
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256 if mask else None)
     else:
         place_map = PlaceMap.open_for_adding(path)
-        settings = _settings(order, order.technique or place_map.spec.name, camera)
-        technique = technique_of(place_map, order.technique, settings, load_board("this"))
+        source, technique = _opened(order, config, place_map)
         say_other_mask(place_map, mask)
     with place_map:
         try:
@@ -138,13 +133,9 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 technique,
                 place_map,
-                meter_of(config, load_board("this")),
-                _preparation(config, order.pictures, technique),
-                Selection(
-                    gate=gate_of(config.salience, load_board("this").threads),
-                    gaps=Gaps(config.salience.gap_frames, config.salience.gap_m),
-                    min_quality=technique.min_quality if is_cut else 0.0,
-                ),
+                meter_of(config, here),
+                replace(_preparation(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
+                Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
         except EdgevprError:
@@ -153,17 +144,14 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             raise
         refined, calibration = None, None
         if order.refine and technique.spec.cells is not None:
-            images = order.pictures.source if isinstance(order.pictures, FlownPictures) else ""
-            refined = _unless_impossible(
-                "refined", lambda: refine_map(place_map, technique, images if Path(images).is_dir() else None, shown)
-            )
+            images = pictures.source if isinstance(pictures, FlownPictures) and Path(pictures.source).is_dir() else None
+            with _if_possible("refined"):
+                refined = refine_map(place_map, technique, images, shown)
         if order.calibrate and kinds_of(technique.spec):
-            calibration = _unless_impossible(
-                "calibrated", lambda: calibrate_map(place_map, technique, config, order.pictures, shown)
-            )
+            with _if_possible("calibrated"):
+                calibration = calibrate_map(place_map, technique, config, pictures, shown)
         return MadeMap(
             technique=technique.spec.name,
-            cells=technique.spec.cells,
             places=len(place_map),
             with_position=info_of(place_map).with_position,
             result=result,
@@ -181,10 +169,8 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
             f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
             "with `--camera nadir` can be refined."
         )
-    try:
+    with _needing_scipy():
         from edgevpr.mapmaking.refine import refine
-    except ModuleNotFoundError as error:
-        raise _without_scipy("Refining", "refine", error) from error
     return refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
 
 
@@ -193,10 +179,8 @@ def calibrate_map(
 ) -> MapCalibration:
     """Calibrate the confidence of an open map with the pictures that it was made from (see `calibrate`). A picture that
     cannot be read is left out. Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
-    try:
+    with _needing_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
-    except ModuleNotFoundError as error:
-        raise _without_scipy("Calibrating", "calibrate", error) from error
 
     def frames(names: Collection[str]) -> Iterator[Frame]:
         yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
@@ -212,6 +196,21 @@ def calibrate_map(
     )
 
 
+def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None) -> tuple[Source, Technique]:
+    """Open the pictures, and make the technique: the one asked for, that of the map, or the best for the board."""
+    is_cut, camera, here = isinstance(order.pictures, Cuttings), config.source.camera, load_board("this")
+    if is_cut and camera not in (None, "nadir"):
+        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
+    camera = "nadir" if is_cut else camera
+    source = order.pictures.open()
+    name = order.technique or (place_map.spec.name if place_map else _OF_ORTHOPHOTOS if is_cut else None)
+    name = name or picked_technique(order.board, source.total or 1, camera)
+    settings = order.parameters | camera_setting(name, camera)
+    if place_map:
+        return source, technique_of(place_map, order.technique, settings, here)
+    return source, made_for(here.threads, name, settings)
+
+
 def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
     """Return the steps before encoding: overlay mask and levelling. Pictures cut from an orthophoto need neither."""
     if isinstance(pictures, Cuttings):
@@ -219,38 +218,21 @@ def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: 
     return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
 
 
-def _unless_impossible(what: str, work: Callable[[], Any]) -> Any:
-    """Call `work`, an optional step, and return its result. If it raises EdgevprError, log a warning that the map is
-    not `what` ("refined"), and return None."""
+@contextmanager
+def _if_possible(what: str) -> Iterator[None]:
+    """Log a warning that the map is not `what` if the body of `with`, an optional step, raises EdgevprError."""
     try:
-        return work()
+        yield
     except EdgevprError as error:
         _log.warning("the map is not %s: %s", what, error)
-        return None
 
 
-def _without_scipy(what: str, command: str, error: ModuleNotFoundError) -> UsageError:
-    return UsageError(
-        f"{what} a map needs SciPy ({error}): install it on the machine that builds maps, with "
-        f"`pip install 'edgevpr[maps]'`, and run `edgevpr map {command}`."
-    )
-
-
-def _camera(camera: str | None, is_cut: bool) -> str | None:
-    if is_cut and camera not in (None, "nadir"):
-        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
-    return "nadir" if is_cut else camera
-
-
-def _settings(order: MapOrder, name: str, camera: str | None) -> dict[str, str]:
-    if isinstance(order.pictures, Cuttings):
-        return order.parameters | camera_setting(name, camera)
-    return order.parameters | ({"camera": camera} if camera else {})
-
-
-def _new_technique(order: MapOrder, camera: str | None, places: int) -> Technique:
-    threads = load_board("this").threads
-    if name := order.technique or (_OF_ORTHOPHOTOS if isinstance(order.pictures, Cuttings) else None):
-        return made_for(threads, name, _settings(order, name, camera))
-    name = picked_technique(order.board, places or 1, camera)
-    return made_for(threads, name, order.parameters | camera_setting(name, camera))
+@contextmanager
+def _needing_scipy() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"Refining and calibrating a map need SciPy ({error}): install it on the machine that builds maps, with "
+            "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine` and `edgevpr map calibrate`."
+        ) from error

@@ -1,8 +1,8 @@
 """Making places of a map from frames: every frame is encoded, and is on the disk before the next one is read.
 
-With salience criteria (the "gate"), only frames that reach all thresholds become places. So that no long gaps arise
-(thesis 3.4.8), the other frames are held back ("wait"). After `most_frames` frames or `most_m` metres without a place,
-all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
+With salience criteria (`Preparation.gate`), only frames that reach all thresholds become places. So that no long gaps
+arise (thesis 3.4.8), the other frames are held back ("wait"). After `most_frames` frames or `most_m` metres without a
+place, all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, says_nothing
 from edgevpr.runtime.recognise.levelling import laid
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, Gate, best_of
+from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, best_of
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
@@ -85,28 +85,18 @@ def _frame_of(event: Recognition) -> Frame:
     return event.frame
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Selection:
-    """Rules that select the frames that become places. `min_quality`: least `Descriptor.quality`. `gate`: salience
-    criteria to be met (None: no criteria). `gaps`: chooses among the frames that do not meet them."""
-
-    gate: Gate | None = None
-    gaps: Gaps = field(default_factory=Gaps)
-    min_quality: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
     `not_memorable`: frames that failed the salience criteria, by the criterion that failed."""
 
-    added: int
-    without_position: int
-    already_here: int
-    of_low_quality: int
-    says_nothing: int
-    not_memorable: dict[str, int]
+    added: int = 0
+    without_position: int = 0
+    already_here: int = 0
+    of_low_quality: int = 0
+    says_nothing: int = 0
+    not_memorable: dict[str, int] = field(default_factory=dict)
 
 
 def build_map(
@@ -115,57 +105,49 @@ def build_map(
     place_map: PlaceMap,
     meter: QueryMeter,
     preparation: Preparation | None = None,
-    selection: Selection | None = None,
+    gaps: Gaps | None = None,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
     """Add a place for every selected frame that is not in the map yet, so that an interrupted map can be continued.
 
     Frames are encoded by the same steps as queries. A frame is in the map already if a place has the same name and
     nearly the same descriptor; the name alone does not suffice, since cameras restart their numbering. For a frame that
-    cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised.
+    cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised. Of pictures cut
+    from an orthophoto (surveyed ones), those that hold too little to be recognised are left out.
     """
     place_map.require(technique.spec)
-    preparation, selection = preparation or Preparation(), selection or Selection()
-    walk = Recogniser(
-        Matcher(technique, empty_index(technique.spec, 0, None), ACCEPT_NOTHING),
-        place_map,
-        meter,
-        preparation=replace(preparation, gate=selection.gate),
-    )
+    matcher = Matcher(technique, empty_index(technique.spec, 0, None), ACCEPT_NOTHING)
+    walk = Recogniser(matcher, place_map, meter, preparation=preparation or Preparation())
+    gaps = gaps or Gaps()
     ids_by_image = place_map.ids_by("source_image")
-    counts: Counter[str] = Counter()
-    not_memorable: Counter[str] = Counter()
+    result, not_memorable = MappingResult(), Counter[str]()
 
     def keep(kept: Iterable[Kept]) -> None:
         for event, salience in kept:
             frame = _frame_of(event)
             assert event.descriptor is not None  # set for every frame that could be encoded
             place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
-            counts.update(added=1, without_position=frame.position is None)
+            result.added += 1
+            result.without_position += frame.position is None
             if salience and salience.is_low and event.worth:
-                counts["of_low_quality"] += 1
+                result.of_low_quality += 1
                 not_memorable[event.worth.lacks or ""] -= 1
 
     for frame in frames:
         event = walk.step(frame)
+        min_quality = technique.min_quality if frame.pose and frame.pose.is_surveyed else 0.0
         if event.failed or event.descriptor is None:
             if unusable is None:
                 raise ModelError(event.reason)
             unusable(ImageError(f"{frame.name}: {event.reason}"))
-        elif says_nothing(event.descriptor, selection.min_quality):
-            counts["says_nothing"] += 1
+        elif says_nothing(event.descriptor, min_quality):
+            result.says_nothing += 1
         elif any(place_map.is_of(at, event.descriptor.coarse) for at in ids_by_image.get((readable(frame.name),), ())):
-            counts["already_here"] += 1
+            result.already_here += 1
         else:
             if event.worth and event.worth.lacks:
                 not_memorable[event.worth.lacks] += 1
-            keep(selection.gaps.take(event))
-    keep(selection.gaps.end())
-    return MappingResult(
-        added=counts["added"],
-        without_position=counts["without_position"],
-        already_here=counts["already_here"],
-        of_low_quality=counts["of_low_quality"],
-        says_nothing=counts["says_nothing"],
-        not_memorable=dict(+not_memorable),
-    )
+            keep(gaps.take(event))
+    keep(gaps.end())
+    result.not_memorable = dict(+not_memorable)
+    return result

@@ -53,14 +53,14 @@ def read_area(path: str | Path) -> Area:
     file that is none of them, holds no position, or has one outside -90..90 or -180..180 degrees."""
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
+        area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give a mission file or GeoJSON.") from error
-    except UnicodeDecodeError:
-        raise _foreign(path) from None
-    try:
-        area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
-        raise _foreign(path) from None
+        raise UsageError(
+            f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl and no GeoJSON that can be "
+            "understood: save it again."
+        ) from None
     if not area.polygons and not area.paths:
         raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
     south, west, north, east = area.extent_deg
@@ -69,29 +69,20 @@ def read_area(path: str | Path) -> Area:
     return area
 
 
-def _foreign(path: str | Path) -> UsageError:
-    return UsageError(
-        f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl and no GeoJSON that can be understood: "
-        "save it again."
-    )
-
-
 def _of_lines(lines: list[str]) -> Area:
     """Read the lines of a waypoint file. The first is a heading; the columns of the others are index, current, frame,
     command, four parameters, lat, lon, alt, autocontinue."""
     path: list[Waypoint] = []
-    for line in lines[1:]:
-        values = line.split()
-        if values and len(values) != _WAYPOINT_COLUMNS:
+    for values in filter(None, map(str.split, lines[1:])):
+        if len(values) != _WAYPOINT_COLUMNS:
             raise ValueError
-        if values:
-            path += _waypoint(int(values[3]), int(values[2]), *map(_finite, values[8:11]))
+        path += _waypoint(int(values[3]), int(values[2]), *map(_finite, values[8:11]))
     return Area((), (tuple(path),) if path else ())
 
 
 def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: float) -> list[Waypoint]:
-    """Return a list with the waypoint of a mission item. It is empty for an item that is not flown to, or has the
-    position (0, 0), which means the aircraft's present one. `command` is a MAV_CMD, `frame` a MAV_FRAME."""
+    """Return the waypoint of a mission item in a list, empty for an item that is not flown to. `command` is a MAV_CMD,
+    `frame` a MAV_FRAME, and (0, 0) means the aircraft's present position."""
     if command not in _FLOWN_TO or lat_deg == lon_deg == 0:
         return []
     # Height 0, as of home and a landing, is not that from which pictures are taken: it counts as not given.
@@ -104,26 +95,26 @@ def _of_json(content: Any) -> Area:
     polygons: list[tuple[Ring, ...]] = []
     paths: list[tuple[Waypoint, ...]] = []
     for kind, within in _geometries(content):
-        if kind in ("Polygon", "MultiPolygon"):
-            polygons += [tuple(map(_ring, rings)) for rings in (within if kind == "MultiPolygon" else [within])]
-        else:
-            points = [[point] for point in within]
-            lines = {"Point": [[within]], "MultiPoint": points, "LineString": [within], "MultiLineString": within}[kind]
+        parts = within if kind.startswith("Multi") else [within]
+        if kind.endswith("Polygon"):
+            polygons += [tuple(map(_ring, rings)) for rings in parts]
+        elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString"):
+            lines = [[point] for point in parts] if kind.endswith("Point") else parts
             paths += [tuple(Waypoint(*_lat_lon(point)) for point in line) for line in lines]
+        else:
+            raise ValueError
     return Area(tuple(filter(None, polygons)), tuple(filter(None, paths)))
 
 
 def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the plain geometries in any GeoJSON object, each as (kind such as "Polygon", coordinates)."""
-    kind = content["type"]
-    if kind == "Feature":
-        if content["geometry"]:
-            yield from _geometries(content["geometry"])
-    elif kind in ("FeatureCollection", "GeometryCollection"):
-        for part in content["features" if kind == "FeatureCollection" else "geometries"]:
-            yield from _geometries(part)
+    if "coordinates" in content:
+        yield content["type"], content["coordinates"]
+    elif content["type"] == "Feature":
+        yield from _geometries(content["geometry"]) if content["geometry"] else ()
     else:
-        yield kind, content["coordinates"]
+        for part in content["features" if content["type"] == "FeatureCollection" else "geometries"]:
+            yield from _geometries(part)
 
 
 def _lat_lon(point: list[float]) -> LatLon:
@@ -144,23 +135,18 @@ def _of_plan(items: list[dict[str, Any]]) -> Area:
     polygons: list[tuple[Ring, ...]] = []
     for item in items:
         if item["type"] == "SimpleItem":
-            at = [_finite(value or 0) for value in item["params"][4:7]]
-            path += _waypoint(int(item["command"]), int(item["frame"]), *at)
+            path += _waypoint(int(item["command"]), int(item["frame"]), *map(_finite, item["params"][4:7]))
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
-        path += [Waypoint(*_corner(point), height_m) for point in style.get("VisualTransectPoints", ())]
-        if corners := [_corner(point) for point in item.get("polygon", ())]:
-            polygons.append(([*corners, corners[0]],))
+        seen_from = style.get("VisualTransectPoints", ())
+        path += [Waypoint(_finite(lat_deg), _finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in seen_from]
+        corners = [(_finite(lat_deg), _finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
+        polygons += [([*corners, corners[0]],)] if corners else []
     return Area(tuple(polygons), (tuple(path),) if path else ())
 
 
-def _corner(point: list[float | None]) -> LatLon:
-    lat_deg, lon_deg = (_finite(value or 0) for value in point[:2])
-    return lat_deg, lon_deg
-
-
-def _finite(value: float | str) -> float:
-    if not math.isfinite(number := float(value)):
+def _finite(value: float | str | None) -> float:
+    if not math.isfinite(number := float(value or 0)):
         raise ValueError
     return number

@@ -2,7 +2,7 @@
 top. `cuttings` makes the frames of a map from them."""
 
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,24 +13,10 @@ from edgevpr.core.types import Position
 from edgevpr.frames.images import resized
 from edgevpr.mapmaking.rasters import CRS, CPLE_BaseError, GeoRaster, RasterioError, TileFolder, rasterio, transform
 
-Pixel = tuple[int, int]  # column and row
 Coordinate = TypeVar("Coordinate", float, Doubles)
 WGS84 = CRS.from_epsg(4326)
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
-
-
-class Raster(Protocol):
-    """A georeferenced grid of pixels: see `rasters.GeoRaster` for its fields."""
-
-    crs: CRS
-    transform: rasterio.Affine
-    width: int
-    height: int
-
-    def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]: ...
-
-    def close(self) -> None: ...
 
 
 def local_crs(at: Position) -> CRS:
@@ -48,37 +34,36 @@ class Orthophoto:
         self.path = Path(path)
         if not self.path.exists():
             raise SourceError(f"There is no orthophoto {path}: check the name.")
-        self._raster: Raster = TileFolder(self.path) if self.path.is_dir() else GeoRaster(self.path)
-        raster = self._raster
+        self._raster = TileFolder(self.path) if self.path.is_dir() else GeoRaster(self.path)
         try:
-            self.middle = self._middle()
-            lon_deg, lat_deg = self.outline(WGS84)
+            columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
+            (lon_deg,), (lat_deg,) = self._through(columns, rows, WGS84)
+            self.middle = Position(lat_deg, (lon_deg + 180) % 360 - 180)
+            lons_deg, lats_deg = self.outline(WGS84)
         except (CPLE_BaseError, RasterioError):
-            lat_deg = lon_deg = np.array([np.nan])
-        if not np.isfinite((lat_deg, lon_deg)).all():
+            lats_deg = lons_deg = np.array([np.nan])
+        if not np.isfinite((lats_deg, lons_deg)).all():
             self.close()
             raise SourceError(
-                f"{path}: its coordinate system ({raster.crs.to_string()[:60]}) cannot be brought to latitude and "
-                "longitude: export it with another, such as UTM or EPSG:4326."
+                f"{path}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to latitude "
+                "and longitude: export it with another, such as UTM or EPSG:4326."
             )
-        lon_deg = self.middle.lon_deg + (lon_deg - self.middle.lon_deg + 180) % 360 - 180
-        self.extent_deg = (lat_deg.min(), lon_deg.min(), lat_deg.max(), lon_deg.max())
+        lons_deg = self.middle.lon_deg + (lons_deg - self.middle.lon_deg + 180) % 360 - 180
+        self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
         metre_px = self._pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
-
-    def _middle(self) -> Position:
-        x, y = _through(self._raster.transform, self._raster.width / 2, self._raster.height / 2)
-        (lon_deg,), (lat_deg,) = transform(self._raster.crs, WGS84, [x], [y])
-        return Position(lat_deg, (lon_deg + 180) % 360 - 180)
 
     def outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
         """Return points along the edges of the file, x and y in the coordinate system `crs`, float64 (N,) each."""
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
         rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
-        x, y = _through(self._raster.transform, columns, rows)
-        to_x, to_y = transform(self._raster.crs, crs, x, y)
-        return np.array(to_x), np.array(to_y)
+        return self._through(columns, rows, crs)
+
+    def _through(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
+        """Return x and y in `crs`, float64 (N,) each, of pixels, float (N,) each."""
+        x, y = transform(self._raster.crs, crs, *_moved(self._raster.transform, columns, rows))
+        return np.array(x), np.array(y)
 
     def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
         """Return (column, row), float64 (N, 2), whole numbers at the corners of pixels, of points (N, 2) in metres east
@@ -86,9 +71,9 @@ class Orthophoto:
         raster = self._raster
         x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
         if raster.crs.is_geographic:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
-            middle, _ = _through(raster.transform, raster.width / 2, raster.height / 2)
+            middle, _ = _moved(raster.transform, raster.width / 2, raster.height / 2)
             x += 360 * np.round((middle - x) / 360)
-        return np.column_stack(_through(~raster.transform, x, y))
+        return np.column_stack(_moved(~raster.transform, x, y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
@@ -129,7 +114,7 @@ class Orthophoto:
         self._raster.close()
 
 
-def _through(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+def _moved(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 

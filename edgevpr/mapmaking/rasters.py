@@ -41,6 +41,10 @@ _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
 # Values of 16 bits are scaled to 8 bits; these percentiles, of sample windows all over the file, become 0 and 255.
 _PERCENTILES = (2, 98)
 _WINDOWS, _WINDOW_PX = 12, 64
+_ENDS = (".png", ".jpg", ".jpeg", ".webp")  # of tiles
+_HALF_WORLD_M = math.pi * 6_378_137.0  # of Web Mercator
+
+Pixel = tuple[int, int]  # column and row
 
 
 class GeoRaster:
@@ -69,26 +73,21 @@ class GeoRaster:
             raise
 
     def _colour_bands(self) -> list[int]:
-        """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError for a
-        file that is no picture."""
+        """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError."""
         kinds, dtypes = self._data.colorinterp, self._data.dtypes
-        if not self.crs or self.transform.is_identity:
-            raise SourceError(
-                f"{self._path} has no geo-reference (coordinate system and position): export it as GeoTIFF with one."
-            )
-        if ColorInterp.palette in kinds:
-            raise SourceError(
-                f"{self._path} holds numbers of a palette: make colours of them with `gdal_translate -expand rgb`."
-            )
         colours = [kinds.index(colour) + 1 for colour in _COLOURS if colour in kinds]
         others = [number for number, kind in enumerate(kinds, start=1) if kind != ColorInterp.alpha]
         if len(colours) < 3:
             colours = others[2::-1] if len(others) >= 3 else others[:1]
-        if not colours or any(dtypes[band - 1] not in _DTYPES for band in colours):
-            raise SourceError(
-                f"{self._path} holds {dtypes[0]} numbers, such as heights or measurements, and no picture: give an "
-                "orthophoto of 8 or 16 bits (unsigned)."
-            )
+        fault = None
+        if not self.crs or self.transform.is_identity:
+            fault = "it has no geo-reference (coordinate system and position)"
+        elif ColorInterp.palette in kinds:
+            fault = "it holds numbers of a palette (`gdal_translate -expand rgb` makes colours of them)"
+        elif not colours or any(dtypes[band - 1] not in _DTYPES for band in colours):
+            fault = f"it holds {dtypes[0]} numbers, such as heights, and no picture of 8 or 16 bits"
+        if fault:
+            raise SourceError(f"{self._path} is no orthophoto: {fault}.")
         return colours
 
     def _find_tone(self) -> Bytes:
@@ -97,12 +96,13 @@ class GeoRaster:
         for top in np.linspace(0, max(0, self.height - _WINDOW_PX), _WINDOWS).astype(int):
             for left in np.linspace(0, max(0, self.width - _WINDOW_PX), _WINDOWS).astype(int):
                 window = Window(left, top, min(_WINDOW_PX, self.width), min(_WINDOW_PX, self.height))
-                values.append(self._read(window, (window.height, window.width)))
-        seen = np.concatenate([bands[:, valid].ravel() for bands, valid in values])
+                bands, valid = self._read(window, (window.height, window.width))
+                values.append(bands[:, valid].ravel())
+        seen = np.concatenate(values)
         low, high = np.percentile(seen, _PERCENTILES) if len(seen) else (0, 65535)
         return np.clip((np.arange(65536) - low) * (255 / max(high - low, 1)), 0, 255).round().astype(np.uint8)
 
-    def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
+    def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]:
         """Read the window from (column, row) `low` to `high` (not included), reduced by the factor `shrink`: each pixel
         of the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
 
@@ -133,35 +133,25 @@ class GeoRaster:
         self._data.close()
 
 
-_ENDS = (".png", ".jpg", ".jpeg", ".webp")
-_HALF_WORLD_M = math.pi * 6_378_137.0  # of Web Mercator
-
-
 class TileFolder:
     """Map tiles of a folder (zoom/x/y.png, Web Mercator), of its highest zoom. The fields are those of `GeoRaster`."""
 
     def __init__(self, folder: Path) -> None:
         """List the tiles. Raises SourceError for a folder that holds none."""
-        zooms = [path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()]
-        self._tiles: dict[tuple[int, int], Path] = {}
-        for path in max(zooms, key=lambda path: int(path.name)).glob("*/*") if zooms else ():
-            if path.suffix.lower() in _ENDS and path.stem.isdecimal() and path.parent.name.isdecimal():
-                self._tiles[int(path.parent.name), int(path.stem)] = path
-        if not self._tiles:
-            raise SourceError(
-                f"{folder} holds no map tiles (z/x/y.png or .jpg, the highest zoom counts): give the folder above the "
-                "zooms, or a file."
-            )
-        decoded = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in self._tiles.values())
-        first = next((tile for tile in decoded if tile is not None), None)
+        zoom = max((int(path.name) for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()), default=0)
+        self._tiles = {
+            (int(path.parent.name), int(path.stem)): path
+            for path in folder.glob(f"{zoom}/*/*")
+            if path.suffix.lower() in _ENDS and path.stem.isdecimal() and path.parent.name.isdecimal()
+        }
+        first = next((tile for path in self._tiles.values() if (tile := _decoded(path)) is not None), None)
         if first is None or first.shape[0] != first.shape[1] or first.shape[0] & first.shape[0] - 1:
             raise SourceError(
-                f"{folder} holds pictures that are no tiles of a map, which are square, of 256 or 512 pixels: copy the "
-                "tiles again."
+                f"{folder} holds no map tiles (z/x/y.png or .jpg, square, of 256 or 512 pixels; the highest zoom "
+                "counts): give the folder above the zooms, or a file."
             )
-        zoom, self._side_px = max(int(path.name) for path in zooms), len(first)
         columns, rows = zip(*self._tiles, strict=True)
-        self._left, self._top = min(columns), min(rows)
+        self._side_px, self._left, self._top = len(first), min(columns), min(rows)
         self.width = (max(columns) + 1 - self._left) * self._side_px
         self.height = (max(rows) + 1 - self._top) * self._side_px
         self.crs = CRS.from_epsg(3857)
@@ -170,33 +160,34 @@ class TileFolder:
         pixel_m = tile_m / self._side_px
         self.transform = rasterio.Affine(pixel_m, 0, west_m, 0, -pixel_m, north_m)
 
-    def read(self, low: tuple[int, int], high: tuple[int, int], shrink: int) -> tuple[Image, Bools]:
+    def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]:
         """Read a window as `GeoRaster.read` does. There is no data where a tile is missing or damaged."""
         (left, top), (right, bottom) = low, high
         side = self._side_px
         bgra = np.zeros(((bottom - top) // shrink, (right - left) // shrink, 4), np.uint8)
         for row in range(top // side, -(-bottom // side)):
             for column in range(left // side, -(-right // side)):
-                tile = self._tile(column, row, side // shrink)
+                path = self._tiles.get((self._left + column, self._top + row))
+                tile = _decoded(path) if path else None
                 if tile is not None:
+                    tile = resized(tile, (side // shrink, side // shrink))
                     at_row, at_column = (row * side - top) // shrink, (column * side - left) // shrink
                     inside = bgra[max(at_row, 0) : at_row + len(tile), max(at_column, 0) : at_column + len(tile)]
                     part = tile[max(-at_row, 0) :, max(-at_column, 0) :]
                     inside[:] = part[: inside.shape[0], : inside.shape[1]]
         return bgra[..., :3], bgra[..., 3] > 127
 
-    def _tile(self, column: int, row: int, side_px: int) -> Image | None:
-        """Read the tile at `column` and `row`, counted from the north-west tile, and scale it to uint8 (side_px,
-        side_px, 4) BGR and alpha. None: it is missing or damaged."""
-        path = self._tiles.get((self._left + column, self._top + row))
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path else None
-        if picture is None or picture.dtype != np.uint8:
-            return None
-        if picture.ndim == 2:
-            picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGRA)
-        elif picture.shape[2] == 3:
-            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2BGRA)
-        return resized(picture, (side_px, side_px))  # type: ignore[arg-type]  # its dtype has been checked
-
     def close(self) -> None:
         """Do nothing: no file is held open between tiles."""
+
+
+def _decoded(path: Path) -> Image | None:
+    """Read a tile, uint8 (H, W, 4) BGR and alpha; None if it is damaged."""
+    tile = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if tile is None or tile.dtype != np.uint8:
+        return None
+    if tile.ndim == 2:
+        tile = cv2.cvtColor(tile, cv2.COLOR_GRAY2BGRA)
+    elif tile.shape[2] == 3:
+        tile = cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA)
+    return np.asarray(tile, np.uint8)

@@ -6,14 +6,14 @@ and mounting of the camera need not be known. A place with ties (see `graph`) to
 position and gets no pose.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Complexes, Floats
+from edgevpr.core.arrays import Bools, Floats
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.geodesy import metres, moved
@@ -22,7 +22,6 @@ from edgevpr.mapmaking.graph import Solved, solve
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, pictures, tied, ties_of
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.sqlite import sentences
 
 _LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
 _MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
@@ -41,9 +40,9 @@ class Refined:
     places: int
     without_position: int
     surveyed: int
-    refined: int
-    ties: int
-    ties_refused: int
+    refined: int = 0
+    ties: int = 0
+    ties_refused: int = 0
     recorded_sd_m: float | None = None
     moved_m: float | None = None
     position_sd_m: float | None = None
@@ -66,17 +65,18 @@ def refine(
     places = list(_readable(place_map))
     placed = [place for place in places if place.position]
     surveyed = np.array([bool(place.pose and place.pose.is_surveyed) for place in placed], bool)
-    result = Refined(
-        places=len(places), without_position=len(places) - len(placed), surveyed=int(surveyed.sum()), refined=0, ties=0,
-        ties_refused=0,
-    )  # fmt: skip
+    without_position = len(places) - len(placed)
+    result = Refined(places=len(places), without_position=without_position, surveyed=int(surveyed.sum()))
     if not placed or surveyed.all():
         return result
     recorded_at = [_recorded(place) for place in placed]
-    recorded = complex_metres(recorded_at)
-    poses = [place.pose if place.pose and place.pose.is_surveyed else None for place in placed]
-    known_sd_m = np.array([np.nan if pose is None else _sd_m(pose) for pose in poses])
-    known_log = np.array([np.nan if pose is None else log_of(pose) for pose in poses])
+    east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
+    recorded = east_m + 1j * north_m
+    known_sd_m, known_log = np.full(len(placed), np.nan), np.full(len(placed), np.nan + 0j)
+    for at in np.flatnonzero(surveyed).tolist():
+        if pose := placed[at].pose:
+            known_sd_m[at] = np.sqrt((pose.covariance_m2[0] + pose.covariance_m2[2]) / 2)
+            known_log[at] = np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg)
     look = looker(place_map, technique, placed, pictures(images, technique) if images else None)
     pairs = likely_pairs(recorded)
     ties = tied(watch(pairs, len(pairs)), look)
@@ -86,9 +86,7 @@ def refine(
         ties |= tied(watch(more, len(more)), look)
         solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
     sure = _is_sure(solved) & ~surveyed
-    # A place without enough ties gets its recorded position back, unless its pose did not come from refinement.
-    by_refining = np.array([place.pose is None or place.pose.recorded is not None for place in placed], bool)
-    _write(place_map, placed, recorded_at, solved, sure, sure | by_refining)
+    _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
     amiss = sure & ~solved.recorded_counts & (off_m > _AMISS * solved.recorded_sd_m)
     return replace(
@@ -106,18 +104,6 @@ def refine(
     )
 
 
-def complex_metres(positions: Sequence[Position]) -> Complexes:
-    """Return positions as complex (N,), east + i north in metres from the first of them."""
-    lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in positions]).T
-    east_m, north_m = metres(lat_deg, lon_deg)
-    return east_m + 1j * north_m
-
-
-def log_of(pose: Pose) -> complex:
-    """Return the complex log of a pose, ln(footprint_m) - i up (see `graph`)."""
-    return complex(np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg))
-
-
 def _recorded(place: Place) -> Position:
     """Return the position of a place as it was before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
@@ -132,30 +118,17 @@ def _is_sure(solved: Solved) -> Bools:
     return is_sure
 
 
-def _sd_m(pose: Pose) -> float:
-    var_east, _, var_north = pose.covariance_m2
-    return float(np.sqrt((var_east + var_north) / 2))
-
-
 def _readable(place_map: PlaceMap) -> Iterator[Place]:
     for place_id, *_ in place_map.outlines():
         with suppress(PlaceError):
             yield from place_map.places([place_id])
 
 
-def _write(
-    place_map: PlaceMap,
-    placed: list[Place],
-    recorded_at: list[Position],
-    solved: Solved,
-    sure: Bools,
-    may_change: Bools,
-) -> None:
-    """Write the solution to the map: refined position and pose for places where `sure`, bool (N,), is True; recorded
-    position and no pose for the others where `may_change`, bool (N,), is True."""
+def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: Solved, sure: Bools) -> None:
+    """Write position and pose of the places that are `sure`, bool (N,); the others become as recorded again."""
     origin = recorded_at[0]
-    with sentences(place_map.path), place_map.transaction():
-        for at in np.flatnonzero(may_change).tolist():
+    with place_map.transaction():
+        for at, place in enumerate(placed):
             position, pose = recorded_at[at], None
             if sure[at]:
                 var_m2, offset_m = float(solved.position_var[at]) / 2, solved.position[at]
@@ -166,7 +139,8 @@ def _write(
                     covariance_m2=(var_m2, 0.0, var_m2),
                     recorded=recorded_at[at],
                 )
-            place_map.lay(placed[at].place_id, position, pose)
+            if pose or place.pose is None or place.pose.recorded:
+                place_map.lay(place.place_id, position, pose)
 
 
 def _median(values: Floats) -> float | None:

@@ -8,7 +8,7 @@ the technique compares their regions as in flight, which gives a rough relative 
 compared again near that pose.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,14 +17,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from edgevpr.core.arrays import Array, Bools, Complexes
-from edgevpr.core.contract import Descriptor, FineMatch, Technique
+from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Place
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import Ties
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Agreement, Overlay, agreement
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 
 _NEAREST = 8  # each place is compared with so many places recorded nearest
@@ -62,32 +62,30 @@ def likely_pairs(recorded: Complexes) -> list[Pair]:
     """Return the pairs of places that may overlap. `recorded` is their positions, complex (N,) metres, as mapped."""
     count = len(recorded)
     pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
-    if count > 1:
-        points = np.stack([recorded.real, recorded.imag], axis=1)
-        _, near = cKDTree(points).query(points, k=min(_NEAREST + 1, count))
-        pairs |= {_later_first(at, other) for at, row in enumerate(near.tolist()) for other in row if other != at}
-    return sorted(pairs)
+    return sorted(pairs | {(at, other) for at, other, _ in _near(recorded, _NEAREST)})
 
 
 def overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
     """Return the pairs that overlap by `position` and `log` of a solved graph, among places where `of` (N,) is True."""
-    members = np.flatnonzero(of).tolist()
-    if len(members) < 2:
-        return []
-    points, footprint_m = np.stack([position.real, position.imag], axis=1)[members], np.exp(log.real[members])
-    away_m, near = cKDTree(points).query(points, k=min(_MOST_OVERLAPPING + 1, len(members)))
+    members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
+    near = _near(position[members], _MOST_OVERLAPPING)
     return sorted(
         {
-            _later_first(members[at], members[other])
-            for at, (row_m, row) in enumerate(zip(away_m.tolist(), near.tolist(), strict=True))
-            for other_m, other in zip(row_m, row, strict=True)
-            if other != at and other_m <= _OVERLAPS * min(footprint_m[at], footprint_m[other])
+            (int(members[at]), int(members[other]))
+            for at, other, away_m in near
+            if away_m <= _OVERLAPS * min(footprint_m[at], footprint_m[other])
         }
     )
 
 
-def _later_first(one: int, other: int) -> Pair:
-    return max(one, other), min(one, other)
+def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
+    """Yield (number of a place, number of an earlier one, metres apart) for the `most` nearest of each of N places."""
+    if len(position) > 1:
+        points = np.stack([position.real, position.imag], axis=1)
+        away_m, near = cKDTree(points).query(points, k=min(most + 1, len(points)))
+        for (at, nth), other in np.ndenumerate(near):
+            if other != at:
+                yield max(at, int(other)), min(at, int(other)), float(away_m[at, nth])
 
 
 def tied(pairs: Iterable[Pair], look: Look) -> dict[Pair, Tie]:
@@ -121,14 +119,16 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
         found = encoded(places[at].source_image) if encoded else None
         return found if found and place_map.is_of(places[at].place_id, found.coarse) else None
 
-    def agreed(query: int, place: int, expected: Overlay | None) -> Agreement | None:
+    def by_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
         one, other = landmarks(query), landmarks(place)
-        return None if one is None or other is None else agreement(one, other, expected)
+        found = None if one is None or other is None else agreement(one, other, expected)
+        if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
+            return None
+        return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
 
     def look(query: int, place: int) -> Tie | None:
-        by_landmarks = agreed(query, place, None)
-        if by_landmarks and by_landmarks.inliers >= PROVEN:
-            return _of_landmarks(by_landmarks)
+        if tie := by_landmarks(query, place, None, PROVEN):
+            return tie
         asking, part = descriptor(query), coarse.get(places[place].place_id)
         if asking is None or part is None:
             return None
@@ -139,11 +139,10 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
         match = technique.match(asking, fine, _likely(technique, asking, part))
         if match.score < _ASKED:
             return None
-        vote = _vote_of(match, technique.spec.cells or 1)
-        by_landmarks = agreed(query, place, vote)
-        if by_landmarks and by_landmarks.inliers >= CONFIRMED:
-            return _of_landmarks(by_landmarks)
-        return _tie(vote, _OF_VOTE) if match.score >= _VOTE else None
+        (dx, dy), cells = match.shift_cells or (0.0, 0.0), technique.spec.cells or 1
+        vote = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
+        tie = by_landmarks(query, place, vote, CONFIRMED)
+        return tie or (_tie(vote, _OF_VOTE) if match.score >= _VOTE else None)
 
     return look
 
@@ -162,24 +161,12 @@ def pictures(folder: str | Path, technique: Technique) -> Encoded:
 
 
 def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
-    """Return the best hypotheses (rotations of query `asking`) for `Technique.match`, by the scores with the place's
-    coarse part `part`. Only the map's own height is tried: neighbours are from about the same height."""
+    """Return the best rotations of query `asking` for `Technique.match`, by the scores with the coarse part `part`."""
     _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
     assert by_hypothesis is not None  # set by techniques for a camera that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
     likely: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
     return likely
-
-
-def _vote_of(match: FineMatch, cells: int) -> Overlay:
-    dx, dy = match.shift_cells or (0.0, 0.0)
-    return Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
-
-
-def _of_landmarks(found: Agreement) -> Tie:
-    assert found.shift_share is not None  # set if any landmarks agree
-    assert found.rotation_deg is not None
-    return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
 
 
 def _tie(seen: Overlay, sds: tuple[float, float]) -> Tie:

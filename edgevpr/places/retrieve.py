@@ -136,38 +136,35 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
         raise MapError(
             f"{query.place_map.path}: no place of it can be read any more: restore a copy, or build it again."
         )
-    found = looks.scores_in_full(chosen)
-    slots = np.array([slot for slot, _ in chosen])
-    if len(slots) < np.count_nonzero(readable):
-        others = elsewhere(index, slots[np.argmax(found)], np.arange(len(index)), neighbour_m)
-        rivals, enough = np.count_nonzero(others[slots]), 1 if in_reach is None else _COMPARED_ELSEWHERE
+    looks.compare(chosen)
+    if len(looks.scores) < np.count_nonzero(readable):
+        best = max(looks.scores, key=looks.scores.__getitem__)
+        others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
+        compared = list(looks.scores)
+        rivals, enough = np.count_nonzero(others[compared]), 1 if in_reach is None else _COMPARED_ELSEWHERE
         if rivals < enough:
-            others[slots] = False
-            more = looks.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals))
-            found += looks.scores_in_full(more)
-            slots = np.append(slots, [slot for slot, _ in more]).astype(np.intp)
-    order = np.argsort(-np.array(found, np.float32), kind="stable")
-    slots, ranked = slots[order], np.array(found, np.float32)[order]
-    last = sorted((glance for glance in looks.passed_over if glance[1][0] not in looks.matches), key=lambda it: -it[0])
+            others[compared] = False
+            looks.compare(looks.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals)))
+    slots, found = np.array(list(looks.scores), np.intp), np.array(list(looks.scores.values()), np.float32)
+    order = np.argsort(-found, kind="stable")
+    slots, found = slots[order], found[order]
+    last = sorted((glance for glance in looks.passed_over if glance[1][0] not in looks.scores), key=lambda it: -it[0])
     return Ranking(
         np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
-        np.append(ranked, np.minimum([score for score, _ in last], ranked[-1])).astype(np.float32),
+        np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
         looks.matches,
         _unread(scanned.scores, readable, slots[0]),
     )
 
 
 class _Comparison:
-    """The comparisons of one query with places of its map. `matches` has the full ones by slot, `passed_over` the
-    places compared in part only. `readable` bool (N,) is False for places left out (all True without a fine part).
-
-    Comparing raises PlaceError if a place cannot be read, after all places have been tried; it is then left out. It
-    raises MapError if the file cannot be read.
-    """
+    """The comparisons of one query with places of its map. `scores` has those compared in full by slot, `matches` their
+    matches (none without a fine part), `passed_over` the places compared in part only. `readable` bool (N,) is False
+    for places left out (all True without a fine part)."""
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
-        self._query, self._scores = query, scanned.scores
+        self._query, self._scanned = query, scanned.scores
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
         self._tries_all = self.is_exact and expected.in_reach is None and expected.turned_deg is None
@@ -176,6 +173,7 @@ class _Comparison:
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
+        self.scores: dict[int, float] = {}
         self.matches: dict[int, FineMatch] = {}
         self.passed_over: list[Glance] = []
 
@@ -185,7 +183,7 @@ class _Comparison:
         if self._tries_all and self._by_hypothesis is not None:
             of_slot = self._by_hypothesis
             return [(at, np.flatnonzero(np.isfinite(of_slot[at])).tolist()) for at in np.flatnonzero(among).tolist()]
-        chosen = best_scanned(self._scores, self._by_hypothesis, among, count)
+        chosen = best_scanned(self._scanned, self._by_hypothesis, among, count)
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
         glances = sorted(self._look_at(chosen, self._glance), key=lambda glance: -glance[0])
@@ -195,15 +193,16 @@ class _Comparison:
     def next_best(self, among: Bools, count: int) -> list[Choice]:
         """Choose up to `count` more places where `among` is True: from `passed_over`, or if none is in it, by scan."""
         more = [choice for _, choice in self.passed_over if among[choice[0]]][:count]
-        return more or best_scanned(self._scores, self._by_hypothesis, among, count)
+        return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
 
-    def scores_in_full(self, chosen: list[Choice]) -> list[float]:
-        """Compare the chosen places in full, and return their scores in the same order; fill `matches`."""
-        slots = [slot for slot, _ in chosen]
+    def compare(self, chosen: list[Choice]) -> None:
+        """Compare the chosen places in full. Raises PlaceError if a place cannot be read, after all have been tried;
+        it is then left out. Raises MapError if the file cannot be read."""
         if self._has_one_stage:
-            return [float(score) for score in self._scores[slots]]
-        self.matches.update(zip(slots, self._look_at(chosen, self._match), strict=True))
-        return [self.matches[slot].score for slot in slots]
+            self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
+            return
+        for (slot, _), match in zip(chosen, self._look_at(chosen, self._match), strict=True):
+            self.matches[slot], self.scores[slot] = match, match.score
 
     def _match(self, slot: int, fine: Array, hypotheses: list[int] | None) -> FineMatch:
         match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
@@ -214,7 +213,7 @@ class _Comparison:
         return self._with_scan(slot, score), (slot, best)
 
     def _with_scan(self, slot: int, score: float) -> float:
-        return score * (1 + float(self._scores[slot])) / 2 if self._query.technique.spec.scan_counts else score
+        return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
 
     def _look_at(self, chosen: list[Choice], look: Callable[[int, Array, list[int] | None], T]) -> list[T]:
         found: list[T] = []
@@ -239,16 +238,15 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     for slot, match in other.compared.items():
         if slot not in compared or match.score > compared[slot].score:
             compared[slot] = match
-    best, last = sorted(compared, key=lambda slot: -compared[slot].score), dict[int, float]()
+    least, last = min(match.score for match in compared.values()), dict[int, float]()
     for ranking in (one, other):
         for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
             if slot not in compared:
                 last[slot] = max(score, last.get(slot, score))
-    rest = sorted(last, key=lambda slot: -last[slot])
-    least = compared[best[-1]].score
-    scores = [compared[slot].score for slot in best] + [min(last[slot], least) for slot in rest]
+    scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
+    scores |= {slot: min(last[slot], least) for slot in sorted(last, key=lambda slot: -last[slot])}
     unread = np.union1d(one.unread, other.unread).astype(np.intp)
-    return Ranking(np.array(best + rest, np.intp), np.array(scores, np.float32), compared, unread)
+    return Ranking(np.array(list(scores), np.intp), np.array(list(scores.values()), np.float32), compared, unread)
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = ()) -> Bools:
@@ -322,11 +320,10 @@ def _largest(scores: Singles, count: int) -> Ints:
 def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
     """Return the slots of the left-out places that the query may show (see `Ranking`). `best` is the best slot."""
     slots: Ints = np.flatnonzero(~readable)
-    if not len(slots):
-        return slots
-    likely = min(_LIKELY, len(scores))
-    least = min(scores[best], np.partition(scores, -likely)[-likely])
-    return np.asarray(slots[scores[slots] >= least])
+    if len(slots):
+        likely = min(_LIKELY, len(scores))
+        slots = slots[scores[slots] >= min(scores[best], np.partition(scores, -likely)[-likely])]
+    return slots
 
 
 def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
@@ -337,8 +334,7 @@ def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: Lat
 
 
 def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Note the unreadable places as left out, and return the first error. But if they are most of the `tried` places,
-    note none, and return a MapError about the file."""
+    """Note unreadable places as left out and return the first error; if they are most `tried`, one of the file."""
     first = unreadable[0]
     if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
         return MapError(

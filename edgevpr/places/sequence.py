@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Floats, Ints, Singles
+from edgevpr.core.arrays import Bools, Floats, Singles
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
@@ -73,24 +73,22 @@ class SequenceSearch:
 
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
-        by the mean score of their best trajectory.
+        by the mean score of their best trajectory, with the matches of the newest query.
 
         A place that was not compared gets the query's usual score, the median score of the compared places. With 0
         instead, rivals would score too low, and a place that is always compared would seem better. Slots before the
-        first place of the map score 0. The returned ranking has the matches of the newest query, with the scores of the
-        sequence.
+        first place of the map score 0.
         """
         if self._broken(index, t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
-            self._rows.pop()
+            self._rows.pop()  # before there is one more
         usual = float(np.median(ranking.scores)) if len(ranking.slots) < len(index) else 0.0
         self._usual.appendleft(usual)
         row = np.full(len(index), usual, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
-        self._known = (len(index), _checksum(index.place_ids))
-
+        self._known = (len(index), zlib.crc32(index.place_ids.data))
         means = best_means(self._rows, self._trajectories)
         self.rivals = best_means(self._rows, self._other_trajectories)
         worth_naming = means > 0
@@ -130,7 +128,7 @@ class SequenceSearch:
         return (
             self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
             or len(index) < places
-            or _checksum(index.place_ids[:places]) != checksum
+            or zlib.crc32(index.place_ids[:places].data) != checksum
         )
 
 
@@ -143,10 +141,6 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     unique: list[list[int]] = np.unique(back, axis=0).tolist()
     return unique
-
-
-def _checksum(place_ids: Ints) -> int:
-    return zlib.crc32(place_ids.data)
 
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:

@@ -1,7 +1,5 @@
 """The places cut from an orthophoto: their grid, what is left out, what a frame says, and the memory it takes."""
 
-import subprocess
-import sys
 from itertools import pairwise
 
 import numpy as np
@@ -9,9 +7,7 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-import rasterio
-from rasterio.windows import Window
-from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
+from rasters import HOME, grid, ground_m, marked_raster, write_raster
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
@@ -163,48 +159,6 @@ def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
         assert (frame.position.lat_deg, frame.position.lon_deg) == pytest.approx(
             (there.lat_deg, there.lon_deg), abs=1e-8
         )
-
-
-_PEAK = """
-import resource, sys
-from edgevpr.mapmaking.cuttings import OrthophotoSource
-from edgevpr.mapmaking.lattice import lattice_of
-from edgevpr.mapmaking.orthophoto import Orthophoto
-orthophoto = Orthophoto(sys.argv[1])
-source = OrthophotoSource(orthophoto, lattice_of(orthophoto, 100.0, float(sys.argv[2])), 100.0, float)
-frames = sum(source.read(1.0) is not None for _ in range(source.total))
-print(frames, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
-"""
-
-
-def test_a_large_file_takes_no_more_memory_than_a_small_one(tmp_path):
-    small, large = textured_raster(tmp_path / "small.tif"), tmp_path / "large.tif"
-    side_px, part = 30_000, np.random.default_rng(1).integers(50, 200, (1, 30, 30)).astype(np.uint8)
-    block = np.kron(part, np.ones((1, 20, 20), np.uint8))
-    to_crs, _, _ = grid("EPSG:32632", 0.5, 8)
-    shape = {"width": side_px, "height": side_px, "count": 1, "dtype": "uint8"}
-    with rasterio.open(
-        large,
-        "w",
-        driver="GTiff",
-        crs="EPSG:32632",
-        transform=to_crs,
-        tiled=True,
-        compress="deflate",
-        zlevel=1,
-        **shape,
-    ) as out:
-        for row in range(0, side_px, 600):  # 900 MB, each in its window
-            out.write(np.tile(block, (1, 1, side_px // 600)), window=Window(0, row, side_px, 600))
-    peaks_mb = []
-    for path, spacing_m in ((small, 50.0), (large, 2900.0)):
-        done = subprocess.run(
-            [sys.executable, "-c", _PEAK, str(path), str(spacing_m)], capture_output=True, text=True, check=True
-        )
-        frames, peak_mb = map(int, done.stdout.split())
-        assert frames >= 25
-        peaks_mb.append(peak_mb)
-    assert peaks_mb[1] < peaks_mb[0] + 80, "GDAL keeps 64 MB of blocks, whatever the file"
 
 
 def test_only_the_places_that_are_asked_for_are_cut(tmp_path):

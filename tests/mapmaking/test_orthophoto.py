@@ -164,16 +164,6 @@ def test_a_file_of_16_bits_has_one_scale_everywhere(tmp_path):
     assert wide[middle, middle].mean() == pytest.approx(narrow.mean(), abs=1.5)
 
 
-def test_overviews_change_nothing_but_the_speed(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=0.05, side_px=2000)
-    shutil.copy(path, tmp_path / "with.tif")
-    with rasterio.open(tmp_path / "with.tif", "r+") as data:
-        data.build_overviews([2, 4, 8], rasterio.enums.Resampling.average)
-    plain, _ = cut(path)
-    other, _ = cut(tmp_path / "with.tif")
-    assert np.abs(plain.astype(int) - other).max() <= 2
-
-
 def tiles(folder, zoom, side_px=256, end="png", skip=()):
     """Write the marks as map tiles around HOME; return the folder."""
     half_world_m, tile_m = 20037508.342789244, 2 * 20037508.342789244 / 2**zoom
@@ -218,17 +208,6 @@ def test_a_tile_that_is_missing_or_damaged_is_a_hole(tmp_path):
         path.write_bytes(b"not a picture")
     _, fewer = cut(folder)
     assert fewer.mean() < valid.mean()
-
-
-def test_an_mbtiles_file_is_read(tmp_path):
-    import rasterio.shutil
-
-    source = marked_raster(tmp_path / "o.tif", "EPSG:3857")
-    path = tmp_path / "o.mbtiles"
-    rasterio.shutil.copy(source, path, driver="MBTILES", TILE_FORMAT="PNG")
-    picture, valid = cut(path)
-    assert valid.all()
-    require_marks(picture, within_px=0.5)  # it was resampled to the zoom
 
 
 def refused(path) -> str:

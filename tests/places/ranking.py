@@ -1,6 +1,28 @@
-"""One call for both stages of retrieval."""
+"""A technique that is simple enough to predict, and one call for both stages of retrieval."""
 
+import numpy as np
+
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, scan
+
+
+class Ruler:
+    """Places are numbers: the coarse part is the number to the nearest 10, the fine part the number itself."""
+
+    spec = TechniqueSpec(name="ruler", parameters={}, coarse=PartSpec((1,), "<f4"), fine=PartSpec((1,), "<f8"))
+    min_score = min_margin = 0.0
+    candidates = 20
+    compared = 0
+
+    def encode(self, number):
+        return Descriptor(coarse=np.array([round(number, -1)], "<f4"), fine=np.array([float(number)]))
+
+    def coarse_scores(self, query, rows, mean):
+        return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
+
+    def match(self, query, fine, hypotheses):
+        self.compared += 1
+        return FineMatch(1 / (1 + abs(float(fine[0] - query.fine[0]))))
 
 
 def rank(
