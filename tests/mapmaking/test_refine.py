@@ -217,7 +217,6 @@ def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
         before = [place.position for place in place_map.places()]
     found, places = refined_of(path)
     assert (found.places, found.refined, found.without_position) == (len(before), refined, without_position)
-    assert found.not_tied == len(before) - refined - without_position
     for place, was in zip(places, before, strict=True):
         if place.pose is None and was is not None:
             assert place.position == was, "a place that is not tied stays"
@@ -233,7 +232,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
         frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
         place_map.add(frame, descriptor)
     found, (place,) = refined_of(tmp_path / "m.gpkg")
-    assert (found.surveyed, found.refined, found.not_tied) == (1, 0, 0)
+    assert (found.surveyed, found.refined) == (1, 0)
     assert place.pose == lies
 
 
