@@ -56,7 +56,7 @@ def run_report(args: Namespace) -> int:
     flight = _read(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
     frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
-    page = page_of(flight, _ground(args.map or flight.map_path, bool(args.map)), frames, references)
+    page = page_of(flight, _ground(args.map or text(flight.start, "map"), bool(args.map)), frames, references)
     write_out(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0

@@ -101,11 +101,6 @@ class LoggedFlight:
     start_s: float | None = None
     span_s: float = 0.0
 
-    @property
-    def map_path(self) -> str | None:
-        """The path of the map in the first line; None if there is none."""
-        return text(self.start, "map")
-
     def since_start(self, t_mono_s: float | None) -> float:
         """Return the seconds from the start to `t_mono_s`; None stands for the latest time so far."""
         if t_mono_s is None:

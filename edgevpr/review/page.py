@@ -135,7 +135,7 @@ def _title(flight: LoggedFlight) -> str:
 def _known(flight: LoggedFlight) -> Iterator[str]:
     yield f"{clock(flight.span_s)} long"
     for name, known in (
-        ("map", flight.map_path),
+        ("map", text(flight.start, "map")),
         ("technique", text(flight.start, "technique")),
         ("board", text(flight.start, "board")),
         ("edgevpr", text(flight.start, "version")),

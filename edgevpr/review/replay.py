@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -90,7 +91,7 @@ def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Pa
             log=replace(config.log, path=log, max_mb=None),
             tape=playback,
             clock=taped(Clock(sleep=playback.sleep), playback),
-            open_source=lambda step_s: ReplayedSource(playback, _pictures_of(flight.folder, say)),
+            open_source=lambda step_s: ReplayedSource(playback, partial(_picture, flight.folder, say)),
             link=playback.link,
             ground=playback.ground,
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
@@ -107,24 +108,17 @@ def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Pa
         return Replayed(list(read_log(log)) if log else [], playback.packets, why_ended, playback.guessed)
 
 
-def _pictures_of(folder: Path, say: Say) -> Callable[[int], Image]:
-    """Return a function that reads a recorded frame, given its number, and calls `say`. It raises TapeEnded for a frame
-    that cannot be read, for instance after a power cut."""
-    total = sum(1 for _ in (folder / FRAMES).iterdir())
-
-    def picture(number: int) -> Image:
-        say(number, total)
-        try:
-            return read_image(frame_path(folder, number))
-        except ImageError as error:
-            raise TapeEnded(str(error)) from None
-
-    return picture
+def _picture(folder: Path, say: Say, number: int) -> Image:
+    """Read a recorded frame. Raises TapeEnded for one that cannot be read, for instance after a power cut."""
+    say(number, sum(1 for _ in (folder / FRAMES).iterdir()))
+    try:
+        return read_image(frame_path(folder, number))
+    except ImageError as error:
+        raise TapeEnded(str(error)) from None
 
 
 def _map_of(folder: Path, temporary: Path, config: Config, map_path: str | None) -> str | None:
-    """Return the path of the map to fly with (None: no map). For a flight that learnt places, it is that of a copy, in
-    `temporary`, of the map as it was at the start."""
+    """Return the path of the map (None: none); of a flight that learnt, that of a copy of the map as it began."""
     if config.mapping.learn:
         copy = temporary / MAP
         if (folder / MAP).is_file():

@@ -38,7 +38,7 @@ def test_a_log_that_was_cut_at_any_byte_is_read_and_exported_up_to_its_last_whol
         for write in (write_csv, write_geojson, write_kml):
             write(features, written := io.StringIO())
             assert written.getvalue()
-        assert [each for each in features if each.kind == "match"] or not flight.queries
+        assert [each for each in features if each["kind"] == "match"] or not flight.queries
 
 
 def test_every_command_after_the_flight_takes_a_log_that_was_cut_in_a_line(log, tmp_path, capsys):

@@ -22,7 +22,7 @@ def written(write, features):
 
 def test_every_form_has_the_same_points(flown):
     features = features_of(read_flight(flown / "flight.jsonl"))
-    kinds = Counter(each.kind for each in features)
+    kinds = Counter(each["kind"] for each in features)
     assert kinds["match"] == kinds["place"] == 8
     assert kinds["autopilot"] == kinds["gps"] == 10
     assert kinds["fix"] > 0

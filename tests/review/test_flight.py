@@ -19,7 +19,7 @@ def test_a_real_flight_is_read(flown):
     flight = read_flight(flown / "flight.jsonl")
     assert [each.name for each in flight.queries] == [f"{number:02d}.png" for number in range(10)]
     assert [each.accepted for each in flight.queries] == [True] * 8 + [False] * 2
-    assert flight.map_path == str(flown / "map.gpkg")
+    assert flight.start["map"] == str(flown / "map.gpkg")
     first = flight.queries[0]
     assert first.at == pytest.approx((50.0, 8.0), abs=1e-5)
     assert first.autopilot_at == pytest.approx((50.0, 8.0), abs=1e-5)
@@ -66,7 +66,7 @@ def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark
     first, *_ = numbered(path)
     first.unlink()
     flight = read_flight(path)
-    assert (flight.map_path, flight.start["repeated"]) == ("m.gpkg", True)
+    assert (flight.start["map"], flight.start["repeated"]) == ("m.gpkg", True)
     assert flight.remarks[0].said == flight.missing
     assert "flight.jsonl: 1." in flight.missing
     assert 0 < len(flight.queries) < 4
