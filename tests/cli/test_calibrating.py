@@ -82,12 +82,6 @@ def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
 
-def test_a_build_that_is_told_so_does_not_calibrate(bare, capsys):
-    assert calibration_in(bare) is None
-    assert main(["map", "info", str(bare)]) == 0
-    assert f"{PLACES} places: fewer" in capsys.readouterr().out
-
-
 def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, capsys, caplog, monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES + 1)
     assert built(tmp_path / "small.gpkg", flight / "ref") == 0

@@ -107,16 +107,10 @@ def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, caps
         repaired.require(damaged.spec)
     assert main(["map", "check", str(valley)]) == 0
     assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
-
-
-def test_a_map_repaired_once_is_not_repaired_over_its_original(valley, capsys):
-    damage(valley, *DAMAGE)
-    assert main(["map", "repair", str(valley)]) == 0
-    first = valley.with_name("valley.gpkg.damaged").read_bytes()
     damage(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
     assert main(["map", "repair", str(valley)]) == 1
     assert "there already" in capsys.readouterr().err
-    assert valley.with_name("valley.gpkg.damaged").read_bytes() == first
+    assert original.read_bytes() == before
 
 
 def test_a_map_of_which_nothing_can_be_read_is_left_as_it_is(valley, capsys):
@@ -142,12 +136,6 @@ def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
     assert main(["map", "check", str(valley)]) == 0
 
 
-def test_a_map_without_checksums_is_whole_and_says_so(valley, capsys):
-    damage(valley, "UPDATE places SET geom_crc32 = NULL, coarse_crc32 = NULL, fine_crc32 = NULL")
-    assert main(["map", "check", str(valley)]) == 0
-    assert "without checksums  6" in capsys.readouterr().out
-
-
 def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
     damage(valley, "UPDATE places SET geom = 'text' WHERE place_id = 2")
     assert main(["match", str(valley), "--images", str(flight / "images"), "--json"]) == 0
@@ -157,9 +145,9 @@ def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
 
 
 @pytest.mark.parametrize(("name", "said"), [("", "cannot be the name of a map"), ("a\0b.gpkg", "a NUL character")])
-@pytest.mark.parametrize("command", [["info"], ["check"], ["repair"]])
+@pytest.mark.parametrize("command", ["info", "check", "repair"])
 def test_a_name_that_no_file_can_have_is_exit_code_2(command, name, said, capsys):
-    assert main(["map", command[0], name, *command[1:]]) == 2
+    assert main(["map", command, name]) == 2
     assert said in capsys.readouterr().err
 
 

@@ -4,18 +4,16 @@ import json
 from dataclasses import replace
 
 import cv2
-import numpy as np
 import pytest
 from pictures import textured
 from tiny_networks import write_network
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import FORMS, load_config
-from edgevpr.core.errors import ConfigError, UsageError
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.core.errors import ConfigError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.recognise.opening import made_for, open_recogniser, technique_of
+from edgevpr.runtime.recognise.opening import made_for, open_recogniser
 from edgevpr.techniques import create, vectors
 
 
@@ -84,12 +82,6 @@ def test_the_form_of_the_configuration_is_flown_and_said(flight):
         load_config(None, {"match.form": 1})
 
 
-def test_a_technique_without_forms_says_so(flight):
-    path = built(flight, "--technique", "cohog")
-    with pytest.raises(UsageError, match="`form`"):
-        open_recogniser(load_config(None, {"map": str(path), "match.form": "8bit"}), load_board("this"))
-
-
 def test_a_map_of_other_weights_is_refused_naming_the_model(models, flight, capsys):
     path = built(flight, "--technique", "calc", "--param", "model=tiny")
     write_network(models, "tiny", fault="dynamic batch")
@@ -136,21 +128,6 @@ def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flig
     assert "not finite" in said
 
 
-@pytest.mark.slow
-def test_eval_goes_on_without_a_network_whose_card_is_wrong(models, capsys, flight):
-    (models / "calc.yaml").write_text("title: x\ntitel: y\n")
-    code, found, said = evaluated(capsys, flight, "--techniques", "calc,cohog")
-    assert (code, list(found)) == (1, ["cohog"])
-    assert "calc was" in said
-    assert "`title`" in said
-
-
-def test_eval_of_an_unknown_form_is_a_wrong_request(capsys, flight):
-    code, _, said = evaluated(capsys, flight, "--techniques", "hog", "--form", "4bit")
-    assert code == 2
-    assert "`4bit`" in said
-
-
 @pytest.mark.process
 @pytest.mark.slow
 def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
@@ -180,12 +157,3 @@ def test_a_network_takes_as_many_threads_as_the_board_spares(monkeypatch, flight
         ("calc", {"threads": 1, "model": "tiny"}),
         ("hog", {}),
     ]
-
-
-@pytest.mark.usefixtures("models")
-def test_threads_are_no_part_of_what_a_map_asks_for(flight):
-    path = built(flight, "--technique", "calc", "--param", "model=tiny")
-    with PlaceMap.open(path) as place_map:
-        assert place_map.spec.parameters == {"model": "tiny"}
-        technique = technique_of(place_map, board=replace(load_board("rpi-5"), threads=2))
-    np.testing.assert_allclose(np.linalg.norm(technique.encode(textured(1)).coarse.astype(np.float32)), 1, atol=1e-3)

@@ -59,6 +59,9 @@ def test_a_picture_is_scored_and_drawn(networks, tmp_path, capsys):
     assert main([*command[:-2], "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
+    write_memorability(networks, gain=3.0)
+    assert main(["salience", str(picture), "--config", config(tmp_path, memorability=0.3, network="bright")]) != 0
+    assert "0 to 1" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -116,14 +119,6 @@ def test_settings_that_cannot_be_meant_are_refused_in_one_sentence(networks, key
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert complaint in said[0]
-
-
-def test_memorability_outside_0_to_1_is_refused(networks, tmp_path, capsys):
-    write_memorability(networks, gain=3.0)
-    picture = tmp_path / "p.png"
-    cv2.imwrite(str(picture), texture(1))
-    assert main(["salience", str(picture), "--config", config(tmp_path, memorability=0.3, network="bright")]) != 0
-    assert "0 to 1" in capsys.readouterr().err
 
 
 def test_a_criterion_without_its_network_is_off_and_says_so(tmp_path, capsys, caplog):

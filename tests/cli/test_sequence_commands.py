@@ -104,15 +104,6 @@ def test_eval_asks_in_the_order_of_the_flight_and_scores_what_the_truth_names(ca
     assert evaluated(capsys, flight, "--techniques", "seqslam")["seqslam"]["sequence"] == 10
 
 
-@pytest.mark.parametrize("length", ["0", "101", "-3"])
-def test_a_length_out_of_range_is_refused_in_a_sentence(capsys, flight, maps, length):
-    data = ["--query", flight / "query", "--ref", flight / "ref", "--ground-truth", flight / "ground_truth.csv"]
-    for command in (["eval", *data], ["match", maps / "hog.gpkg", "--images", flight / "query"]):
-        assert main([str(word) for word in [*command, "--sequence", length]]) == 2
-        said = capsys.readouterr().err
-        assert f"is {length}; it" in said
-
-
 def test_the_budget_holds_the_sequence_as_well(maps):
     with PlaceMap.open(maps / "seqslam.gpkg") as place_map:
         each = bytes_per_place(place_map.spec)
