@@ -292,14 +292,16 @@ def open_links(
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None
-    positions = (place.position for place in place_map.places() if place.position)
+    origin = None
+    if settings.set_origin:
+        origin = next((place.position for place in place_map.places() if place.position), None)
     link_settings = LinkSettings(
         component_id=settings.component_id,
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator,
         tap=world.tap,
-        origin=next(positions, None) if settings.set_origin else None,
+        origin=origin,
         signing=world.signing,
         tape=world.tape,
     )

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkAddressError, LinkError
@@ -71,14 +70,9 @@ def intent_of(config: Config) -> FlightIntent:
     return FlightIntent(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
 
 
-def silence(
-    address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int] = MappingProxyType({})
-) -> Finding:
-    """Return the finding that explains why no heartbeat was received, by what else arrived.
-
-    `bad_bytes`: number of bytes that are no MAVLink. `others`: system ids of other autopilots. `refused`: number of
-    messages that failed the check of signatures, by reason.
-    """
+def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int]) -> Finding:
+    """Return the finding that explains why no heartbeat was received, by what else arrived: `bad_bytes` that are no
+    MAVLink, autopilots of the system ids `others`, messages `refused` by the check of signatures, counted by reason."""
     if refused:
         why = max(refused, key=lambda reason: refused[reason])
         return wrong("link", f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")

@@ -113,25 +113,6 @@ def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
     assert link.texts() == [(6, "edgevpr: learning off by command"), (6, "edgevpr: learning on by command")]
 
 
-@pytest.mark.slow
-def test_fixes_that_are_sent_while_nothing_is_learnt_still_keep_their_echo_from_being_learnt(
-    recording, tmp_path, clock
-):
-    link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
-    read = []
-
-    def work():
-        read.append(1)
-        if wish := {1: Wish.LEARN_NOTHING, 3: Wish.LEARN}.get(len(read)):
-            assert link.wish(wish) == "ACCEPTED"
-
-    flown = learning_flight(recording, tmp_path, clock, link)
-    lines = flown.fly(FakeSource(pictures(3) + pictures(12, 100), clock, work=work))
-    assert link.stats().fixes_sent == 3
-    learnt = [line["query"] for line in of_kind(lines, "learnt")]
-    assert learnt == [f"frame {number:06d}" for number in (0, 12, 13, 14)], "the first was before any fix"
-
-
 def test_a_flight_that_does_not_learn_cannot_be_told_to(recording, tmp_path, clock):
     link, answers = FakeLink(clock), []
     source = FakeSource(pictures(1), clock, work=lambda: answers.extend([link.wish(Wish.LEARN), link.wish(4)]))

@@ -334,16 +334,6 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
     assert [line["n"] for line in last if line["kind"] == "query"] == list(range(100, 200))
 
 
-def test_what_cannot_be_deleted_is_said_once(path, caplog, monkeypatch):
-    monkeypatch.setattr(Path, "unlink", refusing)
-    written(path, 400)
-    assert [n for part in parts(path) for n in numbers(part)] == list(range(400))
-    assert caplog.messages == [
-        f"The oldest flight logs beside {path} cannot be deleted (Read-only file system), so they grow past "
-        "log.max_mb: let the flight write to their folder."
-    ]
-
-
 def test_two_flights_with_the_same_log_have_files_of_their_own(path, caplog):
     with FlightLog(path, max_mb=4 * PART_MB) as first, FlightLog(path, max_mb=4 * PART_MB) as second:
         for log, name in ((first, "a"), (second, "b")):

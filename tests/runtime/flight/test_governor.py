@@ -159,14 +159,6 @@ def test_it_cools_between_two_steps_for_heat():
     assert [b - a for a, b in itertools.pairwise(at_s)] == [20.0, 20.0]
 
 
-def test_after_heat_it_goes_back_no_faster_than_it_went():
-    flight = Flight(lambda setting, now_s: measured(temperature_c=85.0 if now_s <= 30 else 60.0))
-    flight.fly(120)
-    assert flight.governor.setting == ASKED
-    back_at_s = [at for at, change in flight.changes if change.back]
-    assert min(b - a for a, b in itertools.pairwise([30.0, *back_at_s])) >= 20
-
-
 def wait_s(flight, trouble_s):
     """How long after this long a trouble all is as it was asked."""
     until_s = flight.now_s + trouble_s

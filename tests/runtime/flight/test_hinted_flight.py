@@ -89,11 +89,6 @@ def test_a_live_flight_takes_position_and_heading_from_the_autopilot(place_map, 
     assert all(121 <= line["hints"]["reach_m"] <= 131 for line in queries)
 
 
-def test_the_autopilot_knows_nothing_of_a_recording(place_map, tmp_path):
-    queries = fly(place_map, tmp_path / "log", [frame(4, 75.0)], (4, 75.0), 20.0, is_live=False)
-    assert [line["hints"] for line in queries] == [None]
-
-
 @pytest.mark.slow
 def test_a_false_position_costs_time_and_not_the_flight(place_map, tmp_path):
     queries = fly(place_map, tmp_path / "log", [frame(0, MAPPED_DEG)] * 4, (7, None), 1.0)

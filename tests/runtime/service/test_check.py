@@ -203,14 +203,6 @@ def test_a_serial_port_is_opened(settings, config_file):
     os.close(port)
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
-def test_a_log_that_may_not_be_written_is_found(settings, config_file, tmp_path):
-    log_path = tmp_path / "flight.jsonl"
-    log_path.touch(mode=0o400)
-    (finding,) = wrong(config_file, settings)
-    assert finding.message.startswith(f"{log_path} ")
-
-
 def wrong_online(config_file: Path, settings: dict, **how) -> list[Finding]:
     """What `check` finds wrong when it waits for a frame and a heartbeat."""
     config_file.write_text(yaml.safe_dump(settings))

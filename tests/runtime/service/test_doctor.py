@@ -2,7 +2,6 @@
 
 import json
 import re
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,11 +261,6 @@ def test_a_dry_run_could_not_arm_with_what_waits_for_positions(parameters, chang
     assert wrong(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
 
 
-def test_what_a_dry_run_bears_is_wrong_before_it_too():
-    assert wrong(with_parameters(COPTER, GPS2_TYPE=0, EK3_ENABLE=0), plan=DRY) == {"EKF3": ("EK3_ENABLE=1",)}
-    assert set(wrong(with_parameters(PX4, EKF2_AGP0_CTRL=0), plan=DRY)) == {"channel"}
-
-
 # PX4.
 
 
@@ -329,14 +323,6 @@ def test_silence_is_explained_by_what_arrives(link, bad_bytes, others, refused, 
     assert not finding.ok
     assert message in finding.message
     assert finding.message.startswith(f"{link}: ")
-
-
-def test_the_changes_for_a_silent_line():
-    assert silence(SERIAL, 0, set()).changes == (
-        "ArduPilot: SERIALn_PROTOCOL=2, SERIALn_BAUD=57",
-        "PX4: MAV_1_CONFIG=102, MAV_1_MODE=2, SER_TEL2_BAUD=57600",
-    )
-    assert silence(UDP, 0, {5, 3}).changes == ("mavlink: {system_id: 3}",)
 
 
 def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
@@ -425,34 +411,12 @@ def test_the_command_prints_json(link, capsys, tmp_path):
 
 @pytest.mark.network
 @pytest.mark.usefixtures("_quick")
-@pytest.mark.parametrize(("key", "is_heard"), [(bytes(range(32)), True), (bytes(32), False)])
-def test_the_command_signs_with_the_key_of_its_configuration(link, capsys, tmp_path, key, is_heard):
-    (tmp_path / "key").touch(mode=0o600)
-    (tmp_path / "key").write_bytes(bytes(range(32)))
-    (tmp_path / "c.yaml").write_text(f"mavlink: {{signing_key: {tmp_path}/key}}\nlog: {{path: null}}\n")
-    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}, key=key, wants_signed=True):
-        main(["doctor", "--config", str(tmp_path / "c.yaml"), "--link", link])
-    found = findings_of(capsys.readouterr().out)
-    assert ("channel" in found) == is_heard
-    assert ("(wrong signature)" in found["link"][1]) == (not is_heard)
-    assert {path.name for path in tmp_path.iterdir()} == {"key", "c.yaml"}, "the time is not written"
-
-
-@pytest.mark.network
-@pytest.mark.usefixtures("_quick")
 def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, capsys):
     assert main(["doctor", "--link", link]) == 1
     found = findings_of(capsys.readouterr().out)
     assert not found["link"][0]
     assert "memory" in found
     assert "channel" not in found
-
-
-@pytest.mark.network
-def test_a_server_that_is_not_up_is_wrong(capsys):
-    link = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    assert main(["doctor", "--link", link]) == 1
-    assert "(Connection refused)" in findings_of(capsys.readouterr().out)["link"][1]
 
 
 @pytest.mark.parametrize(

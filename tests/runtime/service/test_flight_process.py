@@ -199,19 +199,6 @@ def test_systemd_hears_ready_alive_and_stopping(fly, tmp_path):
     assert any(line.startswith("STATUS=") and "queries" in line for line in said)
 
 
-def test_a_source_that_is_not_there_yet_leaves_the_loop_turning(recording, tmp_path):
-    with manager(tmp_path) as (listening, environment):
-        log = tmp_path / "f.jsonl"
-        run = start(recording / "cohog.gpkg", "rtsp://127.0.0.1:9/nobody", log, **environment)
-        said = []
-        while said.count("WATCHDOG=1") < 8 or not any("reopening" in line for line in said):
-            said += listening.recv(4096).decode().splitlines()
-        run.terminate()
-        assert run.wait(timeout=60) == 0
-        run.stderr.close()
-    assert os.path.exists(log)
-
-
 def test_a_relative_log_of_the_service_lies_in_its_folder_of_logs(fly, tmp_path):
     (tmp_path / "logs").mkdir()
     run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))

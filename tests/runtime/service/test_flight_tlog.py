@@ -58,21 +58,3 @@ def test_the_log_of_a_whole_flight_has_what_was_sent(fly, tmp_path):
     said = dumped(path)
     for name, count in end["mavlink"]["sent"].items():
         assert said.count(f": {name} {{") == count
-
-
-def test_a_log_that_cannot_be_opened_is_said_before_the_flight(fly, tmp_path):
-    flight = fly("--link", "udpout:127.0.0.1:9", "--tlog", tmp_path / "no" / "x.tlog")
-    said = flight.communicate(timeout=120)[1]
-    assert flight.returncode != 0
-    assert "x.tlog" in said
-    assert "Traceback" not in said
-
-
-def test_a_service_flies_without_it(fly, tmp_path):
-    with closing(UdpPort()) as port:
-        link = f"udpout:127.0.0.1:{port.number}"
-        socket_path = str(tmp_path / "notify")
-        flight = fly("--link", link, "--tlog", tmp_path / "no" / "x.tlog", NOTIFY_SOCKET=socket_path)
-        said = flight.communicate(timeout=120)[1]
-    assert flight.returncode == 0
-    assert said.count("x.tlog cannot be opened") == 1

@@ -1,4 +1,4 @@
-"""`match.follow` and `match.accept_precision` of a flight: what they change, and what is wrong with a value."""
+"""`match.follow` and `match.accept_precision` of a flight: what they change."""
 
 import pytest
 from flights import of_kind

@@ -8,7 +8,6 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 
@@ -91,21 +90,6 @@ def test_with_the_mask_more_is_recognised_behind_a_display(folder):
     assert found["masked.gpkg"] > found["plain.gpkg"], "what all places share says nothing of any"
 
 
-def test_a_map_knows_its_mask_and_a_merged_one_where_it_is_the_same(folder, tmp_path):
-    def mask_of(path):
-        with PlaceMap.open(path) as place_map:
-            return place_map.mask_sha256
-
-    own = mask_of(folder / "masked.gpkg")
-    assert len(own) == 64
-    assert mask_of(folder / "plain.gpkg") is None
-    masked, plain = str(folder / "masked.gpkg"), str(folder / "plain.gpkg")
-    assert main(["map", "merge", str(tmp_path / "same.gpkg"), masked, masked]) == 0
-    assert main(["map", "merge", str(tmp_path / "both.gpkg"), masked, plain]) == 0
-    assert mask_of(tmp_path / "same.gpkg") == own
-    assert mask_of(tmp_path / "both.gpkg") is None
-
-
 def test_check_learns_from_a_recording_and_says_what_it_needs(folder, tmp_path, capsys):
     config, out = ["check", "--config", str(folder / "c.yaml")], str(tmp_path / "m.png")
     still = tmp_path / "still"
@@ -127,15 +111,3 @@ def test_check_learns_from_a_recording_and_says_what_it_needs(folder, tmp_path, 
     assert main([*config, "--learn-mask", out, "--source", str(folder / "ref")]) == 0
     (tmp_path / "no-source.yaml").write_text("log: {path: null}\n")
     assert main(["check", "--config", str(tmp_path / "no-source.yaml"), "--learn-mask", out]) == 2
-
-
-@pytest.mark.parametrize("command", ["build", "match"])
-def test_a_mask_that_cannot_be_used_is_said_before_anything_is_made(folder, tmp_path, capsys, command):
-    black = tmp_path / "black.png"
-    cv2.imwrite(str(black), np.zeros((240, 320), np.uint8))
-    asked = ["map", "build", str(tmp_path / "m.gpkg"), "--technique", "cohog"]
-    if command == "match":
-        asked = ["match", str(folder / "plain.gpkg")]
-    assert main([*asked, "--images", str(folder / "ref"), "--mask", str(black)]) == 2
-    assert "100%" in capsys.readouterr().err
-    assert not (tmp_path / "m.gpkg").exists()

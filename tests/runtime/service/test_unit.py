@@ -85,13 +85,6 @@ def test_the_limits_are_those_of_the_board():
     assert "rpi-zero-2w" not in unit
 
 
-@needs_systemd
-def test_a_configuration_with_an_odd_name_is_handed_over_as_it_is(tmp_path):
-    unit = render_unit(load_board("rpi-zero-2w"), '/etc/edgevpr/50% of "my" $HOME\\x.yaml')
-    assert directives(unit)["ExecStart"].endswith('--config "/etc/edgevpr/50%% of \\"my\\" $$HOME\\\\x.yaml"')
-    assert verify(unit, tmp_path) == ""
-
-
 @pytest.mark.parametrize(
     "path",
     [
