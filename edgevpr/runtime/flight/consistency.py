@@ -7,7 +7,6 @@ fixes have the same offset from it, and two wrong ones hardly ever do.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,15 +21,6 @@ _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may h
 _DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
 
 
-@dataclass(frozen=True, slots=True)
-class Weighed:
-    """Verdict on a fix. `objection` is why it is not believed (None: it is believed). `is_against`: it contradicts the
-    expected position, and is believed because an earlier fix agrees with it."""
-
-    objection: str | None = None
-    is_against: bool = False
-
-
 class Consistency:
     """Holds back a fix that contradicts the expected position, until a second, independent fix agrees with it. With
     GPS, a contradicting fix is never believed."""
@@ -38,25 +28,25 @@ class Consistency:
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
 
-    def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""
+    def weighed(self, fix: ComparedFix, has_gps: bool) -> tuple[str | None, bool]:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Returns
+        - why the fix is not believed (None: it is);
+        - whether it contradicts the expected position, and is believed because an earlier fix agrees with it."""
         step_m = fix.off_m - fix.expected_m
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS:
             self._held = None
-            return Weighed()
+            return None, False
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         if has_gps:
             self._held = None
-            return Weighed(f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is")
+            return f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is", False
         if self._held is None or _differ(self._held, fix) > _AGREES:
             self._held = fix
         elif _is_independent(self._held, fix):
             self._held = None
-            return Weighed(is_against=True)
-        return Weighed(
-            f"held back: {off_m:.0f} m from where the aircraft is by the autopilot's reckoning and the fixes before, "
-            f"good to {good_to_m:.0f} m: another fix has to agree"
-        )
+            return None, True
+        there = "where the aircraft is by the autopilot's reckoning and the fixes before"
+        return f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree", False
 
 
 def _differ(one: ComparedFix, other: ComparedFix) -> float:

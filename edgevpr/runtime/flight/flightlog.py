@@ -180,6 +180,8 @@ class FlightLog:
                 "flight a `log.path` of its own."
             )
         self._file, self._is_new = file, not _size_of(file)
+        if self._is_new:  # on another medium it may have the numbers of a file before it
+            self._ours = None
         return file
 
     def _is_set_aside(self) -> bool:

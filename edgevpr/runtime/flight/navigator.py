@@ -127,10 +127,10 @@ class Navigator(Listener):
             if compared is None:
                 self._navigation.begin(seen.position, worst_sd(seen.covariance_m2), seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            verdict = self._consistency.weighed(compared, self.has_gps)
-            if verdict.objection:
-                return Advice(None, verdict.objection, is_held=True)
-            self._navigation.hear_fix(compared, verdict.is_against)
+            objection, is_against = self._consistency.weighed(compared, self.has_gps)
+            if objection:
+                return Advice(None, objection, is_held=True)
+            self._navigation.hear_fix(compared, is_against)
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
 
     def knows_position(self, now_s: float) -> bool:

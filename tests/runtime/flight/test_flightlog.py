@@ -368,6 +368,17 @@ def test_a_start_that_was_lost_is_made_up_for(path):
     assert flight_of(path).missing is None
 
 
+def test_on_another_medium_the_start_is_repeated_whatever_the_numbers_of_the_file(path, monkeypatch):
+    monkeypatch.setattr("edgevpr.runtime.flight.flightlog._identity", lambda file: (1, 1))
+    with FlightLog(path) as log:
+        log.write("start")
+        with no_file_larger_than(10):
+            log.write("query", n=1)
+        path.unlink()
+        log.write("query", n=2)
+    assert kinds(path) == ["start", "gap", "query"]
+
+
 def test_a_disk_that_is_full_when_a_file_begins_loses_lines_and_no_file(path):
     log = FlightLog(path, max_mb=4 * PART_MB)
     log.write("start")
