@@ -11,8 +11,7 @@ from typing import Any
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.files import write_whole
-from edgevpr.core.text import decoded_name
-from edgevpr.frames.images import counting_order, list_images, read_image, small_jpeg
+from edgevpr.frames.images import counting_order, read_image, small_jpeg
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.asking import QueryAnswer
 from edgevpr.lab.evaluate.dataset import Dataset
@@ -110,7 +109,7 @@ def _of_set(name: str, outcome: Measurements, labels: Sequence[str]) -> str:
     scored = f"{len(dataset.queries)} queries scored against {len(dataset.references)} references"
     scored += f", camera {camera}" if camera else ""
     if not rows:
-        return section(foreign(name), f'<p class="soft">{scored}</p><p>No row was measured on it.</p>')
+        return section(foreign(name), f"<p>No row was measured on it: {scored}.</p>")
     most = max(_FEWEST_OF_A_ROW, min(_MOST_OF_A_ROW, _MOST_MATCHES // len(outcome.found)))
     reached = [[_name(row.label, number), *tables.quality(row.result)] for number, row in rows]
     paid = [[_name(row.label, number), *tables.costs(row.result), row.made["date"]] for number, row in rows]
@@ -169,13 +168,12 @@ def _matches(dataset: Dataset, row: MeasuredRow, number: int, most: int) -> str:
 
 def _match(dataset: Dataset, answer: QueryAnswer) -> str:
     (query,) = [query for query in dataset.queries if query.path.name == answer.query]
-    references = {decoded_name(path.name): path for path in list_images(dataset.ref_dir)}
-    pictures = _picture("query", query.path) + _picture("found", references.get(answer.found or ""))
+    pictures = _picture("query", query.path) + _picture("found", answer.found and dataset.ref_dir / answer.found)
     accepted = "accepted" if answer.accepted else "not accepted"
     kind, verdict = "", "right"
     if not answer.is_right:
         names = sorted(query.right, key=counting_order)
-        pictures += _picture("right", references.get(names[0]), f" (one of {len(names)})" if len(names) > 1 else "")
+        pictures += _picture("right", dataset.ref_dir / names[0], f" (one of {len(names)})" if len(names) > 1 else "")
         rank = "not found" if math.isinf(answer.first_right) else f"number {answer.first_right + 1:.0f}"
         kind, verdict = "wrong", f"wrong, the right one is {rank}"
         accepted = f'<b class="bad">{accepted}</b>' if answer.accepted_wrong else accepted
@@ -185,8 +183,8 @@ def _match(dataset: Dataset, answer: QueryAnswer) -> str:
     )
 
 
-def _picture(what: str, path: Path | None, more: str = "") -> str:
-    if path is None:
+def _picture(what: str, path: Path | str | None, more: str = "") -> str:
+    if not isinstance(path, Path):
         return f"<figure><figcaption>{what}: none</figcaption></figure>"
     try:
         return picture(path.name, f"{what}: {path.name}{more}", small_jpeg(read_image(path), _PICTURE_PX))
@@ -202,15 +200,14 @@ def _how(outcome: Measurements) -> str:
         for row in outcome.found
     )
     sentences = [
-        *dict.fromkeys(made),
-        f"95 %: of {RESAMPLES} times that the queries were resampled (seed {SEED}); where all or none hit, the exact "
-        "interval of Clopper and Pearson.",
-        "Times are means over the queries, each on one thread, beside as many workers as are named. Recall counts "
-        "queries whose status is ok; a match that is only loosely right counts neither way.",
-        *dict.fromkeys(f"mAh: {result.ah_assumes}." for result in results),
-        *dict.fromkeys(f"Weights of {result.weights}." for result in results if result.weights),
+        *made,
+        f"95 %: the queries resampled {RESAMPLES} times (seed {SEED}); where all or none hit, by Clopper and Pearson. "
+        "Times are means over the queries, each on one thread, beside as many workers as are named. Recall "
+        "counts queries whose status is ok; a match that is only loosely right counts neither way.",
+        *(f"mAh: {result.ah_assumes}." for result in results),
+        *(f"Weights of {result.weights}." for result in results if result.weights),
     ]
-    return "".join(f'<p class="soft">{foreign(sentence)}</p>' for sentence in sentences)
+    return "".join(f'<p class="soft">{foreign(sentence)}</p>' for sentence in dict.fromkeys(sentences))
 
 
 def _look(number: int) -> str:

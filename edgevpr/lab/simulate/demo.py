@@ -85,17 +85,16 @@ class JudgedAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log; `heard` is the
-    summary of the simulated flight controller, by the names of `AutopilotSummary`."""
+    """Results of the demonstration. `heard` is the summary of the simulated flight controller, by the names of
+    `AutopilotSummary`."""
 
     places: int
     answers: list[JudgedAnswer]
-    costs: dict[str, float]
     heard: dict[str, Any]
     picture: Path
 
     def __str__(self) -> str:
-        cost, on_map = self.costs, [answer for answer in self.answers if answer.on_map]
+        on_map = [answer for answer in self.answers if answer.on_map]
         accepted = [answer for answer in self.answers if answer.fix_off_m is not None]
         errors_m = [answer.fix_off_m or 0.0 for answer in accepted] or [np.nan]
         off_map = len(self.answers) - len(on_map)
@@ -110,8 +109,6 @@ rejected          {len(self.answers) - len(accepted)}, among them {off_map_rejec
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
 largest {max(errors_m):.1f} m \
 (of the accepted; places are 21 m apart)
-a query           {1000 * cost["cpu_s"]:.0f} ms of CPU (encode {1000 * cost["t_encode_s"]:.0f} ms, \
-match {1000 * cost["t_match_s"]:.0f} ms), {cost["rss_mb"]:.0f} MB of RAM
 flight controller {self.heard["fixes_accepted"]} position fixes accepted, {self.heard["fixes_denied"]} denied
 picture           {self.picture}"""
 
@@ -137,9 +134,7 @@ def run_demo(folder: str | Path) -> DemoSummary:
     heard = _flown(folder)
     answers = read_answers(log_path, folder / "flight-1", folder / "flight-2")
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
-    costs = [line["costs"] for line in flight_of(log_path) if line["kind"] == "query"]
-    means = {name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]}
-    return DemoSummary(places=len(mapping.poses), answers=answers, costs=means, heard=heard, picture=picture_path)
+    return DemoSummary(places=len(mapping.poses), answers=answers, heard=heard, picture=picture_path)
 
 
 def _flown(folder: Path) -> dict[str, Any]:

@@ -29,7 +29,6 @@ def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
     assert len(summary.answers) == 6
     assert summary.heard["fixes_accepted"] == sum(answer.fix_off_m is not None for answer in summary.answers)
     assert {"HEARTBEAT", "NAMED_VALUE_FLOAT"} <= set(summary.heard["messages"])
-    assert summary.costs["cpu_s"] > 0
     picture = cv2.imread(str(summary.picture))
     assert picture.shape == (1050, 2580, 3)
     assert picture.std() > 20
