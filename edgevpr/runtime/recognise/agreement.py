@@ -249,7 +249,7 @@ def _turn_scale(expected: Overlay) -> np.complex64:
 
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
     """Return bool (N, M): which landmark of the place each of the query can be, by position, direction and size."""
-    factor = _factor(expected)
+    factor = _ANY_SCALE if expected.scale is None else _SCALE
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
     there: Bools = np.abs(laid[:, None] - known) <= room[:, None].astype(np.float32)
@@ -259,19 +259,15 @@ def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, e
     return there & (size <= place.size * most) & (size * most >= place.size)
 
 
-def _factor(expected: Overlay) -> float:
-    """Return the largest factor by which the scale may differ from the expected one."""
-    return _ANY_SCALE if expected.scale is None else _SCALE
-
-
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     """Return bool like `shift`: True for each way that is near to the expected one."""
     if expected is None:  # only the scale is limited
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)
     turned, stretched = np.abs(np.angle(beside, deg=True)), np.abs(np.log(np.abs(beside)))
+    most = np.log(_ANY_SCALE if expected.scale is None else _SCALE)
     is_there = np.abs(shift - complex(*expected.shift_share)) <= _STEP
-    return np.asarray((turned <= _TURN_DEG) & (stretched <= np.log(_factor(expected))) & is_there)
+    return np.asarray((turned <= _TURN_DEG) & (stretched <= most) & is_there)
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:

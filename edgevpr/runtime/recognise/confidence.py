@@ -115,8 +115,7 @@ class Model:
 
 def model_of(stored: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
-    adapted = stored["adapted_scale"]
-    scales = {"scale": _scale(**stored["scale"]), "adapted_scale": adapted and _scale(**adapted)}
+    scales = {name: stored[name] and _scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
     return Model(**{**stored, **regressions, **scales})
 

@@ -56,8 +56,8 @@ def open_recogniser(
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
-        beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
-        index = load_index(place_map, technique, _budget_bytes(config, board), beside_bytes=beside_bytes)
+        budget_bytes, beside_bytes = _ram(config, board, technique)
+        index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         recogniser = _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -82,10 +82,8 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         on_error.callback(place_map.close)
         technique = technique_of(place_map, config.technique, _wanted(config), board)
         index_positions(place_map)
-        beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
-        growing = GrowingIndex(
-            place_map, technique, budget_bytes=_budget_bytes(config, board), room=_ROOM, beside_bytes=beside_bytes
-        )
+        budget_bytes, beside_bytes = _ram(config, board, technique)
+        growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
         follows = config.match.follow
         recogniser = _recogniser(config, board, technique, place_map, growing.index, narrowed=True, follows=follows)
         on_error.pop_all()
@@ -241,5 +239,7 @@ def _wanted(config: Config) -> dict[str, str]:
     return {key: value for key, value in wanted.items() if value}
 
 
-def _budget_bytes(config: Config, board: Board) -> int:
-    return int(budget_mb(config, board) * 1e6)
+def _ram(config: Config, board: Board, technique: Technique) -> tuple[int, int]:
+    """Return the RAM that an index may take, and what each of its places takes beside it."""
+    beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
+    return int(budget_mb(config, board) * 1e6), beside_bytes

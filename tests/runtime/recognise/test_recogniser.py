@@ -82,7 +82,7 @@ def test_what_is_not_accepted_carries_no_position(walk):
 
 def test_every_step_is_metered(walk, clock):
     encode, scan, match = walk.technique.encode, walk.technique.coarse_scores, walk.technique.match
-    walk.technique.encode = lambda image: (clock.work(0.010), encode(image))[1]
+    walk.technique.encode = lambda *asked: (clock.work(0.010), encode(*asked))[1]
     walk.technique.coarse_scores = lambda *asked: (clock.work(0.020, 2.0), scan(*asked))[1]
     walk.technique.match = lambda *asked: (clock.work(0.001), match(*asked))[1]
     event = walk.step(frame(3))
@@ -120,7 +120,7 @@ def test_a_stop_is_no_exception_of_a_frame(walk):
     class Stop(BaseException):
         pass
 
-    def stopped(image):
+    def stopped(*asked):
         raise Stop
 
     walk.technique.encode = stopped
