@@ -51,7 +51,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     link = FakeLink(clock)
     flown = flight(recording, tmp_path, link, clock)
     encode = flown.recogniser.technique.encode
-    flown.recogniser.technique.encode = lambda image: (clock.work(6.2), encode(image))[1]
+    flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
     lines = flown.fly(FakeSource(pictures(3), clock))
     assert all(line["accepted"] for line in of_kind(lines, "query")), "accepted never means sent"
     assert fixes(lines) == [(False, "its frame is 6.2 s old, and 5 s are the limit")] * 3
@@ -78,7 +78,7 @@ def test_the_cost_of_every_query_is_told(recording, tmp_path):
     link = FakeLink(clock)
     flown = flight(recording, tmp_path, link, clock, board="rpi-4b")
     encode = flown.recogniser.technique.encode
-    flown.recogniser.technique.encode = lambda image: (clock.work(0.1, 2.0), encode(image))[1]
+    flown.recogniser.technique.encode = lambda *seen: (clock.work(0.1, 2.0), encode(*seen))[1]
     flown.fly(FakeSource(pictures(1, first=100), clock))
     told = {each.name: each.value for each in link.sent if each.get_type() == "NAMED_VALUE_FLOAT"}
     assert told["vpr_cpu"] == pytest.approx(0.5), "two of four cores while the query lasted"

@@ -77,7 +77,7 @@ def working_flight(recording, tmp_path, rate_hz, seconds, work, **settings):
     place_map = recording / "hog.gpkg"
     flight = Flight(place_map, tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": rate_hz} | settings)
     encode = flight.recogniser.technique.encode
-    flight.recogniser.technique.encode = lambda image: (work(clock), encode(image))[1]
+    flight.recogniser.technique.encode = lambda *seen: (work(clock), encode(*seen))[1]
     source = FakeSource([textured(0, 240, 320)] * int(rate_hz * seconds), clock)
     return flight.fly(source), flight
 

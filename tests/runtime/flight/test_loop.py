@@ -41,7 +41,7 @@ def test_a_stop_between_frames_ends_the_flight_within_a_turn(recording, tmp_path
 def test_a_stop_while_a_frame_is_recognised_breaks_it_off(recording, tmp_path, clock):
     flown = flight(recording, tmp_path, clock)
 
-    def long(image):
+    def long(image, mask):
         flown.stop()  # a signal comes
         raise AssertionError("the signal breaks this off")
 

@@ -28,7 +28,7 @@ def test_a_flights_charge_is_the_closed_form(recording, tmp_path):
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, **settings)
     technique = flight.recogniser.technique
     encode, scan = technique.encode, technique.coarse_scores
-    technique.encode = lambda image: (work(), encode(image))[1]
+    technique.encode = lambda *seen: (work(), encode(*seen))[1]
     technique.coarse_scores = lambda *asked: (work(), scan(*asked))[1]
     begin_s = clock.now_s
     lines = flight.fly(FakeSource([PICTURE] * 150, clock, work=work))
@@ -56,7 +56,7 @@ def test_nearly_all_cpu_time_of_the_loop_is_some_stage_of_a_query(recording, tmp
     clock = FakeClock()
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
     encode = flight.recogniser.technique.encode
-    flight.recogniser.technique.encode = lambda image: (clock.work(0.001), encode(image))[1]
+    flight.recogniser.technique.encode = lambda *seen: (clock.work(0.001), encode(*seen))[1]
     flight.fly(FakeSource([PICTURE] * 20, clock, work=lambda: clock.work(0.001)))
     totals = flight.end
     assert totals["stages_cpu_s"] == pytest.approx(totals["process_cpu_s"], rel=1e-6)
