@@ -76,11 +76,9 @@ class Descriptor:
     """The descriptor of one image.
 
     `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read for
-    candidates only (None: the technique has none).
-    `regions`: the region descriptors of a query. `good`: bool, one for each region, True if it is compared. None: the
-    technique does not use them.
-    `quality`: share of the image that holds information, 0..1.
-    `picture`: the prepared query, for a technique that encodes it again in other rotations (else None).
+    candidates only (None: the technique has none). `regions`: the region descriptors of a query. `good`: bool, one for
+    each region, True if it is compared. `quality`: share of the image that holds information, 0..1. `picture`: the
+    prepared query, for a technique that encodes it again in other rotations.
     """
 
     coarse: np.ndarray
@@ -110,7 +108,8 @@ class Support:
     `mutual`: share (0..1) where, in addition, the query's region finds the place's region as its most similar one.
     `likeness`: mean cosine similarity of each region of the query to the most similar one of the place, anywhere.
     `log_rank`: for each region of the query, the place's regions are ranked by similarity; mean natural logarithm of
-    the rank (from 1) of the region at this displacement. 0: it is always the most similar."""
+    the rank (from 1) of the region at this displacement.
+    """
 
     back: float
     mutual: float
@@ -150,11 +149,9 @@ class Technique(Protocol):
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
         """Encode an image, uint8 (H, W[, 3]). `mask`, bool (H, W), is False for pixels to be ignored (None: none)."""
-        ...
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape); `mean` is the map's mean part."""
-        ...
 
     def coarse_scores(
         self,
@@ -171,16 +168,13 @@ class Technique(Protocol):
         `turned_deg`: expected `FineMatch.rotation_deg` of each place, float (N,), NaN: unknown. Other rotations are
         ruled out. None: nothing is expected. Given only to a technique with `spec.heading_within_deg`.
         `height_ratio`: expected `FineMatch.height_ratio` (None: 1). Given only to one with `spec.height_ratios`."""
-        ...
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
         """Compare the query with the fine part of one place under `hypotheses`, columns of `coarse_scores` (None:
         all)."""
-        ...
 
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
         """Compare only a part of the query's regions with one place; arguments as of `match`. Returns an estimate of
         the score that `match` would give, and the best of the hypotheses, as the list for `match` (None: no choice)."""
-        ...

@@ -28,10 +28,10 @@ class Pose:
     """Direction and size on the ground of a place's picture, for a camera that looks straight down.
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `covariance_m2`: covariance of the place's position, which is the middle of the picture (variance east, covariance,
-    variance north).
-    `is_surveyed`: True if the picture was cut from an orthophoto, so that the pose needs no refinement.
-    `recorded`: the place's position before refinement (None: refinement did not move it)."""
+    `covariance_m2`: covariance (variance east, covariance, variance north) of the place's position, the middle of the
+    picture. `is_surveyed`: cut from an orthophoto, so that the pose needs no refinement. `recorded`: the place's
+    position before refinement (None: refinement did not move it).
+    """
 
     up_deg: float
     footprint_m: float
@@ -90,9 +90,10 @@ class Frame:
     """One picture and the data known of it (None: unknown).
 
     `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: seconds of the monotonic clock. `t_utc_s`: seconds since
-    1970. `heading_deg`: 0..360 clockwise from true north.
-    `roll_deg`, `pitch_deg`: of the airframe, positive with the right wing down, and with the nose up; of a camera on a
-    gimbal, its deviation from straight down. `height_m`: above the ground."""
+    1970. `heading_deg`: 0..360 clockwise from true north. `roll_deg`, `pitch_deg`: of the airframe, positive with the
+    right wing down, and with the nose up; of a camera on a gimbal, its deviation from straight down. `height_m`: above
+    the ground.
+    """
 
     image: np.ndarray
     name: str
@@ -201,10 +202,9 @@ class Steps:
 class QueryCost:
     """Cost of one query by equations 5.1-5.7 of the thesis, for the stages of encoding and matching.
 
-    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both.
-    `rss_mb`: memory of the process now. `pss_mb`: memory with shared pages in proportion, some seconds old (None: the
-    kernel does not report it).
-    `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not be drawn without the query.
+    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both. `rss_mb`: memory of
+    the process now. `pss_mb`: memory with shared pages in proportion, some seconds old (None: unknown). `used_mah`:
+    charge drawn from the battery; `marginal_mah`: the part that would not be drawn without the query.
     """
 
     t_encode_s: float = 0.0
@@ -225,12 +225,9 @@ class QueryCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
-    """The outcome of the position fix of one query.
-
-    `query`: name of the frame. `sent`: True, False (`why` gives the reason), or None while the fix waits to be sent or,
-    over TCP, for the acknowledgement of the receiver.
-    `answer`: the autopilot's answer, the name of a MAV_RESULT (None: no answer, or none yet).
-    `lat_deg`, `lon_deg`, `accuracy_m`: position and accuracy in the fix (None: there was nothing to send)."""
+    """The outcome of the position fix of one query, the frame's name. `sent`: True, False (`why` gives the reason), or
+    None while the fix waits to be sent or, over TCP, for the acknowledgement of the receiver. `answer`: the autopilot's
+    answer, the name of a MAV_RESULT (None: none yet). Position and accuracy are None if there was nothing to send."""
 
     query: str
     sent: bool | None

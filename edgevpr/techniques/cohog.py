@@ -92,7 +92,6 @@ class CoHog:
         self._hypotheses = range(as_it_is, as_it_is + 1)
         self._query: Descriptor | None = None
         self._views: Views | None = None
-        self._regions_of: dict[int, ViewRegions] = {}
         heights: dict[str, Any] = {}
         if self._is_nadir:
             self._vocabulary = placewords.load(self.words)
@@ -270,10 +269,10 @@ class CoHog:
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
         """Return the good regions of a query under a hypothesis. They are cached for the newest query."""
-        views = self._views_of(query)
-        if number not in self._regions_of:
-            self._regions_of[number] = views.regions(*hypothesis(number), self._comparable)
-        return self._regions_of[number]
+        cached = self._views_of(query).cached
+        if number not in cached:
+            cached[number] = self._views_of(query).regions(*hypothesis(number), self._comparable)
+        return cached[number]
 
     def _views_of(self, query: Descriptor) -> Views:
         if query is not self._query or self._views is None:
@@ -282,7 +281,7 @@ class CoHog:
             square = (self._side, self._side)
             own = query.regions.reshape(*square, -1), query.good.reshape(square)
             self._views = Views(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
-            self._query, self._regions_of = query, {}
+            self._query = query
         return self._views
 
     def _comparable(self, blocks: Singles) -> Singles:

@@ -68,8 +68,8 @@ def of_query(
 ) -> QueryWords:
     """Return the words of a query under all rotations. A key of `asking` is a rotation in steps, clockwise, below
     `within`, the steps in a quarter turn. Its value describes the good regions of the picture so turned: patterns
-    float32 (G, 20) and numbers int (G,). The rotations by further quarter turns follow from these; without a key they
-    have no words. `sides` are the regions along one side of the query and of a place, at most as many."""
+    float32 (G, 20) and numbers int (G,). Further quarter turns follow from these. `sides` are the regions along one
+    side of the query and of a place, at most as many."""
     total = within * QUARTERS
     side, of_place = sides
     at_most = _AT_MOST * side**2 // of_place**2

@@ -19,13 +19,12 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image, Ints, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
-from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.techniques.pooling import regional_vectors, square_regions, unit
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import VectorTechnique
 from edgevpr.techniques.words import bag_of_words, load_words
 
-_SMALLEST = 3  # rows and columns of a feature map: in a smaller one nearly every region covers the picture
 _TINY = 1e-12
 Describe = Callable[[Singles], tuple[Singles, Singles]]
 
@@ -87,11 +86,11 @@ def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
     """Make `cross_region_bow`: the `regions` regions of the highest energy of a feature map, scanned as a bag of
-    `words` visual words. `model` is the card of the network, `form` the form of the bag in RAM.
+    `words` visual words.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
-    `conv5_2`; a card names one feature map, which is used for both. The coarse part is the bag of words.
+    `conv5_2`; a card names one feature map, which is used for both.
     """
     backbone = region_backbone("cross_region_bow", model, threads, regions)
     learned = load_words(model, "bow", words)
@@ -110,24 +109,10 @@ def cross_region_bow(
 
 def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
     """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
-    ModelError for a feature map that is too small or has no activation above zero, UsageError for not 1 to 10 000
-    regions."""
+    UsageError for a number of regions outside 1 to 10 000."""
     if not 1 <= regions <= 10_000:
         raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
-    backbone = open_backbone(model, "features", threads)
-    height, width = backbone.shape[1:]
-    if min(height, width) < _SMALLEST:
-        raise ModelError(
-            f"{technique}: the feature map of `{model}` is {height}x{width}, too small for regions: at least "
-            f"{_SMALLEST}x{_SMALLEST} are needed, use an earlier layer."
-        )
-    noise = np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8)
-    if not len(find_regions(backbone.run(noise), 1)):
-        raise ModelError(
-            f"{technique}: the feature map of `{model}` has nothing above zero, and regions are made of that: use an "
-            "output after the rectifier."
-        )
-    return backbone
+    return open_backbone(model, "features", threads)
 
 
 def find_regions(features: Singles, count: int) -> Ints:
@@ -165,13 +150,9 @@ def describe(features: Singles, boxes: Ints) -> Singles:
 
 
 def mutual_score(query: Singles, place: Singles) -> float:
-    """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1. A pair is mutual if each
-    is the other's best match. The score is the sum of the cosines of the mutual pairs (negative ones count 0), divided
-    by the larger number of regions. All-zero rows are not regions.
-
-    Both papers sum over mutual pairs; the division keeps pictures with few regions from scoring low. Several channels
-    often mark the same box, of which only one finds a partner: a picture may score below 1 against itself.
-    """
+    """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
+    the mutual pairs, of which each is the other's best match (negative ones count 0), divided by the larger number of
+    regions. All-zero rows are not regions. The papers do not divide, and pictures with few regions score low there."""
     regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not regions_of_query or not regions_of_place:
         return 0.0

@@ -77,6 +77,7 @@ class Views:
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
         self._scaled: dict[float, tuple[Array, Array]] = {}
+        self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the blocks float32 (n, n, 4 bins) of the view of a height ratio and a rotation step, and which of them

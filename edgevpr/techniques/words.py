@@ -41,7 +41,7 @@ class Whitening:
 @dataclass(frozen=True, slots=True)
 class Words:
     """Learned words `words` float32 (K, D). `sha256` is the hash of network and words together, which a map stores.
-    `whitening` is that of the VLAD vectors made with them (None: they are not whitened)."""
+    `whitening` is that of the VLAD vectors made with them (None: there is none)."""
 
     words: Singles
     sha256: str

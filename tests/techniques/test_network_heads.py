@@ -149,24 +149,6 @@ def write_network(folder, name, side, shift):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "side", "shift", "says"),
-    [
-        ("amosnet", 2, 0, "2x2 is too small for a grid of 3x3"),
-        ("rmac", 1, 0, "1x1 is too small for the regions of R-MAC"),
-        ("alexnet", 4, 0, "64 values cannot be projected to 256"),
-        ("region_vlad", 2, 0, "2x2, too small for regions"),
-        ("cross_region_bow", 1, 0, "1x1, too small for regions"),
-        ("region_vlad", 8, -5, "nothing above zero"),
-    ],
-)
-def test_a_network_that_does_not_fit_is_refused_before_take_off(name, side, shift, says, tmp_path, monkeypatch):
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-    write_network(tmp_path, "tiny", side, shift)
-    with pytest.raises(ModelError, match=says):
-        technique(name, model="tiny")
-
-
 def test_a_picture_without_any_region_says_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
     write_network(tmp_path, "dim", 8, -0.2)  # active where it is brighter than 50
