@@ -1,17 +1,15 @@
 """Temperature and CPU frequency of the machine, and signs that it slows itself down, for the flight.
 
-A reading opens two or three files of /sys. The Raspberry Pi's firmware is slower and is asked once in `SLOW_S` seconds.
+A reading opens some files of /sys.
 """
 
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.power import machine
 
-SLOW_S = 5.0
 _UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
 # Bits of the firmware's answer that tell the present state. 16 places higher they tell it for any time since start.
@@ -34,8 +32,7 @@ class ThermalState:
 class ThermalWatch:
     """Reader of the temperature and frequency sensors, which are searched for once, when it is created."""
 
-    def __init__(self, root: Path = Path("/"), clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, root: Path = Path("/")) -> None:
         self._temperatures = [zone / "temp" for zone in _cpu_zones(root)]
         self._limit_c = limit_c(root)
         policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
@@ -43,27 +40,22 @@ class ThermalWatch:
         self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0
         self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
-        self._bits: int | None = None
-        self._slow_at_s = float("-inf")
 
     def look(self) -> ThermalState:
         """Read the sensors. Never raises: the value of a sensor that has gone, or reads an impossible value, is
         None."""
-        now_s = self._clock()
-        if self._firmware and now_s - self._slow_at_s >= SLOW_S:
-            self._slow_at_s, self._bits = now_s, _number(self._firmware, 16)
         degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
         khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
         frequency_mhz = khz / 1000 if khz is not None and khz > 0 else None
-        reasons = list(self._reasons(temperature_c, khz))
-        can_tell = self._bits is not None or self._top_khz > 0
+        bits = _number(self._firmware, 16) if self._firmware else None
+        reasons = list(self._reasons(bits or 0, temperature_c, khz))
+        can_tell = bits is not None or self._top_khz > 0
         throttled = any(slows for slows, _ in reasons) if can_tell else None
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
 
-    def _reasons(self, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
+    def _reasons(self, bits: int, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
         """Yield (slows, what) for everything seen: True if it slows the machine down now, and a text about it."""
-        bits = self._bits or 0
         if now := [word for bit, word in _BITS if bits & bit]:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
         if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgevpr.power.thermal import SLOW_S, ThermalState, ThermalWatch, limit_c
+from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 
 ZONE = "sys/class/thermal/thermal_zone"
 CPU = "sys/devices/system/cpu"
@@ -19,43 +19,43 @@ PI = {
 FIRMWARE = "sys/devices/platform/soc/soc:firmware/get_throttled"
 
 
-def test_a_cool_board_that_idles_is_not_throttled(tree, clock):
-    assert ThermalWatch(tree(PI), clock).look() == ThermalState(48.312, 600.0, False, "")
+def test_a_cool_board_that_idles_is_not_throttled(tree):
+    assert ThermalWatch(tree(PI)).look() == ThermalState(48.312, 600.0, False, "")
 
 
-def test_the_hottest_sensor_of_the_cpu_counts_and_no_other(tree, clock):
+def test_the_hottest_sensor_of_the_cpu_counts_and_no_other(tree):
     zones = {
         f"{ZONE}1/type": "wifi-thermal\n",
         f"{ZONE}1/temp": "90000\n",
         f"{ZONE}2/type": "soc0-thermal\n",
         f"{ZONE}2/temp": "51000\n",
     }
-    assert ThermalWatch(tree(PI | zones), clock).look().temperature_c == 51.0
+    assert ThermalWatch(tree(PI | zones)).look().temperature_c == 51.0
 
 
-def test_a_machine_that_says_nothing_is_unknown(tmp_path, clock):
-    assert ThermalWatch(tmp_path, clock).look() == ThermalState(None, None, None, "")
+def test_a_machine_that_says_nothing_is_unknown(tmp_path):
+    assert ThermalWatch(tmp_path).look() == ThermalState(None, None, None, "")
 
 
 @pytest.mark.parametrize("nonsense", ["", "hot\n", "999999999\n", "-300000\n", "nan\n", "\udcff"])
-def test_a_sensor_that_says_nonsense_is_none(tree, clock, nonsense):
+def test_a_sensor_that_says_nonsense_is_none(tree, nonsense):
     root = tree(PI)
     (root / f"{ZONE}0/temp").write_bytes(nonsense.encode(errors="surrogateescape"))
     (root / f"{POLICY}/scaling_cur_freq").write_bytes(b"-1\n")
-    assert ThermalWatch(root, clock).look() == ThermalState(None, None, False, "")
+    assert ThermalWatch(root).look() == ThermalState(None, None, False, "")
 
 
-def test_sensors_that_go_do_not_raise(tree, clock):
+def test_sensors_that_go_do_not_raise(tree):
     root = tree(PI)
-    watch = ThermalWatch(root, clock)
+    watch = ThermalWatch(root)
     for name in PI:
         (root / name).unlink()
     assert watch.look() == ThermalState(None, None, False, "")
 
 
-def test_a_frequency_limit_that_sinks_is_throttling(tree, clock):
+def test_a_frequency_limit_that_sinks_is_throttling(tree):
     root = tree(PI)
-    watch = ThermalWatch(root, clock)
+    watch = ThermalWatch(root)
     assert watch.look().throttled is False
     tree({f"{POLICY}/scaling_max_freq": "1200000\n"})
     state = watch.look()
@@ -64,20 +64,20 @@ def test_a_frequency_limit_that_sinks_is_throttling(tree, clock):
     assert watch.look().throttled is False
 
 
-def test_a_power_mode_that_holds_the_frequency_low_is_not(tree, clock):
-    watch = ThermalWatch(tree(PI | {f"{POLICY}/scaling_max_freq": "1000000\n"}), clock)
+def test_a_power_mode_that_holds_the_frequency_low_is_not(tree):
+    watch = ThermalWatch(tree(PI | {f"{POLICY}/scaling_max_freq": "1000000\n"}))
     assert watch.look().throttled is False
 
 
-def test_a_hot_machine_that_runs_slowly_is_throttled(tree, clock):
-    state = ThermalWatch(tree(PI | {f"{ZONE}0/temp": "82500\n"}), clock).look()
+def test_a_hot_machine_that_runs_slowly_is_throttled(tree):
+    state = ThermalWatch(tree(PI | {f"{ZONE}0/temp": "82500\n"})).look()
     assert (state.throttled, state.why) == (True, "600 of 1800 MHz at 82.5 degrees")
 
 
-def test_the_fastest_of_two_clusters_is_looked_at(tree, clock):
+def test_the_fastest_of_two_clusters_is_looked_at(tree):
     big = f"{CPU}/cpufreq/policy4"
     files = {f"{big}/cpuinfo_max_freq": "2400000", f"{big}/scaling_cur_freq": "2300000"}
-    assert ThermalWatch(tree(PI | files), clock).look().frequency_mhz == 2300.0
+    assert ThermalWatch(tree(PI | files)).look().frequency_mhz == 2300.0
 
 
 @pytest.mark.parametrize(
@@ -93,19 +93,9 @@ def test_the_fastest_of_two_clusters_is_looked_at(tree, clock):
         ("what\n", False, ""),
     ],
 )
-def test_the_firmware_says_what_slows_it_down(tree, clock, answer, throttled, why):
-    state = ThermalWatch(tree(PI | {FIRMWARE: answer}), clock).look()
+def test_the_firmware_says_what_slows_it_down(tree, answer, throttled, why):
+    state = ThermalWatch(tree(PI | {FIRMWARE: answer})).look()
     assert (state.throttled, state.why) == (throttled, why)
-
-
-def test_the_firmware_is_asked_once_in_some_seconds(tree, clock):
-    watch = ThermalWatch(tree(PI | {FIRMWARE: "0\n"}), clock)
-    assert watch.look().throttled is False
-    tree({FIRMWARE: "4\n"})
-    clock.sleep(SLOW_S - 0.1)
-    assert watch.look().throttled is False
-    clock.sleep(0.2)
-    assert watch.look().throttled is True
 
 
 def trips(**points):
