@@ -34,46 +34,20 @@ if TYPE_CHECKING:
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = command(commands, "eval", evaluate, "measure techniques on a data set with ground truth")
-    parser.add_argument(
-        "--data",
-        nargs="+",
-        metavar="FOLDER",
-        help="a data set in one folder, of any layout that is known; several: --out",
-    )
+    parser.add_argument("--data", nargs="+", metavar="FOLDER", help="a data set of any known layout; several: --out")
     parser.add_argument("--sets", metavar="FILE", help="YAML: many sets by many rows, with --out")
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on there"
-    )
+    parser.add_argument("--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on")
     parser.add_argument("--workers", type=count, metavar="N", help="with --out: processes at work (all cores)")
-    video = (
-        "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and FLIGHT.csv: time,lat,lon[,...])"
-    )
+    video = "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and .csv: time,lat,lon[,...])"
     parser.add_argument("--query", metavar="SOURCE", help=video)
     parser.add_argument("--ref", metavar="SOURCE", help="the same, of the places to be found")
-    parser.add_argument(
-        "--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (default: every frame)"
-    )
-    parser.add_argument(
-        "--ground-truth",
-        metavar="FILE",
-        help="CSV; with --similarity also GT.npz or ground_truth_new.npy (default: right is what is near, by the "
-        "positions)",
-    )
+    parser.add_argument("--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (all)")
+    parser.add_argument("--ground-truth", metavar="FILE", help="CSV (default: right is what is near, by the positions)")
     parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
     parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
-    parser.add_argument(
-        "--overlap", type=positive, metavar="SHARE", help="and with so much ground in common, looking down (--fov-deg)"
-    )
-    parser.add_argument(
-        "--similarity",
-        nargs="+",
-        metavar="FILE",
-        help="instead of techniques, measure stored similarities (.npy; a row for each query; of --query and --ref "
-        "where they are given)",
-    )
-    parser.add_argument(
-        "--form", default="float", metavar="A,B", help=f"of vectors, one row each: {', '.join(FORMS)} (float)"
-    )
+    parser.add_argument("--overlap", type=positive, metavar="SHARE", help="and with so much common ground (--fov-deg)")
+    parser.add_argument("--similarity", nargs="+", metavar="FILE", help="measure stored similarities (.npy)")
+    parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")

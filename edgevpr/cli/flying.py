@@ -53,9 +53,7 @@ def add(commands: Any) -> None:
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
     check.add_argument("--offline", action="store_true", help="wait for no frame and no heartbeat: on the bench")
-    check.add_argument(
-        "--learn-mask", metavar="PNG", help="instead, learn from the source which part of its frames shows no ground"
-    )
+    check.add_argument("--learn-mask", metavar="PNG", help="instead, learn which part of the frames is no ground")
     check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
     services = group(commands, "service", "print the systemd unit for a board, or install it all")

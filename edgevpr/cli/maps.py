@@ -51,9 +51,7 @@ def add(commands: Any) -> None:
 
     _add_build(of_map("build", map_build, "make a map of a flight, or of an orthophoto", "to make, e.g. valley.gpkg"))
     refine = of_map("refine", map_refine, "find out where the pictures really lie, by matching them")
-    refine.add_argument(
-        "--images", metavar="DIR", help="the images that the map was made of: with them more pictures are tied"
-    )
+    refine.add_argument("--images", metavar="DIR", help="the images that the map was made of: more pictures are tied")
     add_json(refine)
     calibrate = of_map("calibrate", map_calibrate, "find out how sure a map can be, with the pictures it is of")
     _add_pictures(calibrate)
@@ -87,9 +85,7 @@ def _add_build(build: ArgumentParser) -> None:
     add_keys(build, "source.camera", "source.mask", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places a second of a video (default: all)")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
-    build.add_argument(
-        "--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure the map can be"
-    )
+    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure it is")
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     add_json(build)
 
@@ -101,12 +97,8 @@ def _add_pictures(parser: ArgumentParser) -> None:
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
     flags.add_argument("--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture")
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
-    flags.add_argument(
-        "--area", metavar="FILE", help="only over this: a mission (waypoints, QGC .plan) or GeoJSON (default: all)"
-    )
-    flags.add_argument(
-        "--margin-m", type=float, metavar="M", help="this far beside the path of --area (default: the footprint)"
-    )
+    flags.add_argument("--area", metavar="FILE", help="only over this: a mission or GeoJSON (default: all)")
+    flags.add_argument("--margin-m", type=float, metavar="M", help="so far beside the path of --area (a footprint)")
 
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":

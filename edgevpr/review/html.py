@@ -1,14 +1,30 @@
-"""Parts of HTML pages that need no network and no script, in the light or dark colours that the reader has chosen.
+"""Parts of HTML pages that need no network and no script, in the light or dark colours that the reader has chosen: for
+the reports of flights (`review.page`) and of evaluations (`lab.evaluate.page`).
 
-The reports of flights (`review.page`) and of evaluations (`lab.evaluate.page`) are made of them.
+Charts follow the width of the page, while their lines and dots keep their thickness. Their text is HTML beside the SVG,
+so that it is readable on a phone. A `colour` is a CSS class that sets the colour.
 """
 
 import base64
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 from edgevpr.core.text import shown
+
+Points = Sequence[tuple[float, float]]  # (x, value), or (x, y) of a drawing
+
+UNKNOWN = "–"
+
+_WIDE, _HIGH = 1000.0, 100.0
+_LAST = 0.97  # share of an axis: a text centred on a point further right would leave the page
+_TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
+_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
+_MOST_TICKS = 6
+_GAP, _LEAST_GAP = 5.0, 3.0  # a line is broken where points are missing for so many usual steps, and so much of x
 
 # Content security policy: the browser loads nothing from anywhere, even if a file name in the page contains HTML.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -64,3 +80,157 @@ def picture(name: str, caption: str, jpeg: bytes) -> str:
         f'<figure><img alt="{foreign(name)}" src="data:image/jpeg;base64,{data}">'
         f"<figcaption>{foreign(caption)}</figcaption></figure>"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One line of a chart (with `are_dots`: its dots): the name in the legend, the colour, and the points (x, value) in
+    the order of x."""
+
+    name: str
+    colour: str
+    points: Points
+    are_dots: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """The horizontal axis, from `first` to `last`. Each of `ticks` is (value on the axis; text below it)."""
+
+    first: float
+    last: float
+    ticks: Sequence[tuple[float, str]]
+
+    def across(self, x: float) -> float:
+        """Return where `x` lies along the axis, from 0 (left end, or left of it) to 1 (right end, or right of it)."""
+        return min(max((x - self.first) / ((self.last - self.first) or 1.0), 0.0), 1.0)
+
+    def grid(self, high: float) -> str:
+        """Return an SVG path of vertical lines at the ticks, `high` units high, and the line below them."""
+        lines = "".join(f"M{_WIDE * self.across(x):.1f} 0v{high:g}" for x, _ in self.ticks)
+        return f'<path class="grid" d="{lines}M0 {high:g}h{_WIDE:g}"/>'
+
+    def below(self) -> str:
+        """Return the texts below the axis, as HTML."""
+        texts = ""
+        for x, text in self.ticks:
+            left = self.across(x)
+            last = " class=last" if left > _LAST else ""
+            texts += f'<span{last} style="left:{100 * left:.1f}%">{escape(text)}</span>' if text else ""
+        return f'<div class="times">{texts}</div>'
+
+
+def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: float = 0.0) -> str:
+    """Return a chart of `series` as HTML. Its values reach from 0 to the highest one, and to `top` at least. A series
+    without points is left out; if none has points, the result is "". A line is broken where points are missing."""
+    series = [each for each in series if each.points]
+    if not series:
+        return ""
+    highest = nice(max(top, *(value for each in series for _, value in each.points)))
+    paths = ""
+    for each in series:
+        path, kind = (dots, "dots") if each.are_dots else (way, "line")
+        several = [each.points] if each.are_dots else _known_parts(each.points)
+        places = ([(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in part] for part in several)
+        paths += f'<path class="{kind} {each.colour}" d="{"".join(map(path, places))}"/>'
+    legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
+    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + paths)
+    return _framed(title, f"{unit} {legend}", highest, axis, drawing)
+
+
+def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
+    """Return a chart of points as HTML, "" without points. Each is (x, value, short text, colour), with values from 0
+    to `top`. Texts that would lie over each other are moved to the right."""
+    taken: list[tuple[float, float]] = []
+    marks = tags = ""
+    for x, value, text, colour in points:
+        left, above = axis.across(x), 1 - min(max(value / top, 0.0), 1.0)
+        marks += f'<path class="dots {colour}" d="{dots([(_WIDE * left, _HIGH * above)])}"/>'
+        tag = left
+        while any(abs(tag - other) < _TAG_WIDE and abs(above - at) < _TAG_HIGH for other, at in taken):
+            tag += _TAG_WIDE
+        taken.append((tag, above))
+        tags += f'<span class="tag {colour}" style="left:{100 * tag:.1f}%;top:{100 * above:.1f}%">{escape(text)}</span>'
+    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + marks)
+    return _framed(title, f"{unit} ", top, axis, f'<div class="tagged">{drawing}{tags}</div>') if points else ""
+
+
+def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
+    """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number; "" without
+    rows."""
+    axis, lines = times(span_s), ""
+    for name, colour, times_s in rows:
+        marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times_s}))
+        drawing = _svg(f"{name}: {len(times_s)}", 20, f'{axis.grid(20)}<path class="mark {colour}" d="{marks}"/>')
+        lines += f"<span>{escape(name)} <b>{len(times_s)}</b></span>{drawing}"
+    return f'<div class="lanes">{lines}<span></span>{axis.below()}</div>' if rows else ""
+
+
+def dots(points: Points) -> str:
+    """Return SVG path data of dots: lines of length 0, whose round ends make dots as wide as the line."""
+    return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+
+
+def way(points: Points) -> str:
+    """Return SVG path data of a line through `points`; a single point becomes a dot."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + ("h0" if len(points) == 1 else "")
+
+
+def nice(value: float) -> float:
+    """Round up to two digits that are easily read: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of ten."""
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10) if step * power >= value * 0.999)
+
+
+def figure(value: float | None, unit: str = "") -> str:
+    """Return a number, with three significant digits, and its unit as text; a dash for None."""
+    if value is None:
+        return UNKNOWN
+    digits = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{digits} {unit}".strip()
+
+
+def clock(t_s: float) -> str:
+    """Return a time in seconds as text: minutes and seconds (2:03), from an hour on with the hours (1:02:03)."""
+    minutes, seconds = divmod(round(t_s), 60)
+    if minutes < 60:
+        return f"{minutes}:{seconds:02d}"
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _svg(label: str, high: float, content: str) -> str:
+    return (
+        f'<svg role="img" aria-label="{escape(label)}" viewBox="0 0 {_WIDE:g} {high:g}" preserveAspectRatio="none">'
+        f"{content}</svg>"
+    )
+
+
+def _framed(title: str, beside: str, highest: float, axis: Axis, drawing: str) -> str:
+    return (
+        f'<figure class="chart"><figcaption><b>{escape(title)}</b> {beside}</figcaption>'
+        f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>0</span></div>'
+        f"<div>{drawing}{axis.below()}</div></div></figure>"
+    )
+
+
+def _label(title: str, unit: str) -> str:
+    return f"{title}, {unit}" if unit else title
+
+
+def times(span_s: float) -> Axis:
+    """Return an axis of time, from 0 to `span_s` seconds."""
+    step = next((each for each in _STEPS_S if span_s / each <= _MOST_TICKS), span_s / _MOST_TICKS)
+    ticks = [count * step for count in range(int(span_s / step) + 1)] if step else [0.0]
+    last = _LAST * span_s
+    return Axis(0.0, span_s, [(t_s, clock(t_s) if t_s <= last or not t_s else "") for t_s in ticks])
+
+
+def _known_parts(points: Points) -> Iterator[Points]:
+    """Split a line wherever points are missing for an unusual time, and yield its parts."""
+    steps = [after[0] - before[0] for before, after in pairwise(points)]
+    most = max(_LEAST_GAP, _GAP * sorted(steps)[len(steps) // 2]) if steps else 0.0
+    breaks = [at for at, step in enumerate(steps, start=1) if step > most]
+    for first, last in pairwise([0, *breaks, len(points)]):
+        yield points[first:last]

@@ -14,8 +14,8 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Pose
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.review.html import Points, dots, way
 from edgevpr.review.logged import FixOutcome, LoggedFlight, Point
-from edgevpr.review.svg import Points, dots, way
 
 _WIDE = 1000.0  # of the drawing, in its own units
 _MARGIN = 0.04

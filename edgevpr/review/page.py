@@ -16,10 +16,25 @@ from types import MappingProxyType
 
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import shown
-from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
+from edgevpr.review.html import (
+    UNKNOWN,
+    Points,
+    Series,
+    chart,
+    clock,
+    figure,
+    foreign,
+    heading,
+    lanes,
+    notes,
+    page,
+    picture,
+    section,
+    table,
+    times,
+)
 from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, text, value
 from edgevpr.review.overhead import MapGround, draw, layers_of
-from edgevpr.review.svg import UNKNOWN, Points, Series, chart, clock, figure, lanes, times
 
 _MOST_REMARKS = 200
 _FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
@@ -34,6 +49,7 @@ _COLOURS = {
     FixOutcome.CONTINUOUS: "taken",
     FixOutcome.KEPT: "places",
 }
+_KNOWN = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 _CHARTS = (
     ("CPU", "cores busy", "cores", "accepted"),
     ("RAM", "MB", "rss_mb", "accepted"),
@@ -103,46 +119,30 @@ class Album:
 
 def page_of(flight: LoggedFlight, ground: MapGround, frames: Album, references: Album) -> str:
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of."""
-    moments = list(enumerate(worst(flight.queries), start=1))
-    named = [
-        (str(number), where)
-        for number, (query, _) in moments
-        if (where := query.at or query.autopilot_at or query.gps_at)
-    ]
-    shown_moments = [_moment(number, *moment, frames, references) for number, moment in moments]
-    title = _title(flight)
+    queries, moments = flight.queries, list(enumerate(worst(flight.queries), start=1))
+    positions = [(str(number), query.at or query.autopilot_at or query.gps_at) for number, (query, _) in moments]
+    time = text(flight.start, "time") or next((each.time for each in queries), "")
+    title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
+    start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
+    refusals = (query.reason.partition(":")[0] for query in queries if not query.accepted)
+    fixes = [query.fix for query in queries if query.fix and query.fix.outcome is not FixOutcome.CONTINUOUS]
     body = [
-        heading(title, _known(flight)),
-        section("", _figures(flight.queries)),
+        heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
+        section("", _figures(queries)),
         notes(_notes(flight, ground)),
-        section("Over the ground", draw(ground, layers_of(flight), named)),
+        section("Over the ground", draw(ground, layers_of(flight), [(name, at) for name, at in positions if at])),
         section("What became of every query", _lanes(flight)),
         section("Over time", _charts(flight)),
-        section("Worst moments", "".join(shown_moments)),
-        section("Why matches were refused", _counts(_refusals(flight))),
-        section("Why fixes were not sent, or not taken", _counts(_objections(flight))),
+        section("Worst moments", "".join(_moment(number, *each, frames, references) for number, each in moments)),
+        section("Why matches were refused", _counts(refusals)),
+        section(
+            "Why fixes were not sent, or not taken",
+            _counts(f"{fix.outcome.value}: {fix.why}" for fix in fixes if fix.why),
+        ),
         section("What was said", _remarks(flight)),
         section("How it was set", _settings(flight)),
     ]
     return page(title, Path(__file__).with_name("page.css"), body)
-
-
-def _title(flight: LoggedFlight) -> str:
-    time = text(flight.start, "time") or next((each.time for each in flight.queries), "")
-    return f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
-
-
-def _known(flight: LoggedFlight) -> Iterator[str]:
-    yield f"{clock(flight.span_s)} long"
-    for name, known in (
-        ("map", text(flight.start, "map")),
-        ("technique", text(flight.start, "technique")),
-        ("board", text(flight.start, "board")),
-        ("edgevpr", text(flight.start, "version")),
-    ):
-        if known:
-            yield f"{name} {known}"
-    yield str(flight.path)
 
 
 def _figures(queries: Sequence[LoggedQuery]) -> str:
@@ -195,7 +195,7 @@ def _notes(flight: LoggedFlight, ground: MapGround) -> Iterator[str]:
 
 def _lanes(flight: LoggedFlight) -> str:
     queries = flight.queries
-    heard = [query.t_s for query in queries if query.has_link]
+    is_heard = any(query.has_link for query in queries)
     rows = [
         ("match accepted", "accepted", [query.t_s for query in queries if query.accepted]),
         ("match refused", "refused", [query.t_s for query in queries if not query.accepted]),
@@ -204,11 +204,10 @@ def _lanes(flight: LoggedFlight) -> str:
             (outcome.value, colour, [query.t_s for query in queries if query.fix and query.fix.outcome is outcome])
             for outcome, colour in _COLOURS.items()
         ),
-        ("autopilot heard", "autopilot", heard),
-        ("autopilot silent", "refused", [query.t_s for query in queries if heard and query.has_link is False]),
+        ("autopilot heard", "autopilot", [query.t_s for query in queries if query.has_link]),
+        ("autopilot silent", "refused", [query.t_s for query in queries if is_heard and query.has_link is False]),
     ]
-    rows = [row for row in rows if row[2]]
-    return lanes(rows, flight.span_s) if rows else ""
+    return lanes([row for row in rows if row[2]], flight.span_s)
 
 
 def _charts(flight: LoggedFlight) -> str:
@@ -289,16 +288,6 @@ def _moment(number: int, query: LoggedQuery, why: str, frames: Album, references
     )
 
 
-def _refusals(flight: LoggedFlight) -> Iterator[str]:
-    return (query.reason.partition(":")[0] for query in flight.queries if not query.accepted)
-
-
-def _objections(flight: LoggedFlight) -> Iterator[str]:
-    for query in flight.queries:
-        if query.fix and query.fix.why and query.fix.outcome is not FixOutcome.CONTINUOUS:
-            yield f"{query.fix.outcome.value}: {query.fix.why}"
-
-
 def _counts(reasons: Iterable[str]) -> str:
     """Return a table of how often each reason was given. Numbers in reasons become "…", so that equal ones count
     together."""
@@ -307,18 +296,13 @@ def _counts(reasons: Iterable[str]) -> str:
 
 
 def _remarks(flight: LoggedFlight) -> str:
-    remarks = flight.remarks[:_MOST_REMARKS]
-    if not remarks:
-        return ""
-    more = len(flight.remarks) - len(remarks)
-    rows = [(clock(each.t_s), each.kind, each.said) for each in remarks]
-    left_out = f'<p class="soft">and {more} more lines</p>' if more else ""
-    return table(("time", "of", "said"), rows) + left_out
+    rows = [(clock(each.t_s), each.kind, each.said) for each in flight.remarks[:_MOST_REMARKS]]
+    left_out = f'<p class="soft">and {len(flight.remarks) - len(rows)} more lines</p>'
+    return (table(("time", "of", "said"), rows) if rows else "") + left_out * (len(flight.remarks) > len(rows))
 
 
 def _settings(flight: LoggedFlight) -> str:
-    reason = text(flight.start, "decided", "reason")
-    config = value(flight.start, "config")
+    reason, config = text(flight.start, "decided", "reason"), value(flight.start, "config")
     if not isinstance(config, dict):
         return ""
     said = f"<p>{foreign(reason)}</p>" if reason else ""

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from edgevpr.review.svg import Series, chart, clock, figure, lanes, nice, times
+from edgevpr.review.html import Series, chart, clock, figure, lanes, nice, times
 
 
 def paths(drawn, kind):

@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from edgevpr.review.html import foreign, page, section, table
-from edgevpr.review.svg import Axis, Series, chart, scatter
+from edgevpr.review.html import Axis, Series, chart, foreign, page, scatter, section, table
 
 SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.5, "half"), (1.0, "1")])
 

@@ -18,8 +18,20 @@ from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.many import CURVE_TO, MeasuredRow, Measurements
 from edgevpr.lab.evaluate.metrics import RESAMPLES, SEED
 from edgevpr.lab.evaluate.provenance import machine, today, versions
-from edgevpr.review.html import foreign, heading, notes, page, picture, section, table
-from edgevpr.review.svg import Axis, Series, chart, figure, scatter
+from edgevpr.review.html import (
+    Axis,
+    Series,
+    chart,
+    figure,
+    foreign,
+    heading,
+    notes,
+    page,
+    picture,
+    scatter,
+    section,
+    table,
+)
 
 _COLOURS = 8  # of lines; those after the eighth are dashed
 _PICTURE_PX = 240
