@@ -7,7 +7,7 @@
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
   GSV-Cities and others in that form). References near the query are right (`Nearness`).
 * query/ and ref/ with positions (positions.csv or EXIF): references near the query are right. Either side may be a
-  video with positions beside it, query.mp4 with query.csv, or a folder that holds one.
+  video with positions beside it, query.mp4 with query.csv.
 """
 
 from collections.abc import Callable

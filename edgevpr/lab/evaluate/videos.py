@@ -1,8 +1,8 @@
 """Makes folders of pictures from videos with positions, for data sets: each video is decoded once, and its pictures are
 kept.
 
-The positions of a video lie beside it: a table of its name (later.csv of later.mp4), or positions.csv where it is the
-only video of its folder. `frames.track` explains its columns. A side of a data set is its queries or its references.
+The positions of a video lie beside it, in a table of its name (later.csv of later.mp4). `frames.positions` explains its
+columns. A side of a data set is its queries or its references.
 """
 
 import tempfile
@@ -19,7 +19,7 @@ from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate.asking import Progress
 from edgevpr.lab.evaluate.provenance import key_of, stamp
 
-# Videos looked for in a folder, which may hold other files. A video that is given by its own path may have any ending.
+# Of videos of a data set. A video that is given by its own path may have any ending.
 _EXTENSIONS = frozenset(".mp4 .mov .mkv .avi .m4v .webm .ts .mts .m2ts .mpg .mpeg .mjpeg .h264".split())  # noqa: SIM905
 _POSITIONS = "positions.csv"
 _FORM = "time,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m], `time` in seconds from its first frame"
@@ -36,13 +36,14 @@ class VideoPictures:
     progress: Progress[Any]
 
     def __call__(self, given: Path) -> Path:
-        """Return `given` if it is a folder of pictures. If it is a video, or a folder with one video and no picture,
-        return the folder of that video's pictures. Raises UsageError for a video without positions, ImageError for a
-        damaged one, SourceError for a file that is no video, and EdgevprError for a full disk."""
-        video = _video_of(given)
-        if video is None:
+        """Return `given` if it is a folder of pictures, and of a video the folder of its pictures. Raises UsageError for
+        a video without positions, ImageError for a damaged one, SourceError for a file that is no video, and
+        EdgevprError for a full disk."""
+        video, table = given, given.with_suffix(".csv")
+        if not video.is_file() or is_image(video.name):
             return given
-        table = _positions_beside(video)
+        if not table.is_file():
+            raise UsageError(f"{video} has no positions beside it: write {table.name} there ({_FORM}).")
         made = self.folder / key_of(video, stamp(video), stamp(table), self.rate_hz)
         if not made.is_dir():
             step_s = 1 / self.rate_hz if self.rate_hz else None
@@ -106,32 +107,7 @@ def side_of(folder: Path, name: str) -> Path | None:
     there is neither."""
     if (inner := folder / name).is_dir():
         return inner
-    return _only([path for path in _videos_in(folder) if path.stem == name], folder)
-
-
-def _video_of(given: Path) -> Path | None:
-    if given.is_file():
-        return None if is_image(given.name) else given
-    if not given.is_dir() or any(is_image(path.name) for path in given.iterdir()):
-        return None
-    return _only(_videos_in(given), given)
-
-
-def _only(videos: list[Path], folder: Path) -> Path | None:
+    videos = sorted(path for path in folder.glob(f"{name}.*") if path.suffix.lower() in _EXTENSIONS)
     if len(videos) > 1:
         raise UsageError(f"{folder} holds {len(videos)} videos ({videos[0].name}, {videos[1].name}): keep one of them.")
     return videos[0] if videos else None
-
-
-def _videos_in(folder: Path) -> list[Path]:
-    found = (path for path in folder.iterdir() if path.suffix.lower() in _EXTENSIONS and path.name[0] != ".")
-    return sorted(path for path in found if path.is_file())
-
-
-def _positions_beside(video: Path) -> Path:
-    own, common = video.with_suffix(".csv"), video.parent / _POSITIONS
-    if own.is_file():
-        return own
-    if common.is_file() and _videos_in(video.parent) == [video]:
-        return common
-    raise UsageError(f"{video} has no positions beside it: write {own.name} there ({_FORM}).")

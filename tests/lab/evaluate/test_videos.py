@@ -55,10 +55,10 @@ class Flight:
             self.pictures.append(picture)
         (self.places / "positions.csv").write_text("\n".join(rows))
 
-    def film(self, video, table=None, *coding):
+    def film(self, video, *coding):
         """Film the flight, with its positions beside it, and return the path."""
         film_of(video, self.pictures, RATE_HZ, *coding)
-        (table or video.with_suffix(".csv")).write_text("\n".join(self.times))
+        video.with_suffix(".csv").write_text("\n".join(self.times))
         return video
 
 
@@ -117,18 +117,17 @@ def test_what_is_right_is_the_same_by_distance_heading_and_ground_in_common(rule
 
 def test_the_layouts_of_a_folder(tmp_path, mapping, later):
     pictures = VideoPictures(tmp_path / "kept", None, shown)
-    for name in ("beside", "inside", "both"):
+    for name in ("beside", "both"):
         (tmp_path / name).mkdir()
-    later.film(tmp_path / "beside" / "query.MKV", tmp_path / "beside" / "query.csv")
+    later.film(tmp_path / "beside" / "query.MKV")
     mapping.film(tmp_path / "beside" / "ref.mkv")
-    for each in (later, mapping):
-        (tmp_path / "inside" / each.name).mkdir()
-        video = tmp_path / "inside" / each.name / "DJI_0001.mkv"
-        each.film(video, video.parent / "positions.csv")
     later.film(tmp_path / "both" / "query.mkv")
     mapping.places.rename(tmp_path / "both" / "ref")
-    found = [numbers(open_folder(tmp_path / name, RULES[0], pictures)) for name in ("beside", "inside", "both")]
-    assert found[0] == found[1] == found[2] == {0: {1, 2}, 1: {2, 3}, 2: {3, 4}, 3: {4, 5}, 4: {5}}
+    found = [numbers(open_folder(tmp_path / name, RULES[0], pictures)) for name in ("beside", "both")]
+    assert found[0] == found[1] == {0: {1, 2}, 1: {2, 3}, 2: {3, 4}, 3: {4, 5}, 4: {5}}
+    (tmp_path / "both" / "query.mp4").touch()
+    with pytest.raises(UsageError, match=r"query\.mp4"):
+        open_folder(tmp_path / "both", RULES[0], pictures)
 
 
 def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_anew(films, tmp_path, capsys):
@@ -200,22 +199,6 @@ def test_what_cannot_be_used_is_said_in_one_sentence(harm, code, said, films, ca
     assert said in lines[0]
 
 
-def test_two_videos_in_one_folder_and_a_common_table_of_two_are_refused(films, tmp_path):
-    pictures = VideoPictures(tmp_path / "kept", None, shown)
-    with pytest.raises(UsageError, match=r"2 videos \(later"):
-        pictures(tmp_path)
-    films[0].with_suffix(".csv").rename(tmp_path / "positions.csv")
-    with pytest.raises(UsageError, match=r"later\.csv"):
-        pictures(films[0])
-    films[1].unlink()
-    assert len(list(pictures(films[0]).glob("*.png"))) == PLACES
-    (tmp_path / "later.mp4").touch()
-    films[0].rename(tmp_path / "query.mkv")
-    (tmp_path / "later.mp4").rename(tmp_path / "query.mp4")
-    with pytest.raises(UsageError, match=r"query\.mp4"):
-        open_folder(tmp_path, RULES[0], pictures)
-
-
 def test_a_full_disk_is_said_and_leaves_nothing_half_taken(films, tmp_path):
     pictures = VideoPictures(tmp_path / "kept", None, shown)
     with no_file_larger_than(2000), pytest.raises(EdgevprError, match=r"later\.mkv"):
@@ -246,6 +229,6 @@ def test_killed_while_pictures_are_taken_it_goes_on_with_the_next_run(films, tmp
 def test_as_a_camera_films_it_the_places_are_still_found(tmp_path, mapping, later, capsys):
     """With losses, as MPEG-4 in an MP4 file."""
     coding = "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"
-    videos = [each.film(tmp_path / f"{each.name}.mp4", None, *coding) for each in (later, mapping)]
+    videos = [each.film(tmp_path / f"{each.name}.mp4", *coding) for each in (later, mapping)]
     found = measured(capsys, "--query", videos[0], "--ref", videos[1], "--within-m", "20")
     assert quality(found)["recall_at_1"] >= 5 / 6
