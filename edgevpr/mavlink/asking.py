@@ -6,7 +6,7 @@ import select
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
@@ -119,23 +119,15 @@ class Inquiry:
         missing = list(dict.fromkeys(names))
         for _ in range(TRIES):
             for start in range(0, len(missing), IN_FLIGHT):
-                self._read_parameters(missing[start : start + IN_FLIGHT], values, bytewise)
+                waiting = set(missing[start : start + IN_FLIGHT])
+                for name in missing[start : start + IN_FLIGHT]:
+                    self._put(messages.parameter_request(self.system_id or 0, name))
+                while waiting and (answer := self._first(ANSWER_WAIT_S, _answers_one_of(waiting))):
+                    waiting.remove(answer.param_id)
+                    if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
+                        values[answer.param_id] = value
             missing = [name for name in missing if name not in values]
         return values
-
-    def _read_parameters(self, names: Collection[str], values: dict[str, float | int], bytewise: bool) -> None:
-        """Request the parameters `names`, and store the answers in `values`, until no answer has come for a second."""
-        waiting = set(names)
-        for name in names:
-            self._put(messages.parameter_request(self.system_id or 0, name))
-        kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
-        while waiting:
-            answer = self._first(ANSWER_WAIT_S, lambda each: each.get_type() in kinds and each.param_id in waiting)
-            if answer is None:
-                return
-            waiting.remove(answer.param_id)
-            if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
-                values[answer.param_id] = value
 
     def _first(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
         return next((message for message in self._messages(wait_s) if is_wanted(message)), None)
@@ -289,3 +281,8 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
 def _refuses(message: Message) -> bool:
     is_answer = message.get_type() == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
     return is_answer and message.result in _FINAL
+
+
+def _answers_one_of(names: set[str]) -> Callable[[Message], bool]:
+    kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
+    return lambda message: message.get_type() in kinds and message.param_id in names

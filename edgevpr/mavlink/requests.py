@@ -2,13 +2,11 @@
 computer. A request that is not handled here has no effect; there are no parameters that could be set. A wish is a
 request that only the flight itself can fulfil, such as a pause. Used by `conversation` and the flight."""
 
-import re
 from collections import Counter
 from collections.abc import Collection
 from enum import IntEnum
 from typing import NamedTuple
 
-from edgevpr import __version__
 from edgevpr.mavlink.wire import Message, mavlink
 
 ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
@@ -69,25 +67,17 @@ class Requests:
             return ()
         if kind == "TIMESYNC":
             return (mavlink.MAVLink_timesync_message(tc1=round(now_s * 1e9), ts1=message.ts1),)
-        result, replies = self._obey(message)
+        is_wish = message.command == mavlink.MAV_CMD_USER_1
+        result = self._take_wish(message.param1, sender) if is_wish else int(mavlink.MAV_RESULT_UNSUPPORTED)
         self.results[mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")] += 1
         ack = mavlink.MAVLink_command_ack_message(
             command=message.command, result=result, target_system=sender[0], target_component=sender[1]
         )
-        return (ack, *replies)
+        return (ack,)
 
-    def _obey(self, command: Message) -> tuple[int, tuple[Message, ...]]:
-        """Execute a command. Returns its result, a MAV_RESULT, and the messages that it requested."""
-        wanted = command.param1  # a float: a whole one equals its integer, and NaN equals none
-        if command.command == mavlink.MAV_CMD_USER_1:
-            return self._take_wish(command, wanted), ()
-        if command.command == mavlink.MAV_CMD_REQUEST_MESSAGE and wanted == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-            return mavlink.MAV_RESULT_ACCEPTED, (version(),)
-        return mavlink.MAV_RESULT_UNSUPPORTED, ()
-
-    def _take_wish(self, command: Message, wanted: float) -> int:
+    def _take_wish(self, wanted: float, sender: tuple[int, int]) -> int:
         """Keep a wish, in place of a waiting one on the same subject. Returns a MAV_RESULT."""
-        if wanted not in tuple(Wish):
+        if wanted not in tuple(Wish):  # a whole float equals its integer, and NaN equals none
             return int(mavlink.MAV_RESULT_DENIED)
         wish = Wish(int(wanted))
         if wish not in self.offered:
@@ -95,7 +85,7 @@ class Requests:
         is_about_learning = wish in (Wish.LEARN, Wish.LEARN_NOTHING)
         if not is_about_learning:
             self._is_paused = wish is Wish.PAUSE
-        self._waiting[is_about_learning] = Wished(wish, f"{command.get_srcSystem()}/{command.get_srcComponent()}")
+        self._waiting[is_about_learning] = Wished(wish, f"{sender[0]}/{sender[1]}")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _may_answer(self, now_s: float) -> bool:
@@ -112,11 +102,3 @@ def _asks(message: Message, us: tuple[int, int]) -> bool:
         return bool(message.tc1 == 0)
     target = getattr(message, "target_system", None), getattr(message, "target_component", None)
     return target == us and message.get_type() != "COMMAND_ACK"
-
-
-def version() -> Message:
-    """Make the AUTOPILOT_VERSION (148) of this companion: the version of edgevpr, and that it uses MAVLink 2."""
-    major, minor, patch = (int(each) for each in re.findall(r"\d+", f"{__version__}.0.0")[:3])
-    capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    packed, nothing = major << 24 | minor << 16 | patch << 8, [0] * 8
-    return mavlink.MAVLink_autopilot_version_message(capabilities, packed, 0, 0, 0, *[nothing] * 3, 0, 0, 0)
