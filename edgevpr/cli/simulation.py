@@ -25,7 +25,6 @@ def add(commands: Any) -> None:
     simulations = group(commands, "simulate", "a generated flight, a flight controller to talk to")
     autopilot = command(simulations, "autopilot", simulate_autopilot, "a flight controller that answers and counts")
     autopilot.add_argument("--link", default="udpin:127.0.0.1:14550", metavar="URL", help="(udpin:127.0.0.1:14550)")
-    autopilot.add_argument("--duration-s", type=float, metavar="S", help="how long (default: until stopped)")
     autopilot.add_argument(
         "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a flight is first heard"
     )
@@ -63,7 +62,6 @@ def simulate_autopilot(args: Namespace) -> int:
     has_gps = track is not None and not args.no_gps
     summary = run_autopilot(
         args.link,
-        args.duration_s,
         track=track,
         vehicle=args.vehicle,
         gps=has_gps,

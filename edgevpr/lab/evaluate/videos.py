@@ -36,8 +36,8 @@ class VideoPictures:
     progress: Progress[Any]
 
     def __call__(self, given: Path) -> Path:
-        """Return `given` if it is a folder of pictures, and of a video the folder of its pictures. Raises UsageError for
-        a video without positions, ImageError for a damaged one, SourceError for a file that is no video, and
+        """Return `given` if it is a folder of pictures, and of a video the folder of its pictures. Raises UsageError
+        for a video without positions, ImageError for a damaged one, SourceError for a file that is no video, and
         EdgevprError for a full disk."""
         video, table = given, given.with_suffix(".csv")
         if not video.is_file() or is_image(video.name):

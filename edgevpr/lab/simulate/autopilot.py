@@ -6,7 +6,7 @@ import select
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -52,7 +52,6 @@ class AutopilotSummary:
 
 def run_autopilot(
     link_url: str,
-    duration_s: float | None = None,
     stop: threading.Event | None = None,
     *,
     track: FlownTrack | None = None,
@@ -60,8 +59,8 @@ def run_autopilot(
     gps: bool = False,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
-    """Simulate an autopilot at `link_url` until `duration_s` is over, `stop` is set, Ctrl-C comes, or the link is
-    lost. Its UTC is that of this machine.
+    """Simulate an autopilot at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost. Its UTC is that of
+    this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that is more than a question, and
     stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS, and accepts no
@@ -72,17 +71,11 @@ def run_autopilot(
     controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
     for name, text in parameters.items():
         controller.brain.parameters.set_written(name, text)
-    return serve(controller, link_url, duration_s, stop)
+    return serve(controller, link_url, stop)
 
 
-def serve(
-    controller: FlightController,
-    link_url: str,
-    duration_s: float | None = None,
-    stop: threading.Event | None = None,
-) -> AutopilotSummary:
+def serve(controller: FlightController, link_url: str, stop: threading.Event | None = None) -> AutopilotSummary:
     """Connect `controller` to `link_url` until the same events as in `run_autopilot`; return what it received."""
-    stop = stop or threading.Event()
     address = parse_link(link_url)
     try:
         transport = open_port(address)
@@ -91,7 +84,7 @@ def serve(
     log.info("%s is up at %s", controller, address)
     port = _Conversation(transport, controller)
     try:
-        port.run(lambda t_s: stop.is_set() or (duration_s is not None and t_s >= duration_s))
+        port.run(stop or threading.Event())
     except KeyboardInterrupt:
         log.debug("%s is asked to end", address)
     except OSError as error:
@@ -113,11 +106,11 @@ class _Conversation:
         self._lost_packets = 0
         self._waiting = b""
 
-    def run(self, ended: Callable[[float], bool]) -> None:
-        """Advance by the clock and answer until `ended`, which is given the seconds since the start, is true."""
+    def run(self, stop: threading.Event) -> None:
+        """Advance by the clock and answer until `stop` is set."""
         start_s = time.monotonic()
-        while not ended(t_s := time.monotonic() - start_s):
-            self._say(self._controller.advance(t_s))
+        while not stop.is_set():
+            self._say(self._controller.advance(time.monotonic() - start_s))
             readable, _, _ = select.select([self._transport], [], [], STEP_S)
             if readable:
                 for message in self._receiver.feed(self._transport.read()):
