@@ -1,5 +1,6 @@
 """Image files that are right, and all the ways in which they can be wrong."""
 
+import contextlib
 import os
 import random
 import resource
@@ -14,6 +15,7 @@ import photographs
 import pytest
 
 from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import MAX_PIXELS, list_images, read_image
 
 THUMBNAIL = photographs.encoded(".jpg", photographs.picture(24, 32))
@@ -148,9 +150,6 @@ def test_a_folder_without_images_is_refused(tmp_path):
         list_images(tmp_path / "notes.txt")
 
 
-FORMATS = {".jpg": (), ".png": (), ".tif": (), ".bmp": (), ".webp": (cv2.IMWRITE_WEBP_QUALITY, 80), ".ppm": ()}
-
-
 def png(width, height, rows=b""):
     """A PNG whose header promises width x height, with every checksum right."""
 
@@ -208,23 +207,36 @@ def test_a_small_file_does_not_take_gigabytes(tmp_path):
     assert "102 megapixels" in done.stdout, done.stderr
 
 
-def test_a_header_with_bytes_gone_wrong_is_read_or_refused(tmp_path):
-    chance = random.Random(5)
+def whole_files(folder):
+    """Pairs of a picture file with all that a camera writes and the number of its first bytes that matter."""
+    photographs.write_jpeg(
+        folder / "photo.jpg",
+        {1: "N", 2: (46.0, 50.0, 33.0), 3: "W", 4: (91.0, 59.0, 42.0), 6: 198.5, 7: (16.0, 31.0, 59.5), 17: 10.0},
+        {0x9003: "2016:06:23 16:31:59"},
+    )
+    photo = (folder / "photo.jpg").read_bytes()
+    xmp = b'<x drone-dji:RelativeAltitude="40" drone-dji:FlightYawDegree="+10.0"/>'
+    yield photo, 4 + int.from_bytes(photo[4:6], "big")
+    yield photographs.with_app1(photo, xmp), 100
+    for extension in (".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"):
+        yield photographs.encoded(extension, photographs.picture()), 64
 
-    def read_image_of(content):
-        (tmp_path / "broken.jpg").write_bytes(content)
-        return read_image(tmp_path / "broken.jpg")
 
-    for extension, options in FORMATS.items():
-        whole = photographs.encoded(extension, photographs.picture(), *options)
-        for _ in range(60):
+@pytest.mark.slow
+def test_a_file_with_bytes_gone_wrong_is_read_or_refused_and_its_tags_never_leave_the_earth(tmp_path):
+    chance, path = random.Random(5), tmp_path / "broken.jpg"
+    for whole, most in whole_files(tmp_path):
+        for _ in range(100):
             broken = bytearray(whole[: chance.choice((len(whole), chance.randrange(len(whole))))])
             for _ in range(min(len(broken), chance.choice((1, 4, 16)))):
-                broken[chance.randrange(min(len(broken), 64))] = chance.choice((0, 255, chance.randrange(256)))
-            try:
-                assert read_image_of(bytes(broken)).size <= 3 * MAX_PIXELS
-            except ImageError:
-                continue
+                broken[chance.randrange(min(len(broken), most))] = chance.choice((0, 255, chance.randrange(256)))
+            path.write_bytes(broken)
+            with contextlib.suppress(ImageError):
+                assert read_image(path).size <= 3 * MAX_PIXELS
+            tag = read_exif(path)
+            assert tag.position is None or (abs(tag.position.lat_deg) <= 90 and abs(tag.position.lon_deg) <= 180)
+            assert tag.heading_deg is None or 0 <= tag.heading_deg < 360
+            assert tag.height_m is None or abs(tag.height_m) <= 100_000
 
 
 def test_a_jpeg_of_hundreds_of_scans_is_refused(tmp_path):

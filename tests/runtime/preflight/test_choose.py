@@ -134,12 +134,6 @@ def test_a_technique_without_a_fine_part_is_tried_too():
     assert costs.match_per_place.wall_s > 0
 
 
-@pytest.mark.slow
-def test_the_real_techniques_can_be_probed():
-    costs = {name: probe(techniques.create(name)) for name in techniques.AUTOMATIC}
-    assert costs["hog"].ram_bytes_per_place > 100 * costs["cohog"].ram_bytes_per_place
-
-
 def test_the_most_accurate_is_taken_where_it_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
     assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "the order says nothing"
