@@ -50,8 +50,7 @@ def _exif_of(path: str | Path) -> Tags:
 
 
 def _known(read: Callable[[Tags], T], tags: Tags) -> T | None:
-    """Return what `read` finds; None if it raises, since a tag may be absent, of another type or length, or a zero
-    division."""
+    """Return what `read` finds; None if it raises: a tag may be absent, of another type or length, or divide by 0."""
     with contextlib.suppress(Exception):  # files of any origin
         return read(tags)
     return None
@@ -142,13 +141,10 @@ def _number(values: Mapping[str, bytes], name: str, low: float = -360.0, high: f
 
 
 def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Convert a gimbal's angles, whose pitch is -90 when it looks straight down, to (heading, roll, pitch) in degrees,
-    with roll and pitch 0 when it looks straight down.
-
-    The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
-    is the camera's viewing direction. Looking straight down, the gimbal's roll only turns the picture: a gimbal may
-    report half a turn in yaw as half a turn in roll.
-    """
+    """Convert a gimbal's angles, whose pitch is -90 when it looks straight down, to (heading, roll, pitch) in degrees."""
+    # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
+    # is the camera's viewing direction: roll and pitch are 0 when it looks straight down. Then the gimbal's own roll
+    # only turns the picture: a gimbal may report half a turn in yaw as half a turn in roll.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
     # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, with which atan2 is off by half a turn.
     ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)

@@ -129,11 +129,8 @@ def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes
 
 
 def _is_incomplete(data: bytes) -> bool:
-    """Return True for no data, a JPEG without its end mark, or a PNG in which a chunk is missing or damaged.
-
-    OpenCV 4 fills the missing part of a JPEG with grey without an error, and ignores the checksums of a PNG. Its
-    decoders of the other formats detect damage themselves. Bytes after the end mark are allowed.
-    """
+    # OpenCV 4 fills the missing part of a JPEG with grey, and ignores the checksums of a PNG. Its decoders of the other
+    # formats detect damage themselves. Bytes after the end mark are allowed.
     if data.startswith(_JPEG_START):
         return not jpeg_is_whole(data)
     return not data or (data.startswith(_PNG_START) and not _png_is_whole(data))

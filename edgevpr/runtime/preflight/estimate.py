@@ -157,8 +157,7 @@ def _estimated(option: Option, board: Board, plan: FlightPlan, measured: bool, o
 def _recommended(
     rows: tuple[TechniqueEstimate, ...], board: Board, plan: FlightPlan, map_technique: str | None
 ) -> tuple[str | None, str]:
-    """Choose among the options of `map_technique` (None: among all). Return the label of the technique to use (None:
-    none can be), and the reason, in a sentence."""
+    """Choose among the options of `map_technique` (None: among all); return `recommended` and `reason`."""
     usable = {row.option.label: row for row in rows if map_technique in (None, row.option.name)}
     served = f"the map was built with {map_technique}, and " if map_technique else ""
     if not usable:

@@ -82,8 +82,7 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
 
 
 def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
-    """Return the technique with the number of candidates that the flight will compare, and its accuracy and cost as a
-    short text."""
+    """Return the technique with the candidates that the flight will compare, and its accuracy and cost as a text."""
     technique, board = recogniser.technique, recogniser.meter.board
     spec, costs = technique.spec, _costs_on(technique, board)
     costs = replace(

@@ -104,8 +104,7 @@ def _passes(score: MachineSpeed) -> float | None:
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
-    """Return the cost of a stage on `board`, one thread of which is `ratio` times as fast. It may use `threads` threads
-    there (None: as many as it did)."""
+    """Return the cost of a stage on `board`, a thread of which is `ratio` times as fast, with at most `threads`."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return cost * (1 / ratio)
