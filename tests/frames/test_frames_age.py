@@ -54,7 +54,7 @@ def test_clocks_that_drift_make_no_picture_old(drift):
 
 @pytest.mark.parametrize("delay", ["wavers", "grows"])
 def test_a_delay_that_wavers_or_grows_is_age_for_as_long_as_it_lasts(delay):
-    """A network that is jammed for a minute, after ten pictures in time; and a reader who is too slow for the stream."""
+    """A network that is jammed for a minute, after ten pictures in time; and a reader too slow for the stream."""
     wavering = np.random.default_rng(1).uniform(2.0, 2.5, 1200)
     delays_s = {"wavers": np.where(np.arange(1200) < 10, 0.0, wavering), "grows": 0.02 * np.arange(1200)}[delay]
     ages_s = feed(StampedTime(), 1200, delay_s=lambda number: delays_s[number])
