@@ -141,7 +141,7 @@ def _number(values: Mapping[str, bytes], name: str, low: float = -360.0, high: f
 
 
 def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Convert angles of a gimbal, whose pitch is -90 when it looks straight down, to (heading, roll, pitch), degrees."""
+    """Convert angles of a gimbal, with a pitch of -90 straight down, to (heading, roll, pitch) in degrees."""
     # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
     # is the camera's viewing direction: roll and pitch are 0 when it looks straight down. Then the gimbal's own roll
     # only turns the picture: a gimbal may report half a turn in yaw as half a turn in roll.
