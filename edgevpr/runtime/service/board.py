@@ -13,13 +13,11 @@ from edgevpr.core.config import Config, LogConfig
 from edgevpr.core.errors import UsageError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.tlog import SPARED_BYTES
-from edgevpr.places.mapfiles import map_path
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
 
 LOG_ROOM_MB = 10  # some hours of queries
-_MAP_ROOM_MB = 100  # a thousand places of cohog, learnt in flight
 
 
 def board_findings(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
@@ -32,8 +30,6 @@ def board_findings(config: Config, address: LinkAddress | None, root: Path = Pat
     if config.source.uri and config.source.uri.startswith("/dev/"):
         yield device("camera", config.source.uri, root)
     yield from log_findings(config.log, has_link=config.mavlink.link is not None)
-    if config.map:
-        yield _map_room(map_path(config.map).absolute(), config.mapping.learn)
 
 
 def device(what: str, path: str, root: Path = Path("/")) -> Finding:
@@ -86,15 +82,6 @@ def _room(file: str, key: str, needed_mb: float) -> str:
     if free_mb < needed_mb:
         raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {needed_mb:g} are needed: make room.")
     return str(path)
-
-
-def _map_room(path: Path, learns: bool) -> Finding:
-    free_mb = shutil.disk_usage(next(folder for folder in path.parents if folder.is_dir())).free / 1e6
-    if learns and free_mb < _MAP_ROOM_MB:
-        return wrong("map", f"{path}: only {free_mb:.0f} MB are free there, too few for learning: make room.")
-    if not path.exists() and not learns:
-        return wrong("map", f"{path} is not there: copy it to the board, or build it.")
-    return fine("map", f"{path}, {free_mb:.0f} MB free")
 
 
 def _memory(needed_mb: float, root: Path) -> Finding:

@@ -12,7 +12,7 @@ from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.board import board_findings
-from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
+from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, judged, wrong
 from edgevpr.runtime.service.rules import RULES
 
 _SLOW_S = 0.25  # for a round trip: fixes would come as late
@@ -181,9 +181,8 @@ def _filter(reading: AutopilotReading) -> Finding:
 
 def _gps(reading: AutopilotReading) -> Finding:
     fixes = [fix for fix in reading.gps_fix if fix is not None]
-    if any(fix >= _GPS_3D for fix in fixes):
-        return fine("gps", f"fix type {' and '.join(map(str, fixes))}")
-    return wrong("gps", "No GPS receiver has a fix: take off only with one, so that the start is known.")
+    none = "No GPS receiver has a fix: take off only with one, so that the start is known."
+    return judged("gps", max(fixes, default=0) >= _GPS_3D, f"fix type {' and '.join(map(str, fixes))}", none)
 
 
 def _origin(reading: AutopilotReading) -> Finding:
@@ -201,10 +200,10 @@ def _clock(reading: AutopilotReading) -> Finding:
     if ahead_s is None:
         return fine("clock", "the autopilot has no time of day yet, so the board's is not compared with it")
     side = "behind" if ahead_s > 0 else "ahead of"
-    if abs(ahead_s) <= _CLOCK_S:
-        return fine("clock", f"{abs(ahead_s):.1f} s {side} the autopilot's")
-    return wrong(
+    return judged(
         "clock",
+        abs(ahead_s) <= _CLOCK_S,
+        f"{abs(ahead_s):.1f} s {side} the autopilot's",
         f"The board's clock is {abs(ahead_s):.0f} s {side} the autopilot's: flight logs and signatures would carry the "
         "wrong time.",
         "timedatectl set-ntp true, or a clock chip",

@@ -35,6 +35,11 @@ def wrong(what: str, message: str, *changes: str) -> Finding:
     return Finding(what, False, message, changes)
 
 
+def judged(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
+    """Return the finding that is `good` or, with the changes that put it right, `bad`."""
+    return fine(what, good) if ok else wrong(what, bad, *changes)
+
+
 def looked_at(what: str, look: Callable[[], str]) -> Finding:
     """Run a check and return its finding: fine with the text that `look` returns, wrong with the error that it
     raises."""

@@ -25,7 +25,7 @@ from edgevpr.mavlink.channel import (
     receiver_name,
 )
 from edgevpr.mavlink.messages import SENSOR_ID
-from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, wrong
+from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, judged, wrong
 
 Parameters = Mapping[str, float | int]
 
@@ -55,10 +55,9 @@ class FirmwareRules:
 def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
     parameters, choice = reading.parameters, ardupilot_choice(reading.asked)
     wanted = (("EK3_ENABLE", 1), ("AHRS_EKF_TYPE", 3))
-    if changes := [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]:
-        yield wrong("EKF3", "Only the third EKF takes fixes: use it, and reboot.", *changes)
-    else:
-        yield fine("EKF3", "the filter that takes fixes is in use")
+    changes = [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]
+    good, bad = "the filter that takes fixes is in use", "Only the third EKF takes fixes: use it, and reboot."
+    yield judged("EKF3", not changes, good, bad, *changes)
     if choice.channel.is_continuous and not intent.sends_fixes:
         yield _dry(choice, reading)
     elif choice.channel is Channel.GPS_INPUT:
@@ -110,9 +109,8 @@ def _by_gps(choice: Choice, parameters: Parameters) -> Finding:
         changes.append(_SWITCH)
     if not _sets_with(parameters, "POSXY", _FROM_GPS):
         changes.append(f"EK3_SRC1_POSXY={_FROM_GPS}")
-    if changes:
-        return wrong("channel", f"{choice.reason}, but it would not be used.", *changes)
-    return fine("channel", _sentence(choice.reason))
+    unused = f"{choice.reason}, but it would not be used."
+    return judged("channel", not changes, _sentence(choice.reason), unused, *changes)
 
 
 def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
@@ -153,15 +151,15 @@ def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[F
     choice = px4_choice(reading.asked)
     yield _px4_channel(choice, reading)
     rarity = f"a query every {intent.every_s:g} s, and PX4 drops positions after {SILENT_S:g} s of silence"
-    if choice.channel is Channel.SENSOR and intent.every_s >= SILENT_S:
-        yield wrong(
+    if choice.channel is Channel.SENSOR:
+        yield judged(
             "rate",
+            intent.every_s < SILENT_S,
+            rarity,
             f"There is {rarity}: it would never keep one. Ask more often, where `edgevpr profile "
             "--rate-hz` says that the board can, or take a faster board.",
             f"source: {{rate_hz: {2 / SILENT_S:g}}}, or more: not every query is a match",
         )
-    elif choice.channel is Channel.SENSOR:
-        yield fine("rate", rarity)
     yield _port(reading, "MAV_PROTO_VER=2")
 
 
@@ -183,20 +181,14 @@ def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
         (parameters.get("EKF2_AGP0_ID", SENSOR_ID) == SENSOR_ID, f"EKF2_AGP0_ID={SENSOR_ID}"),
         (parameters.get("EKF2_AGP0_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_AGP0_DELAY=0"),
     )
-    if changes := [change for is_so, change in wanted if not is_so]:
-        return wrong(
-            "channel",
-            "PX4 can take positions as measurements (message 296), but is not set for it as edgevpr sends them: change "
-            "this, and reboot.",
-            *changes,
-        )
-    return fine("channel", _sentence(choice.reason))
+    changes = [change for is_so, change in wanted if not is_so]
+    unset = "PX4 can take positions as measurements (message 296), but is not set for it as edgevpr sends them"
+    return judged("channel", not changes, _sentence(choice.reason), f"{unset}: change this, and reboot.", *changes)
 
 
 def _port(reading: AutopilotReading, change: str) -> Finding:
-    if reading.says_version_1:
-        return wrong("port", "It speaks MAVLink 1, which knows neither signatures nor new messages.", change)
-    return fine("port", "MAVLink 2")
+    old = "It speaks MAVLink 1, which knows neither signatures nor new messages."
+    return judged("port", not reading.says_version_1, "MAVLink 2", old, change)
 
 
 def _sentence(words: str) -> str:

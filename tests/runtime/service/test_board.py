@@ -102,13 +102,7 @@ def test_a_device_that_may_not_be_used_names_its_group():
     os.close(port)
 
 
-def test_room_for_log_and_map_is_looked_at(root, tmp_path, monkeypatch):
-    absent = config(tmp_path, map=str(tmp_path / "valley.gpkg"))
-    assert not found(absent, root)["map"].ok
-    learning = config(tmp_path, map=str(tmp_path / "valley.gpkg"), **{"mapping.learn": True})
-    assert found(learning, root)["map"].ok
+def test_room_for_the_log_is_looked_at(root, tmp_path, monkeypatch):
     usage = type(shutil.disk_usage("/"))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(8_000_000_000, 7_995_000_000, 5_000_000))
-    findings = found(learning, root)
-    assert "5 MB" in findings["map"].message
-    assert "5.0 MB" in findings["log"].message
+    assert "5.0 MB" in found(config(tmp_path), root)["log"].message
