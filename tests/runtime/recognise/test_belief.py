@@ -77,13 +77,6 @@ def test_queries_that_fit_each_other_say_more_than_each_alone(speed):
     assert posteriors[0].mass < 0.85
 
 
-def test_stops_and_a_turn_back_do_not_lose_it():
-    places = [*range(20, 40), *[39] * 10, *range(39, 20, -1)]
-    posteriors = fly(Belief(IN_ORDER), places, np.random.default_rng(3), p=0.95)
-    assert all(is_at(each, place) for each, place in zip(posteriors, places, strict=True))
-    assert all(each.mass > 0.9 for each in posteriors[3:])
-
-
 def test_between_two_places_that_look_alike_the_way_there_decides():
     belief = Belief(IN_ORDER)
     for n in range(12):

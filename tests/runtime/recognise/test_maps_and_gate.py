@@ -30,27 +30,6 @@ def texture(height=120, width=160, spread=40.0, middle=128.0):
     return np.clip(middle + spread * fine / fine.std(), 0, 255).astype(np.uint8)
 
 
-def literal_entropy(grey, radius=5):
-    """The algorithm printed in thesis 3.2.3, disc by disc."""
-    height, width = grey.shape
-    entropy = np.zeros(grey.shape)
-    for y in range(height):
-        for x in range(width):
-            bins = {
-                grey[v, u]
-                for v in range(max(0, y - radius), min(height, y + radius + 1))
-                for u in range(max(0, x - radius), min(width, x + radius + 1))
-                if (v - y) ** 2 + (u - x) ** 2 <= radius**2
-            }
-            entropy[y, x] = np.log2(len(bins)) / 8
-    return entropy
-
-
-def test_the_entropy_map_is_that_of_the_thesis():
-    grey = texture(40, 50)
-    assert maps_of(grey, None, None).entropy == pytest.approx(literal_entropy(grey), abs=1e-6)
-
-
 def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_nothing():
     picture = texture()
     static = np.ones(picture.shape, bool)
