@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.places import geopackage, mapfiles, rows, sqlite
+from edgevpr.places import geopackage, mapfiles, rows
+from edgevpr.places.mapfiles import is_of_one_row, sentences
 from edgevpr.places.mapspec import read_stored, spec_of, write_spec
 from edgevpr.places.rows import Values
-from edgevpr.places.sqlite import is_of_one_row, sentences
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -36,7 +36,7 @@ class MapConnection:
         self.path, self.stored = path, read_stored(path, db)
         self.spec = spec_of(path, self.stored)
         self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
-        self._wait_s = sqlite.WAIT_S
+        self._wait_s = mapfiles.WAIT_S
         self._take(db)
         self._state = self._state_now()
 
@@ -53,11 +53,11 @@ class MapConnection:
                 raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
             undo.callback(mapfiles.remove, path)
             with sentences(path):
-                db = sqlite.connect(path, "rw")
+                db = mapfiles.connect(path, "rw")
                 undo.callback(db.close)
                 db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
                 db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
-                sqlite.start_log(db)
+                mapfiles.start_log(db)
                 db.executescript("BEGIN;" + geopackage.SCHEMA)
                 write_spec(db, spec)
                 db.execute("COMMIT")
@@ -70,7 +70,7 @@ class MapConnection:
         """Open a map for reading. Raises MapError if the file is missing, damaged, not a place map, or of an unknown
         format version, and UsageError for a name that no file can have."""
         path = mapfiles.existing(path)
-        sqlite.settle_left_log(path)
+        mapfiles.settle_left_log(path)
         return cls._opened(path, None)
 
     @classmethod
@@ -88,7 +88,7 @@ class MapConnection:
     @classmethod
     def _opened(cls, path: Path, lock: int | None) -> "Self":
         with sentences(path):
-            db = sqlite.connect(path, "ro" if lock is None else "rw")
+            db = mapfiles.connect(path, "ro" if lock is None else "rw")
             try:
                 return cls(path, db, lock)
             except BaseException:
@@ -105,7 +105,7 @@ class MapConnection:
         """Close the file. If it was open for adding, first merge SQLite's log into it: one file, also readable from a
         read-only medium, is left."""
         if self._lock is not None:
-            sqlite.settle(self.db)
+            mapfiles.settle(self.db)
         self.db.close()
         if self._lock is not None:
             os.close(self._lock)
@@ -122,7 +122,7 @@ class MapConnection:
             if state == self._state:
                 return
             mapfiles.existing(self.path)
-            fresh = sqlite.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
+            fresh = mapfiles.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
             try:
                 if read_stored(self.path, fresh) != self.stored:
                     raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
@@ -185,7 +185,7 @@ class MapConnection:
         can be. Python 3.10 cannot set this limit."""
         self.db = connection
         if self._lock is not None:
-            sqlite.start_log(connection)
+            mapfiles.start_log(connection)
         if sys.version_info >= (3, 11):
             fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
             most_bytes = self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES

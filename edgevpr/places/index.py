@@ -188,8 +188,7 @@ class GrowingIndex:
     ) -> None:
         """Load the map, which may be empty, and allocate slots for `room` more places as far as the budget allows.
 
-        Per place, `beside_bytes` of `budget_bytes` stay free for other arrays that grow with the index (see
-        `sequence`). Raises MapError if the budget is too small for one place.
+        `beside_bytes`: see `load_index`. Raises MapError if the budget is too small for one place.
         """
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)

@@ -20,8 +20,8 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
+from edgevpr.places.mapfiles import is_of_one_row, sentences
 from edgevpr.places.rows import Content, Unreadable, Values
-from edgevpr.places.sqlite import is_of_one_row, sentences
 
 _OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
 _OF_FINE = "geom, geom_crc32, fine, fine_crc32"

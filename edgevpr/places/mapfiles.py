@@ -1,14 +1,30 @@
-"""Paths of map files and of the files that SQLite keeps beside them, and the lock of the program that adds places."""
+"""Paths of map files and of the files that SQLite keeps beside them; the lock of the program that adds places; opening
+and closing with SQLite, and the translation of its errors into sentences for the user."""
 
 import fcntl
 import os
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from edgevpr.core.errors import MapBusyError, MapError, UsageError
+from edgevpr.places.geopackage import point_or_none
 
 _BESIDE = ("-wal", "-shm", "-journal")
+WAIT_S = 5.0  # longest wait for another program that is writing
+# Instructions of SQLite after which a statement is interrupted. A table of a million places takes a tenth of this; a
+# view, or a damaged table that refers to itself, may never end.
+_MOST_STEPS = 500_000_000
+
+# Words of SQLite's messages, and advice to the user.
+_ADVICE = {
+    "full": "the disk is full: make room; every place confirmed so far is kept",
+    "not a database": "this is not a place map: give a .gpkg file made by `edgevpr map build`",
+    "readonly": "it may not be written: check its permissions and those of its folder",
+    "unable to open": "it cannot be opened: check the path, and the permissions of the file and its folder",
+    "": "the file or its disk is damaged, or it is no place map ({said}): restore a copy or build it again",
+}
 
 
 def beside(path: Path) -> list[Path]:
@@ -95,3 +111,75 @@ def _closed(path: Path, error: OSError) -> MapError:
         f"{path}: it cannot be opened ({error.strerror}): check the path, and the permissions of the file and its "
         "folder."
     )
+
+
+def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection:
+    """Open a map file in SQLite's `mode`, ro or rw. `wait_s` seconds is the longest wait for another program that is
+    writing. Raises sqlite3.Error."""
+    # Autocommit: transactions are begun explicitly, so that nothing is ever half committed.
+    db = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}",
+        uri=True,
+        isolation_level=None,
+        timeout=wait_s,
+        check_same_thread=False,
+    )
+    db.text_factory = _text
+    db.set_progress_handler(lambda: 1, _MOST_STEPS)
+    # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
+    # or GDAL may have added such an index. A damaged geometry is treated as an empty one.
+    db.create_function("ST_IsEmpty", 1, lambda geom: point_or_none(geom) is None)
+    for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
+        db.create_function(name, 1, lambda geom, axis=axis: (point_or_none(geom) or (None, None))[axis])
+    return db
+
+
+def start_log(db: sqlite3.Connection) -> None:
+    # A write-ahead log, synced at every commit: a confirmed place survives a power loss.
+    db.execute("PRAGMA journal_mode = WAL")
+    db.execute("PRAGMA synchronous = FULL")
+
+
+def settle(db: sqlite3.Connection) -> None:
+    """Merge the write-ahead log into the file and remove it. If another program has the map open, the log stays, which
+    does no harm."""
+    with suppress(sqlite3.Error):
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        db.execute("PRAGMA journal_mode = DELETE")
+
+
+def settle_left_log(path: Path) -> None:
+    """Merge the log of a map that was not closed into its file, if file and folder may be written."""
+    if beside(path)[0].exists():
+        with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
+            settle(db)
+
+
+def is_of_one_row(error: sqlite3.Error) -> bool:
+    """Return True if an error may concern one row only, so that other rows can still be read: a damaged page, an
+    unreadable sector, or a value that is too large."""
+    return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
+
+
+@contextmanager
+def sentences(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite in the body of `with` into a MapError that tells the user what to do; into a MapBusyError
+    if another program is writing."""
+    try:
+        yield
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
+        said = str(error)
+        if "locked" in said:
+            raise MapBusyError(
+                f"{path}: another program is writing to it: close that program and try again."
+            ) from error
+        advice = next(advice for words, advice in _ADVICE.items() if words in said)
+        raise MapError(f"{path}: {advice.format(said=said)}.") from error
+
+
+def _text(raw: bytes) -> str | bytes:
+    """Decode a text of the file. One that is not UTF-8 is returned as bytes, which the checks of `rows` refuse."""
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        return raw

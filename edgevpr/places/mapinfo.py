@@ -9,7 +9,7 @@ from edgevpr.core.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.core.types import Position
 from edgevpr.places import geopackage, rows
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.sqlite import sentences
+from edgevpr.places.mapfiles import sentences
 
 Extent = tuple[float, float, float, float]
 

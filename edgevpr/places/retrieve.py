@@ -114,13 +114,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
     If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
     If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
     compared: exact, but slow. All hypotheses of the expected height are then tried, if nothing else is expected.
-    Neighbours of the best place are the places within `neighbour_m` metres of it. If all candidates are its neighbours,
-    the best-scanned places elsewhere are compared as well, for the margin. Without a fine part, the scan scores rank.
-    With `TechniqueSpec.scan_counts`, the score is that of the comparison times the mean of the scan score and 1,
-    because for a wrong place the two scores are nearly independent.
-    If `expected.in_reach` is known, the candidates are places in reach, and five places out of reach are compared as
-    well: with a false expectation, the right place would otherwise be missing, and a wrong one could win. At least five
-    places elsewhere are then compared, because a margin over fewer means little.
+    If all candidates are within `neighbour_m` metres of the best one, the best-scanned places elsewhere are compared as
+    well, for the margin. Without a fine part, the scan scores rank. With `TechniqueSpec.scan_counts`, the score is that
+    of the comparison times the mean of the scan score and 1: for a wrong place the two are nearly independent.
+    If `expected.in_reach` is known, the candidates are places in reach, and five out of reach are compared as well, in
+    case the expectation is false; and at least five places elsewhere, because a margin over fewer means little.
 
     Raises PlaceError if a place cannot be read, after all candidates have been tried; the place is then left out (see
     the module's docstring). Raises MapError if the file cannot be read.
@@ -178,8 +176,8 @@ class _Comparison:
         self.passed_over: list[Glance] = []
 
     def best(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
-        """Choose up to `count` places, with hypotheses to try, of those where `among` bool (N,) is True, by scan score.
-        If these have more than `in_full` hypotheses, keep the `in_full` places with the best glance (None: all)."""
+        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If these have more than `in_full`
+        hypotheses to try, keep the `in_full` places with the best glance (None: all)."""
         if self._tries_all and self._by_hypothesis is not None:
             of_slot = self._by_hypothesis
             return [(at, np.flatnonzero(np.isfinite(of_slot[at])).tolist()) for at in np.flatnonzero(among).tolist()]
@@ -290,12 +288,11 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int |
 
 def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
     """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
-    (None: all). They come in the order of the map file, in which a memory card reads them fastest.
+    (None: all), in the order of the map file, in which a memory card reads them fastest.
 
     With `by_hypothesis` float32 (N, H) (see `Scan`), the best pairs of a place and a hypothesis are chosen instead:
-    `count` times six pairs or, if that is less, `count` times a third of the mean number of possible hypotheses per
-    place. So a place with only two likely hypotheses leaves pairs to other places. One place gets six hypotheses at
-    most, or more if there are too few places.
+    `count` times six or, if that is less, a third of the mean number of possible hypotheses per place. One place gets
+    six hypotheses at most, or more if there are too few places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):

@@ -20,7 +20,7 @@ from edgevpr.core.arrays import Array, LatLon
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage
-from edgevpr.places.sqlite import is_of_one_row
+from edgevpr.places.mapfiles import is_of_one_row
 
 # Lists of columns, as SQL queries name them.
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"

@@ -118,21 +118,6 @@ def test_places_without_ties_stay_where_they_were_recorded():
     assert len(np.unique(solved.component)) == 1 + len(position)
 
 
-def test_places_in_one_line_are_turned_and_scaled():
-    position, log = flight(legs=1, a_leg=30)
-    ties, _ = ties_of(position, log)
-    solved = solve(recorded_of(position, sd_m=3.0), unknown(position), ties)
-    assert rms(off(solved, position, log)[1]) < 0.05
-
-
-def test_places_that_are_all_recorded_at_one_point_do_not_break_it():
-    position, log = flight(legs=2, a_leg=5)
-    ties, _ = ties_of(position, log)
-    solved = solve(np.zeros(len(position), complex), unknown(position), ties)
-    assert np.isfinite(solved.position).all()
-    assert np.isfinite(solved.log).all()
-
-
 def test_what_is_surveyed_holds_the_others():
     position, log = flight()
     ties, _ = ties_of(position, log)

@@ -115,13 +115,6 @@ def test_pictures_of_the_same_names_that_show_something_else_are_not_believed(pl
     assert place_map.calibration is None
 
 
-def test_of_two_places_with_a_picture_of_one_name_each_has_its_own(place_map):
-    again = [Frame(image=textured(50 + n, 240, 320), name=f"{n}.png", t_mono_s=0.0) for n in range(PLACES)]
-    build_map(again, AHEAD, place_map, meter())
-    found = calibrated(place_map, at_hand(*again)[0])
-    assert sorted(found.recognisable) == list(range(PLACES + 1, 2 * PLACES + 1))
-
-
 def test_a_map_that_is_too_small_and_a_technique_without_confidence_are_refused(place_map, tmp_path, monkeypatch):
     monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES + 1)
     with pytest.raises(UsageError, match=f"{PLACES + 1}"):
@@ -212,21 +205,6 @@ def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
     found = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
     assert found.weights == pytest.approx(start.weights, abs=0.01)
     assert found.bias < start.bias - 1
-
-
-def test_rows_count_by_their_weights():
-    rows, right = [{"a": 0.0, "b": 0.0}] * 2, np.array([True, False])
-    found = fitted(START, rows, right, np.array([9.0, 1.0]), 1.0)
-    assert found.bias == pytest.approx(np.log(9), abs=1e-3)
-
-
-@pytest.mark.parametrize("shape", [(120, 160), (160, 120), (120, 160, 3)])
-@pytest.mark.parametrize("looks_down", [True, False])
-def test_a_changed_picture_has_the_form_of_one(shape, looks_down):
-    image = np.broadcast_to(textured(1, *shape[:2]).reshape(*shape[:2], *[1] * (len(shape) - 2)), shape).copy()
-    seen, shown = changed(image, np.random.default_rng(3), looks_down)
-    assert (seen.shape, seen.dtype, shown) == (shape[:2], np.uint8, None)
-    assert seen.std() > 5
 
 
 def test_the_part_that_shows_ground_moves_with_the_picture():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import distance_m, metres, moved
+from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Frame, Position
 from edgevpr.lab.simulate.camera import Camera, lit, photograph
 from edgevpr.lab.simulate.generated import mapping_flight, to_position
@@ -28,21 +28,26 @@ FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
 EVERY, LEGS = 1, 2  # pictures of the two first legs
 
 
+def photographer(seed):
+    """Return the function that takes the picture of a pose in the generated flight."""
+    flight, rng = mapping_flight(7), np.random.default_rng(seed)
+    scene = make_scene(7, 420.0, 220.0)
+    ground = lit(scene, flight.light, flight.seed)
+    return lambda pose: photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng), rng
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """A folder of pictures of two legs, their true poses, and noisy positions of which one is a glitch."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "images").mkdir()
-    flight, rng = mapping_flight(7), np.random.default_rng(7)
-    scene = make_scene(7, 420.0, 220.0)
-    ground = lit(scene, flight.light, flight.seed)
-    poses = flight.poses[: 14 * LEGS : EVERY]
+    shot_of, rng = photographer(7)
+    poses = mapping_flight(7).poses[: 14 * LEGS : EVERY]
     with open(folder / "positions.csv", "w", newline="") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon"))
         for number, pose in enumerate(poses):
-            shot = photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng)
-            cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot)
+            cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
             true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
             east_m += GLITCH_M if number == 9 else 0.0
             lat_deg, lon_deg = moved(true.lat_deg, true.lon_deg, east_m, north_m)
@@ -119,9 +124,7 @@ def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
 def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
     """Pictures between the places: half a step beside each, turned and a little higher."""
     folder, poses = flown
-    flight, rng = mapping_flight(7), np.random.default_rng(8)
-    scene = make_scene(7, 420.0, 220.0)
-    ground = lit(scene, flight.light, flight.seed)
+    shot_of, _ = photographer(8)
     (tmp_path / "asked").mkdir()
     asked = [
         dataclasses.replace(
@@ -131,14 +134,13 @@ def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
         for pose in poses[2:12:2]
     ]  # fmt: skip
     for number, pose in enumerate(asked):
-        shot = photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng)
-        cv2.imwrite(str(tmp_path / "asked" / f"{number}.jpg"), shot)
+        cv2.imwrite(str(tmp_path / "asked" / f"{number}.jpg"), shot_of(pose))
     main(["map", "refine", str(map_path), "--images", str(folder / "images")])
     with PlaceMap.open(map_path) as place_map:
         offsets = []
         for place, pose in zip(place_map.places(), poses, strict=True):
             true = to_position(pose)
-            offsets.append(_metres(true, place.position))
+            offsets.append(offset_m(true.lat_deg, true.lon_deg, place.position.lat_deg, place.position.lon_deg))
     common = np.mean(offsets, axis=0)  # what is left of the noise of all positions together
     capsys.readouterr()
     assert main(["match", str(map_path), "--images", str(tmp_path / "asked"), "--json"]) == 0
@@ -146,17 +148,12 @@ def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
     for event, pose in zip(events, asked, strict=True):
         assert event["accepted"], event["reason"]
         where = event["located"]
-        off_m = _metres(to_position(pose), Position(where["lat_deg"], where["lon_deg"])) - common
+        true = to_position(pose)
+        off_m = np.subtract(offset_m(true.lat_deg, true.lon_deg, where["lat_deg"], where["lon_deg"]), common)
         assert np.hypot(*off_m) < 4
         assert abs((where["heading_deg"] - pose.heading_deg + 180) % 360 - 180) < 8
         assert where["height_ratio"] == pytest.approx(86 / 80, abs=0.08)
         assert event["accuracy_m"] < 12, event
-
-
-def _metres(one, other):
-    lat_deg, lon_deg = np.array([(each.lat_deg, each.lon_deg) for each in (one, other)]).T
-    east_m, north_m = metres(lat_deg, lon_deg)
-    return np.array([east_m[1], north_m[1]])
 
 
 def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
@@ -265,11 +262,9 @@ def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
 
     folder, poses = flown
     assert main(["map", "refine", str(map_path), "--images", str(folder / "images")]) == 0
-    flight, rng = mapping_flight(7), np.random.default_rng(9)
-    scene = make_scene(7, 420.0, 220.0)
-    ground = lit(scene, flight.light, flight.seed)
+    shot_of, _ = photographer(9)
     seen = dataclasses.replace(poses[5], east_m=poses[5].east_m + 10, heading_deg=140.0, height_m=90.0)
-    shot = photograph(ground, scene.metres_per_pixel, seen, Camera(), flight.light, rng)
+    shot = shot_of(seen)
     true = to_position(seen)
     noisy = Position(*moved(true.lat_deg, true.lon_deg, 6.0, -4.0), true.alt_m)
     # Each picture counts alone: a flight that is followed would not learn the second one at all.
