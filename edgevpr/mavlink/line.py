@@ -18,22 +18,18 @@ class Line:
 
     A fix counts as sent when all its bytes have left the operating system (over TCP: when the other end has confirmed
     them). If that has not happened at the fix's `due_s`, `departed` raises ConnectionError; closing the port then
-    throws the bytes away. `tap` is called with each packet that the port has accepted in full.
+    throws the bytes away. `tap` is called with each packet that the port has accepted in full. `unsent` are the bytes
+    of the last packet that it has not accepted yet.
     """
 
     def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
         self.port = port
         self._tap = tap
         self._clock = clock
-        self._packet = self._unsent = b""  # the packet that was put last, and what the port has not accepted of it yet
+        self._packet = self.unsent = b""
         self._taken = 0  # number of bytes that the port has accepted so far
         self._leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
         self._blocked_since_s: float | None = None
-
-    @property
-    def is_writing(self) -> bool:
-        """True if the port has not yet accepted the last packet in full."""
-        return bool(self._unsent)
 
     @property
     def is_watched(self) -> bool:
@@ -43,24 +39,24 @@ class Line:
     @property
     def is_idle(self) -> bool:
         """True if every byte has left the operating system."""
-        return not self._unsent and self.port.unsent() == 0
+        return not self.unsent and self.port.unsent() == 0
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
         """Set the next packet to be written, and `sending`, the fix that it contains (None: it contains none). The port
         must have accepted the previous packet in full."""
-        self._packet = self._unsent = packet
+        self._packet = self.unsent = packet
         if sending:
             self._leaving.append((self._taken + len(packet), sending))
 
     def write(self) -> None:
         """Write as much of the packet as the port accepts without blocking. Raises OSError if the connection is lost,
         and if the port has accepted no byte for STUCK_S seconds."""
-        if not self._unsent:
+        if not self.unsent:
             return
-        taken = self.port.write(self._unsent)
-        self._unsent = self._unsent[taken:]
+        taken = self.port.write(self.unsent)
+        self.unsent = self.unsent[taken:]
         self._taken += taken
-        if not self._unsent:
+        if not self.unsent:
             self._tap(self._packet)
         if taken:
             self._blocked_since_s = None

@@ -238,7 +238,7 @@ class Link:
             self._conversation.tell_of_answers()
             step("answers")
         reading: list[Port | socket.socket] = [line.port, self._bell]
-        writing = [line.port] if line.is_writing else []
+        writing = [line.port] if line.unsent else []
         timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select(reading, writing, [], timeout_s)
         if self._bell in readable:
@@ -267,14 +267,14 @@ class Link:
         while True:
             # Before writing: what has waited too long must not be written on.
             self._note_departed(line, step)
-            if not line.is_writing:
+            if not line.unsent:
                 next_one = self._conversation.next_packet()
                 step("said", next_one and next_one[0])
                 if next_one is None:
                     return
                 line.put(*next_one)
             line.write()
-            if line.is_writing:
+            if line.unsent:
                 return
 
     def _note_departed(self, line: Line, step: Step) -> None:

@@ -48,14 +48,9 @@ def test_an_ardupilot_gets_what_its_operator_has_set_up_else_single_fixes(kind, 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
     second = ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1, GPS2_TYPE=14, GPS2_DELAY_MS=0))
     assert (second.receiver, second.lag_s) == (1, 0.2)
+    assert "GPS2_TYPE=14" in ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason, "what to set up"
     first = ardupilot_choice(asked(Kind.COPTER, GPS_TYPE=14, GPS_TYPE2=1, GPS_DELAY_MS=60))
     assert (first.receiver, first.lag_s) == (0, 0.06)
-
-
-def test_a_copter_with_nothing_set_up_is_told_what_to_set():
-    assert "GPS2_TYPE=14" in ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason
-    assert "GPS_TYPE2=14" in ardupilot_choice(asked(Kind.ROVER, GPS_TYPE=1, GPS_TYPE2=0)).reason
-    assert "GPS2_TYPE" not in ardupilot_choice(asked(Kind.PLANE, GPS1_TYPE=1)).reason
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():

@@ -50,7 +50,7 @@ def hold_up(line) -> None:
     while line.port.unsent() < 2000:
         line.put(bytes(100), None)
         line.write()
-        assert not line.is_writing
+        assert not line.unsent
 
 
 def drained(port: socket.socket) -> bytes:
@@ -79,7 +79,7 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     fix = sending(clock)
     line.put(b"the fix", fix)
     line.write()
-    assert not line.is_writing
+    assert not line.unsent
     clock.now_s += 0.99
     assert line.departed() == []
     clock.now_s += 0.02

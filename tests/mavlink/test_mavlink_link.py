@@ -8,7 +8,6 @@ from contextlib import closing
 import pytest
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, named_values, status_text
@@ -125,14 +124,6 @@ def test_a_sending_link_hears_nobody_but_its_peer(clock):
         heard(link, peer)
         stats = link.stats()
         assert (stats.received, stats.bad_bytes, stats.foreign_messages) == ({"HEARTBEAT": 1}, 0, 0)
-
-
-def test_a_udp_port_in_use_is_said_at_the_start(clock):
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}", clock=clock):
-        second = link_to(f"udpin:0.0.0.0:{number}", clock=clock)
-        with pytest.raises(LinkError, match=f"{number}"):
-            second.start()
 
 
 def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):

@@ -118,11 +118,11 @@ def test_a_packet_is_in_the_log_when_the_port_has_taken_all_of_it():
         far = server.accept()
         line.put(big := bytes(1_000_000), None)
         line.write()
-        assert line.is_writing
+        assert line.unsent
         assert not taken
         reader = threading.Thread(target=lambda: all(iter(lambda: far.recv(1_000_000), b"")))
         reader.start()
-        wait_until(lambda: line.write() or not line.is_writing)
+        wait_until(lambda: line.write() or not line.unsent)
         line.write()
         assert taken == [big]
         line.close()
