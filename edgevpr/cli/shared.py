@@ -72,17 +72,15 @@ def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
-def add_keys(parser: ArgumentParser, *names: str, **texts: str) -> None:
-    """Add the flags of the configuration keys `names` (none: of all keys), such as "source.mask". `texts` replace the
-    help of some; they are by the last part of the key's name, such as "mask"."""
+def add_keys(parser: ArgumentParser, *names: str) -> None:
+    """Add the flags of the configuration keys `names` (none: of all keys), such as "source.mask"."""
     for key in keys_of():
         if not key.flags or (names and key.name not in names):
             continue
-        text = texts.get(key.name.rpartition(".")[2], key.text)
         form: dict[str, Any] = {"type": key.kind, "metavar": key.metavar, "choices": key.choices or None}
         if key.kind is bool:
             form = {"action": "store_const", "const": key.sets}
-        parser.add_argument(*key.flags, dest=_KEY + key.name, help=text, **form)
+        parser.add_argument(*key.flags, dest=_KEY + key.name, help=key.text, **form)
 
 
 def value_of(args: Namespace, name: str) -> Any:

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import shutil
 import signal
 import sqlite3
@@ -20,7 +19,7 @@ from edgevpr.places.mapfile import PlaceMap
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    """Six pictures with positions and times; the last has a name that is not UTF-8."""
+    """Six pictures with positions and times."""
     folder = tmp_path_factory.mktemp("flight")
     (folder / "images").mkdir()
     rows = ["file,lat,lon,time"]
@@ -29,7 +28,6 @@ def flight(tmp_path_factory):
         cv2.imwrite(str(folder / "images" / name), textured(number, 240, 320))
         rows.append(f"{name},{50 + number * 0.001:.6f},8.0,{1.7e9 + number}")
     (folder / "positions.csv").write_text("\n".join(rows) + "\n")
-    os.rename(folder / "images" / "5.png", os.fsencode(folder / "images") + b"/\xff.png")
     return folder
 
 
@@ -60,16 +58,6 @@ DAMAGE = (
     "UPDATE places SET fine = zeroblob(length(fine)) WHERE place_id = 2",
     "UPDATE places SET heading_deg = 'north' WHERE place_id = 4",
 )
-
-
-def test_a_name_that_is_not_utf_8_is_mapped(flight, tmp_path, capsys):
-    path = tmp_path / "m.gpkg"
-    assert main(built(path, flight)) == 0
-    capsys.readouterr()
-    assert main([*built(path, flight, "--append"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["already_here"] == 6
-    with PlaceMap.open(path) as place_map:
-        assert list(place_map.places())[-1].source_image == "\\xff.png"
 
 
 def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, capsys):

@@ -1,9 +1,6 @@
 """`edgevpr export`, as a user types it."""
 
-import json
-
 from edgevpr.cli.main import main
-from edgevpr.core.appending import numbered
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
@@ -33,22 +30,3 @@ def test_export_never_writes_over_the_log(tmp_path, capsys):
     assert main(["export", str(log), "--csv", str(log)]) == 2
     assert "another name" in capsys.readouterr().err
     assert log.read_bytes() == before
-
-
-def test_a_file_of_the_flight_that_is_missing_is_said_and_the_rest_is_exported(tmp_path, capsys, caplog):
-    path = tmp_path / "flight.jsonl"
-    with FlightLog(path, max_mb=0.02) as log:
-        log.write("start")
-        for second in range(5):
-            at = {"lat_deg": 50.0 + second, "lon_deg": 8.0}
-            log.write("query", query=f"{second}.jpg", accepted=True, reason="x" * 3000, located=at)
-    export = ["export", str(path), "--geojson", "-"]
-    assert main(export) == 0
-    assert len(json.loads(capsys.readouterr().out)["features"]) == 5
-    assert not caplog.messages
-    for each in numbered(path):
-        each.unlink()
-    assert main(export) == 0
-    assert 0 < len(json.loads(capsys.readouterr().out)["features"]) < 5
-    (said,) = caplog.messages
-    assert said.startswith(f"Files of the flight that are missing before {path}: ")

@@ -26,9 +26,3 @@ def test_a_map_of_a_video_has_the_positions_of_its_table(flight, tmp_path, capsy
         placed = [place for place in place_map.places() if place.position]
     assert [round(place.position.lon_deg, 9) for place in placed] == [8.0006, 8.0014, 8.0022, 8.003]
     assert {place.heading_deg for place in placed} == {90.0}
-
-
-def test_a_map_of_a_video_without_positions_says_how_to_give_them(flight, tmp_path, capsys):
-    command = ["map", "build", str(tmp_path / "valley.gpkg"), "--images", str(flight[0]), "--technique", "hog"]
-    assert main([*command, "--rate-hz", "1"]) == 0
-    assert "time,lat,lon" in capsys.readouterr().out

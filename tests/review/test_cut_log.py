@@ -52,10 +52,3 @@ def test_every_command_after_the_flight_takes_a_log_that_was_cut_in_a_line(log, 
     said = capsys.readouterr()
     assert "Traceback" not in said.err
     assert "3 queries" in said.out
-
-
-def test_a_log_of_which_no_line_is_whole_is_refused_in_a_sentence(log, tmp_path, capsys):
-    (tmp_path / "cut.jsonl").write_bytes(log.read_bytes()[:40])
-    assert main(["report", str(tmp_path / "cut.jsonl"), "--out", str(tmp_path / "page.html")]) == 1
-    assert "cut.jsonl" in capsys.readouterr().err
-    assert not (tmp_path / "page.html").exists()

@@ -11,7 +11,7 @@ from logs import query, write_log
 
 from edgevpr.cli.main import main
 from edgevpr.review.logged import read_flight
-from edgevpr.review.overhead import MapGround, read_ground
+from edgevpr.review.overhead import MapGround
 from edgevpr.review.page import Album, page_of
 
 NO_PICTURES = Album([])
@@ -80,12 +80,6 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
         assert album.picture(name) is None
 
 
-def test_a_picture_is_made_small(tmp_path):
-    cv2.imwrite(str(tmp_path / "one.png"), np.random.default_rng(1).integers(0, 255, (1000, 2000), np.uint8))
-    data = Album([tmp_path]).picture("one.png")
-    assert cv2.imdecode(np.frombuffer(data, np.uint8), 0).shape == (320, 640)
-
-
 def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     nasty = query(NASTY, reason=NASTY, reference_image=NASTY, accepted=False)
     log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": NASTY}))
@@ -150,11 +144,6 @@ def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path, c
     assert code == 0
 
 
-def test_places_of_a_map_are_read(flown):
-    ground = read_ground(flown / "map.gpkg")
-    assert (ground.places, len(ground.at), ground.trouble) == (8, 8, None)
-
-
 @pytest.mark.parametrize(
     ("argv", "code", "said"),
     [
@@ -188,16 +177,6 @@ def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
         shown = show(each)
         assert "match accepted" in shown.content
         assert (shown.console, shown.requests) == ([], [])
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_the_test_with_a_browser_sees_requests_and_errors(tmp_path):
-    bad = tmp_path / "bad.html"
-    bad.write_text('<!doctype html><img src="http://example.test/x.png"><script>console.error("oh no")</script>')
-    shown = show(bad)
-    assert "oh no" in "".join(shown.console)
-    assert "http://example.test/x.png" in shown.requests
 
 
 def measured(made, folder, measure, width_px):
