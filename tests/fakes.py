@@ -114,20 +114,10 @@ class FakeSource:
         picture = self._left.popleft()
         if isinstance(picture, Exception):
             raise picture
-        given = picture if isinstance(picture, Frame) else None
-        frame = Frame(
-            image=given.image if given else picture,
-            name=given.name if given else f"frame {self._read:06d}",
-            t_mono_s=self._clock(),
-            t_utc_s=given and given.t_utc_s,
-            position=given and given.position,
-            heading_deg=given and given.heading_deg,
-            roll_deg=given and given.roll_deg,
-            pitch_deg=given and given.pitch_deg,
-            height_m=given and given.height_m,
-        )
+        if not isinstance(picture, Frame):
+            picture = Frame(image=picture, name=f"frame {self._read:06d}", t_mono_s=0.0)
         self._read += 1
-        return frame
+        return replace(picture, t_mono_s=self._clock())
 
     def close(self) -> None:
         self._left.clear()
