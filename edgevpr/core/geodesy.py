@@ -1,45 +1,33 @@
 """Distances and projections on the Earth, for flights of some metres to some kilometres. Angles are in degrees."""
 
 import math
-from typing import overload
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from edgevpr.core.arrays import Degrees, Doubles, Floats
 
+D = TypeVar("D", float, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
 
-@overload
-def distance_m(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> float: ...
-@overload
-def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Floats, other_lon_deg: Floats) -> Floats: ...
-def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees) -> Degrees:
+def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_deg: D) -> D:
     """Return the distance in metres between points (scalars, or arrays that broadcast); NaN where one is NaN."""
     north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     middle_deg = np.add(lat_deg, other_lat_deg) / 2
-    distance: Floats = np.hypot(north_m, turn * EARTH_RADIUS_M * np.cos(np.radians(middle_deg)))
-    return distance
+    return cast(D, np.hypot(north_m, turn * EARTH_RADIUS_M * np.cos(np.radians(middle_deg))))
 
 
-@overload
-def offset_m(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> tuple[float, float]: ...
-@overload
-def offset_m(
-    lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Floats, other_lon_deg: Floats
-) -> tuple[Floats, Floats]: ...
-def offset_m(
-    lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
-) -> tuple[Degrees, Degrees]:
+def offset_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_deg: D) -> tuple[D, D]:
     """Return the offset (east, north) in metres from the first point to the other (scalars, or arrays that broadcast),
     on the plane that touches the Earth at the first point; NaN where one is NaN."""
     north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
-    return turn * EARTH_RADIUS_M * np.cos(np.radians(lat_deg)), north_m
+    return cast(D, turn * EARTH_RADIUS_M * np.cos(np.radians(lat_deg))), cast(D, north_m)
 
 
 def _north_m_and_turn(
     lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
-) -> tuple[Floats, Floats]:
+) -> tuple[Any, Any]:
     north_m = np.radians(np.subtract(other_lat_deg, lat_deg)) * EARTH_RADIUS_M
     turn_deg = (np.subtract(other_lon_deg, lon_deg) + 180) % 360 - 180  # the shorter way, also across the date line
     return north_m, np.radians(turn_deg)
