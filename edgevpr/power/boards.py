@@ -167,8 +167,7 @@ def _read(path: Path) -> Board:
 
 
 def _this_machine(root: Path) -> Board:
-    """Return the shipped profile of this machine's board (generic-x86 if it has none), with the cores and memory that
-    the machine really has."""
+    """Return the profile of this machine's board, else generic-x86, with the cores and memory that are really there."""
     model, recognised = machine.model(root), _recognised(root)
     profile = recognised or _shipped(_ANY_MACHINE)
     title, speed = profile.title, profile.benchmark_score

@@ -23,8 +23,7 @@ _ARM_PARTS = {
 
 
 def model(root: Path = _ROOT) -> str | None:
-    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None without a device tree
-    (x86)."""
+    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None without one (x86)."""
     return text(root / "proc/device-tree/model")
 
 
@@ -118,8 +117,7 @@ def _kib_line(path: Path, label: str) -> float:
 
 
 def _cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
-    """Yield the fields of the limit file `name` (cgroup v2) of this process's control group and of every group above
-    it, where they set a limit. All of these limits apply."""
+    """Yield the fields of the limit file `name` (cgroup v2) of this process's control group and all above it."""
     memberships = (text(root / "proc/self/cgroup") or "").splitlines()
     for group in (PurePosixPath(line.removeprefix("0::")) for line in memberships if line.startswith("0::")):
         for level in (group, *group.parents):

@@ -42,8 +42,7 @@ class ThermalWatch:
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
 
     def look(self) -> ThermalState:
-        """Read the sensors. Never raises: the value of a sensor that has gone, or reads an impossible value, is
-        None."""
+        """Read the sensors. Never raises: the value of one that has gone, or says what cannot be, is None."""
         degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
         khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
@@ -75,11 +74,8 @@ class ThermalWatch:
 
 def limit_c(root: Path = Path("/")) -> float:
     """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU's
-    zones.
-
-    If the kernel has none (Raspberry Pi: its firmware slows it down), it is 80 degrees, or 10 below the point where the
-    machine switches off if that is lower.
-    """
+    zones. If the kernel has none (Raspberry Pi: its firmware slows it down), it is 80 degrees, or 10 below the point
+    where the machine switches off if that is lower."""
     trips: dict[str, list[float]] = {}
     for zone in _cpu_zones(root):
         for path in zone.glob("trip_point_*_type"):

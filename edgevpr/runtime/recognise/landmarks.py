@@ -106,13 +106,9 @@ def packed(landmarks: Landmarks) -> bytes:
 
 def unpacked(blob: bytes) -> Landmarks:
     """Convert bytes made by `packed` back to landmarks. Raises ValueError for anything else."""
-    if len(blob) < _HEADER.size:
-        raise ValueError("its landmarks have no header")
-    version, count = _HEADER.unpack_from(blob)
-    if version != _VERSION:
-        raise ValueError(f"its landmarks have the form {version}, which this edgevpr does not know")
-    if len(blob) != _HEADER.size + count * _STORED.itemsize:
-        raise ValueError("its landmarks have a wrong size")
+    version, count = _HEADER.unpack(blob[: _HEADER.size].ljust(_HEADER.size, b"\0"))
+    if version != _VERSION or len(blob) != _HEADER.size + count * _STORED.itemsize:
+        raise ValueError("its landmarks have a form that this edgevpr does not know")
     stored = np.frombuffer(blob, _STORED, offset=_HEADER.size)
     at = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
     return Landmarks(
