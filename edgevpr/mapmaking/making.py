@@ -177,8 +177,8 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 def calibrate_map(
     place_map: PlaceMap, technique: Technique, config: Config, pictures: FlownPictures | Cuttings, shown: Shown
 ) -> MapCalibration:
-    """Calibrate the confidence of an open map with the pictures that it was made from (see `calibrate`). A picture that
-    cannot be read is left out. Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
+    """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
+    `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
     with _needing_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 

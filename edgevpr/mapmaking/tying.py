@@ -9,9 +9,9 @@ compared again near that pose.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,8 +42,7 @@ _KEPT = 512  # places whose landmarks are cached: a place is compared with its n
 _KEPT_PICTURES = 4  # descriptors that are cached
 
 
-@dataclass(frozen=True, slots=True)
-class Tie:
+class Tie(NamedTuple):
     """Relative pose of picture `query` to picture `place`: complex `step` (right + i up, in shares of the place's
     longest side) and `turn` (log of the scale + i counter-clockwise rotation), and their standard deviations."""
 
@@ -95,10 +94,9 @@ def tied(pairs: Iterable[Pair], look: Look) -> dict[Pair, Tie]:
 
 def ties_of(tie_of: dict[Pair, Tie]) -> Ties:
     """Convert ties to the arrays that `graph.solve` takes."""
-    pairs = np.array(list(tie_of), np.intp).reshape(-1, 2)
-    columns = [(tie.step, tie.turn, tie.step_sd, tie.turn_sd) for tie in tie_of.values()]
-    step, turn, step_sd, turn_sd = np.array(columns, complex).reshape(-1, 4).T
-    return Ties(query=pairs[:, 0], place=pairs[:, 1], step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
+    query, place = np.array(list(tie_of), np.intp).reshape(-1, 2).T
+    step, turn, step_sd, turn_sd = np.array(list(tie_of.values()), complex).reshape(-1, 4).T
+    return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
 
 
 def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encoded: Encoded | None) -> Look:

@@ -181,8 +181,7 @@ class MapConnection:
         return sum(row is not None for _, row in self.scan("1"))
 
     def _take(self, connection: sqlite3.Connection) -> None:
-        """Make `connection` the current one. Let SQLite refuse to load any row that is larger than the rows of this map
-        can be. Python 3.10 cannot set this limit."""
+        """Make `connection` the current one; where Python can, let SQLite refuse rows too large to be of this map."""
         self.db = connection
         if self._lock is not None:
             mapfiles.start_log(connection)
@@ -192,8 +191,7 @@ class MapConnection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
 
     def _version(self) -> int | None:
-        """Return SQLite's data_version, which changes when another program has written to the file; None if this
-        connection can no longer read the file."""
+        """Return SQLite's data_version, which changes when others write; None if the file can no longer be read."""
         try:
             return int(self.db.execute("PRAGMA data_version").fetchone()[0])
         except (sqlite3.Error, UnicodeDecodeError) as error:

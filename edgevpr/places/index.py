@@ -187,7 +187,6 @@ class GrowingIndex:
         self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
     ) -> None:
         """Load the map, which may be empty, and allocate slots for `room` more places as far as the budget allows.
-
         `beside_bytes`: see `load_index`. Raises MapError if the budget is too small for one place.
         """
         each = bytes_per_place(technique.spec) + beside_bytes
@@ -214,11 +213,8 @@ class GrowingIndex:
 
     def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
         """Add a place that is already in the map file, with an id larger than all ids in the index (position and
-        heading None: unknown).
-
-        Raises MapError if the file cannot be read. The index can still be used after that: it has the places that could
-        be read, all packed with the same mean. If only some places are damaged, they are left out without an error.
-        """
+        heading None: unknown). Raises MapError if the file cannot be read: the index then has the places that could be,
+        all packed with the same mean. If only some places are damaged, they are left out without an error."""
         if self._taken == len(self._slots):
             self._thin()
         point = (position.lat_deg, position.lon_deg) if position else None

@@ -30,11 +30,8 @@ _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, 
 
 
 class PlaceMap(MapConnection):
-    """An open map. Make it with `create`, `open` or `open_for_adding`, and close it or use `with`.
-
-    `left_out` maps the id of each place that could not be read so far to the reason in a few words, in the order in
-    which they were found.
-    """
+    """An open map. `left_out` maps the id of each place that could not be read so far to the reason in a few words, in
+    the order in which they were found."""
 
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         super().__init__(path, db, lock)
@@ -109,10 +106,8 @@ class PlaceMap(MapConnection):
         self._record_beside(mapspec.CALIBRATION, text)
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """Yield the places with `place_ids` in the order given (None: all places, in the order they were added).
-
-        Raises PlaceError for a place that is missing or damaged.
-        """
+        """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
+        PlaceError for a place that is missing or damaged."""
         found: Iterable[tuple[int, Values | None]] = self.scan(rows.OF_PLACE)
         if place_ids is not None:
             found = ((int(place_id), self.row(int(place_id), rows.OF_PLACE)) for place_id in place_ids)
@@ -143,10 +138,7 @@ class PlaceMap(MapConnection):
 
     def fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
         """Read one place from the file: return its fine part, a read-only array of `spec.fine`, and its (lat_deg,
-        lon_deg), None if it has no position.
-
-        Raises PlaceError for a place that is missing or damaged.
-        """
+        lon_deg), None if it has no position. Raises PlaceError for a place that is missing or damaged."""
         with self._named(place_id):
             if self.spec.fine is None:
                 raise Unreadable("it has no fine part")
@@ -176,12 +168,8 @@ class PlaceMap(MapConnection):
         return ids
 
     def is_of(self, place_id: int, coarse: Array) -> bool:
-        """Return True if a place's coarse part nearly equals `coarse`, so that both are of the same picture. Return
-        False if the place cannot be read.
-
-        The last bits of a descriptor may differ between two runs of a program: floating-point sums depend on where an
-        array lies in memory. If the numbers are codes, a few of them may then be quite different.
-        """
+        """Return True if a place's coarse part nearly equals `coarse`, so that both are of the same picture; False if
+        the place cannot be read. The last bits may differ between two runs of a program, and so may a few codes."""
         try:
             content = rows.content_of("coarse", self.row(place_id, "coarse"))
             there = rows.part_of(content, "coarse", self.spec.coarse).astype(np.float32)

@@ -139,10 +139,8 @@ def place_of(place_id: int, content: Content) -> Place:
 def frame_content(
     frame: Frame, descriptor: Descriptor, spec: TechniqueSpec, salience: Salience | None, landmarks: bytes | None
 ) -> Content:
-    """Return the row of a new place, by columns, without its checksums.
-
-    A time that is not a date and an altitude outside the allowed range are stored as unknown (NULL).
-    """
+    """Return the row of a new place, by columns, without its checksums. A time that is not a date and an altitude
+    outside the allowed range are stored as unknown (NULL)."""
     position, scores = frame.position, salience.scores if salience else {}
     altitude = position.alt_m if position else None
     return {
@@ -215,8 +213,7 @@ def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | N
 
 
 def _one_after(db: sqlite3.Connection, columns: str, last: int) -> Values:
-    """Return id and values of `columns` of the first place after the id `last`; if SQLite cannot read it, the next
-    number alone."""
+    """Return id and `columns` of the first place after the id `last`; if it cannot be read, the next number alone."""
     try:
         return db.execute(f"{_AFTER.format(columns)} LIMIT 1", (last,)).fetchone() or (sys.maxsize,)
     except sqlite3.Error as error:
@@ -236,8 +233,7 @@ def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
 
 
 def _salience_of(values: Sequence[Any]) -> Salience | None:
-    """Make a Salience from the values of `SALIENCE`; None if they are unknown. An invalid score becomes None, since no
-    decision in flight depends on it."""
+    """Make a Salience of the values of `SALIENCE`; None if unknown, and None in place of an invalid score."""
     *scores, is_low = values
     if is_low is None:
         return None
@@ -247,8 +243,7 @@ def _salience_of(values: Sequence[Any]) -> Salience | None:
 
 
 def _pose_of(content: Content) -> Pose | None:
-    """Make a Pose from the columns `POSE`; None if they are unknown. Raises Unreadable for invalid values: a wrong
-    pose would give wrong positions in flight."""
+    """Make a Pose from the columns `POSE`; None if they are unknown. Raises Unreadable: a wrong pose misleads fixes."""
     values, checksum = [_number(content, name) for name in _POSE], content["pose_crc32"]
     if checksum is not None and checksum != pose_crc32(values):
         raise Unreadable("its pose does not match its checksum")
