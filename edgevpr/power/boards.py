@@ -112,16 +112,6 @@ def detect(root: Path = Path("/")) -> dict[str, Any]:
     }
 
 
-def describe(found: dict[str, Any]) -> str:
-    """Return two sentences about the machine that was detected: its profile, and its cores, memory and thermal
-    limit."""
-    known = f"the board {found['board']}" if found["board"] else f"no board of edgevpr's: {_ANY_MACHINE} stands in"
-    return (
-        "`{title}` is {known}. It has {cores} cores and {ram_mb:.0f} MB of RAM, of which this process may use "
-        "{usable_cores:.3g} and {ram_limit_mb:.0f}, and begins to slow down at {thermal_limit_c:g} degrees Celsius."
-    ).format(known=known, **found)
-
-
 def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
     """Return a profile of this machine with the score `speed`. Its power is that of the shipped profile of its board,
     else relative (idle 0 W, full load 1 W). Memory and shares are those of `load_board("this")`."""

@@ -6,7 +6,7 @@ Functions that return a str return HTML.
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from html import escape
 from itertools import groupby, product
@@ -170,27 +170,23 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
     return f'<dl class="figures">{"".join(known)}</dl>'
 
 
-def _notes(flight: LoggedFlight, ground: MapGround) -> Iterator[str]:
-    queries = flight.queries
-    if not flight.start:
-        yield "The log lacks the first line of this flight: how it was set is not known."
-    if not flight.end:
-        yield "The log of this flight has no last line: it was cut off (power, full disk), or the flight still goes on."
-    if not queries:
-        yield "No picture became a query in this flight: there is nothing to show of one."
-    else:
-        if not any(query.accepted for query in queries):
-            yield "No match was accepted in this flight."
-        if not ground.at and not any(query.place_at for query in queries):
-            yield "No place has a position: nothing can be drawn over ground, and no fix was sent."
-        if not any(query.has_link for query in queries):
-            yield (
-                "The log has no report of the autopilot's position: its track and the distance from GPS are not known."
-            )
-    if ground.trouble:
-        yield ground.trouble
-    if nowhere := ground.places - len(ground.at):
-        yield f"{nowhere} of {ground.places} places of the map have no position and are not drawn."
+def _notes(flight: LoggedFlight, ground: MapGround) -> list[str]:
+    queries, nowhere = flight.queries, ground.places - len(ground.at)
+    has_places = bool(ground.at) or any(query.place_at for query in queries)
+    known = [
+        (flight.start, "The log lacks the first line of this flight: how it was set is not known."),
+        (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight still goes on."),
+        (queries, "No picture became a query in this flight: there is nothing to show of one."),
+        (not queries or any(query.accepted for query in queries), "No match was accepted in this flight."),
+        (not queries or has_places, "No place has a position: nothing can be drawn over ground, and no fix was sent."),
+        (
+            not queries or any(query.has_link for query in queries),
+            "The log has no report of the autopilot's position: its track and the distance from GPS are not known.",
+        ),
+        (not ground.trouble, ground.trouble or ""),
+        (not nowhere, f"{nowhere} of {ground.places} places of the map have no position and are not drawn."),
+    ]
+    return [sentence for is_there, sentence in known if not is_there]
 
 
 def _lanes(flight: LoggedFlight) -> str:
