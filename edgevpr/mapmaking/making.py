@@ -203,10 +203,10 @@ def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None) -> tupl
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     camera = "nadir" if is_cut else camera
     source = order.pictures.open()
-    name = order.technique or (place_map.spec.name if place_map else _OF_ORTHOPHOTOS if is_cut else None)
+    name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS if is_cut else None)
     name = name or picked_technique(order.board, source.total or 1, camera)
     settings = order.parameters | camera_setting(name, camera)
-    if place_map:
+    if place_map is not None:  # one without places is false
         return source, technique_of(place_map, order.technique, settings, here)
     return source, made_for(here.threads, name, settings)
 
