@@ -4,7 +4,8 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.wholeflight import flight_of
 
 _SEED = 1
@@ -85,11 +87,15 @@ class JudgedAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """Results of the demonstration. `heard` is the summary of the simulated flight controller, by the names of
-    `AutopilotSummary`."""
+    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log, and `used_mah`
+    and `marginal_mah` the charge of the flight and of its recognising. `heard` is the summary of the simulated flight
+    controller, by the names of `AutopilotSummary`."""
 
     places: int
     answers: list[JudgedAnswer]
+    costs: dict[str, float]
+    used_mah: float
+    marginal_mah: float
     heard: dict[str, Any]
     picture: Path
 
@@ -100,6 +106,7 @@ class DemoSummary:
         off_map = len(self.answers) - len(on_map)
         off_map_rejected = off_map - sum(not answer.on_map for answer in accepted)
         recall = sum(answer.right for answer in on_map) / max(len(on_map), 1)
+        cost = self.costs
         return f"""
 places            {self.places} in the map
 queries           {len(self.answers)}: {len(on_map)} over the map, {off_map} beyond it
@@ -109,6 +116,9 @@ rejected          {len(self.answers) - len(accepted)}, among them {off_map_rejec
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
 largest {max(errors_m):.1f} m \
 (of the accepted; places are 21 m apart)
+a query           {1000 * cost["cpu_s"]:.0f} ms of CPU (encode {1000 * cost["t_encode_s"]:.0f} ms, \
+match {1000 * cost["t_match_s"]:.0f} ms), {cost["rss_mb"]:.0f} MB of RAM
+battery           {self.used_mah:.3f} mAh, {self.marginal_mah:.3f} mAh of them for recognising
 flight controller {self.heard["fixes_accepted"]} position fixes accepted, {self.heard["fixes_denied"]} denied
 picture           {self.picture}"""
 
@@ -131,13 +141,23 @@ def run_demo(folder: str | Path) -> DemoSummary:
     ):
         for _ in progress(write_flight(folder / name, scene, flight), len(flight.poses), label):
             pass
-    heard = _flown(folder)
+    heard = _flown(folder, len(later.poses))
     answers = read_answers(log_path, folder / "flight-1", folder / "flight-2")
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
-    return DemoSummary(places=len(mapping.poses), answers=answers, heard=heard, picture=picture_path)
+    lines = list(flight_of(log_path))
+    costs = [line["costs"] for line in lines if line["kind"] == "query"]
+    return DemoSummary(
+        places=len(mapping.poses),
+        answers=answers,
+        costs={name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]},
+        used_mah=lines[-1]["used_mah"],
+        marginal_mah=lines[-1]["marginal_mah"],
+        heard=heard,
+        picture=picture_path,
+    )
 
 
-def _flown(folder: Path) -> dict[str, Any]:
+def _flown(folder: Path, queries: int) -> dict[str, Any]:
     """Map the first flight of a demonstration and fly the second one; return the report of the flight controller."""
     map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
@@ -148,9 +168,15 @@ def _flown(folder: Path) -> dict[str, Any]:
     command = _command("simulate", "autopilot", "--link", f"udpin:{address}", "--json")
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as autopilot:
         try:
-            _run("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
+            build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
+            mapping = _command(*build)
+            _require_success(mapping, subprocess.run(mapping, stdout=subprocess.DEVNULL).returncode)
             flags = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
-            _run("run", "--map", map_path, "--source", second, *_CAMERA, *flags)
+            flying = _command("run", "--map", map_path, "--source", second, *_CAMERA, *flags)
+            with subprocess.Popen(flying, stdout=subprocess.DEVNULL) as flight:
+                for _ in progress(_queries(log_path, flight), queries, "flying"):
+                    pass
+            _require_success(flying, flight.returncode)
         finally:
             autopilot.terminate()
         said, _ = autopilot.communicate()
@@ -163,10 +189,15 @@ def _command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "edgevpr", *map(str, arguments)]
 
 
-def _run(*arguments: object) -> None:
-    """Run the real program in a process of its own. Raises EdgevprError if it fails."""
-    command = _command(*arguments)
-    _require_success(command, subprocess.run(command, stdout=subprocess.DEVNULL).returncode)
+def _queries(log_path: Path, flight: subprocess.Popen[bytes]) -> Iterator[int]:
+    """Follow the growing flight log until the flight ends, and yield the number of each query in it, from 0."""
+    seen, ended = 0, False
+    while not ended:
+        ended = flight.poll() is not None
+        done = sum(line["kind"] == "query" for line in read_log(log_path)) if log_path.exists() else 0
+        yield from range(seen, done)
+        seen = done
+        time.sleep(0.1)
 
 
 def _require_success(command: list[str], code: int) -> None:
