@@ -4,7 +4,8 @@ presence, answers to fixes, and the position and motion of its vehicle. Used by 
 import logging
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
@@ -29,20 +30,15 @@ GAP_S = 2.5  # without a longer gap: they come once a second, and one may be los
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Speaker:
+class Speaker(NamedTuple):
     """The sender of an autopilot's messages: its system id, and its address (None if the link has one sender only)."""
 
     system_id: int
     address: Sender | None
 
     def __str__(self) -> str:
-        return f"system {self.system_id}{self.where}"
-
-    @property
-    def where(self) -> str:
-        """The address as text with a space before it (" at HOST:PORT"); empty without an address."""
-        return f" at {self.address[0]}:{self.address[1]}" if self.address else ""
+        where = f" at {self.address[0]}:{self.address[1]}" if self.address else ""
+        return f"system {self.system_id}{where}"
 
 
 class Identity:
@@ -111,7 +107,8 @@ class Identity:
         else:
             silent_s = now_s - self._spoke_s
             log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, silent_s)
-            self.news = f"autopilot now{speaker.where}"
+            host, port = speaker.address or ("", 0)
+            self.news = f"autopilot now at {host}:{port}"
 
 
 class Listener:
