@@ -133,12 +133,13 @@ def show(value: Any, as_json: bool, text: str | None = None) -> None:
 
 def lines_of(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Yield a line of text for each field that is known: its name, and its value with the unit that ends the name. The
-    lines of a field that has fields itself are indented; a list of other things than numbers has one line for each."""
+    lines of a field that has fields itself are indented; a list of rows or sentences has one line for each."""
     for name, value in fields.items():
         words, _, ending = name.rpartition("_")
         unit = _UNITS.get(ending, "") if words else ""
         label = (words if unit else name).replace("_", " ")
-        is_list = isinstance(value, list | tuple) and value and not isinstance(value[0], int | float)
+        # The texts of dictionaries and of rows have spaces too.
+        is_list = isinstance(value, list | tuple) and any(" " in str(each) for each in value)
         for each in value if is_list else [value]:
             if isinstance(each, dict) and each:
                 yield f"{indent}{label}:"
