@@ -5,10 +5,13 @@ pixels for radius 5), counting only pixels inside the image, and divide the resu
 intensities can have. `good_blocks` mostly answers without computing a map.
 """
 
-from functools import lru_cache, reduce
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial, reduce
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Singles
 
@@ -16,6 +19,7 @@ DISC_RADIUS_PX = 5
 SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a copy of this size
 # Sizes of the parts that are computed at once, so that the sums stay in cache.
 _STRIP_ROWS = 32
+_STRIP_CELLS = 32
 _STRIP_PIXELS = 256
 _STRIP_INTENSITIES = 16
 _ROUNDING = 1e-5  # more than float32 rounding can change the mean entropy of a block
@@ -29,16 +33,11 @@ def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
 
     `grey` is uint8 (H, W); returns float32 (H, W) in 0..1.
     """
-    # Copies of the border add no intensity to any disc: the pixel copied is nearer to the middle of the disc.
-    padded: Array = cv2.copyMakeBorder(grey, *(radius_px,) * 4, cv2.BORDER_REPLICATE)
+    padded = _replicated(grey, radius_px)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
         strip = padded[top : top + _STRIP_ROWS + 2 * radius_px]
-        # A set of intensities is 256 bits in four words. The union of the sets in a disc has one bit for each of them.
-        bit, word_of = np.left_shift(np.uint64(1), strip & 63, dtype=np.uint64), strip >> 6
-        unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
-        different: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
-        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[different]
+        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[_different(strip, radius_px)]
     return entropy
 
 
@@ -56,8 +55,7 @@ def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
 def block_means(per_pixel: Array, cell_px: int) -> Array:
     """Average a map over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart: float32 (H, W)
     to (H/cell_px - 1, W/cell_px - 1)."""
-    height, width = per_pixel.shape
-    cell = cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
+    cell = _cell_means(per_pixel, cell_px)
     means: Array = (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
     return means
 
@@ -66,30 +64,81 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
     """Tell which blocks are good (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result
     equals `block_means(filled_bins(grey), cell_px) >= threshold`, or that of `shannon`, as `which` names.
 
-    Cheap bounds of the Shannon entropy decide nearly every block, and only the pixels under the others are computed
-    exactly. `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px -
-    1), False where `among`, bool of this shape, is False (True: consider all).
+    Cheap bounds of the entropy decide nearly every block, and only the pixels under the others are computed exactly.
+    `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1),
+    False where `among`, bool of this shape, is False (True: consider all).
     """
-    if which == "filled_bins":
-        return (block_means(filled_bins(grey), cell_px) >= threshold) & among
-    small = _shannon_copy(grey)
-    down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
+    bounds = _BOUNDS[which](grey, cell_px)
+    low = bounds.low
+    undecided = (bounds.blocks(low) < threshold + _ROUNDING) & (bounds.blocks(bounds.high) >= threshold - _ROUNDING)
+    undecided &= among
+    if undecided.any():
+        matters = (bounds.down.T @ undecided @ bounds.across > 0) & (low < bounds.high)
+        low[matters] = bounds.exact(matters)
+        if (np.abs(bounds.blocks(low)[undecided] - threshold) < _ROUNDING).any():
+            return (block_means(_MAPS[which](grey), cell_px) >= threshold) & among
+    return (bounds.blocks(low) >= threshold) & among
 
-    def over_blocks(per_pixel: Singles) -> Singles:
-        means: Array = down @ per_pixel @ across.T
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bounds:
+    """Bounds `low` and `high` of an entropy, float32 (h, w), on a grid over the image. Their means over the blocks are
+    `down` @ values @ `across`.T. `exact` computes the entropy at the True points of a bool (h, w), one value each."""
+
+    low: Array
+    high: Array
+    down: Singles
+    across: Singles
+    exact: Callable[[Bools], Singles]
+
+    def blocks(self, values: Array) -> Singles:
+        means: Singles = self.down @ values @ self.across.T
         return means
 
-    # Of the last four bits alone, the entropy is never more. If all intensities around a pixel lie within 16 k values,
-    # the other bits add at most log2 k.
+
+def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
+    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*."""
+    r = DISC_RADIUS_PX
+    padded = _replicated(grey, r)
+    at_least = np.empty(grey.shape, np.uint8)
+    for top in range(0, len(grey), _STRIP_ROWS):
+        endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
+        at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
+    # n intensities have at most n endings; of those within 64 k values at most k share one.
+    at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # saturates at 255
+
+    def exact(cells: Bools) -> Singles:
+        side = cell_px + 2 * r
+        patches = np.lib.stride_tricks.sliding_window_view(padded, (side, side))[::cell_px, ::cell_px][cells]
+        means = np.empty(len(patches), np.float32)
+        for start in range(0, len(patches), _STRIP_CELLS):
+            strip = slice(start, start + _STRIP_CELLS)
+            means[strip] = _LOG2_OVER_8[_different(patches[strip], r)].mean(axis=(1, 2))
+        return means
+
+    low, high = (_cell_means(cv2.LUT(number, _LOG2_OVER_8[:256]), cell_px) for number in (at_least, at_most))
+    down, across = (_pairs(side // cell_px) for side in grey.shape)
+    return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
+
+
+def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
+    """Bound `shannon` at each pixel of its 100x100 copy, from the last four bits of the intensities, their
+    *endings*."""
+    small = _shannon_copy(grey)
+    # The entropy of the endings is at most that of all bits; within 16 k values the others add at most log2 k.
     low = _shannon_of(small & 15, DISC_RADIUS_PX)
     high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
-    undecided = (over_blocks(low) < threshold + _ROUNDING) & (over_blocks(high) >= threshold - _ROUNDING) & among
-    if undecided.any():
-        matters = (down.T @ undecided @ across > 0) & (low < high)
-        low[matters] = _shannon_at(small, matters)
-        if (np.abs(over_blocks(low)[undecided] - threshold) < _ROUNDING).any():
-            return (block_means(shannon(grey), cell_px) >= threshold) & among
-    return (over_blocks(low) >= threshold) & among
+    down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
+    return _Bounds(low=low, high=high, down=down, across=across, exact=partial(_shannon_at, small))
+
+
+_MAPS = {"filled_bins": filled_bins, "shannon": shannon}
+_BOUNDS = {"filled_bins": _bound_filled_bins, "shannon": _bound_shannon}
+
+
+def _cell_means(per_pixel: Array, cell_px: int) -> Array:
+    height, width = per_pixel.shape
+    return cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
 
 
 def _shannon_copy(grey: Bytes) -> Array:
@@ -98,13 +147,18 @@ def _shannon_copy(grey: Bytes) -> Array:
 
 
 @lru_cache(maxsize=4)
+def _pairs(cells: int) -> Array:
+    """Return the matrix float32 (cells - 1, cells) that averages each cell and the next one."""
+    return (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
+
+
+@lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
-    """Return the matrix float32 (cells - 1, 100) that enlarges a row of the copy and averages it over blocks."""
+    """Return the matrix float32 (cells - 1, 100) that enlarges a row of the copy and averages it over `_pairs` of
+    cells."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
-    cells = side_px // cell_px
-    pairs: Array = (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
-    matrix: Singles = pairs @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
+    matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
     return matrix
 
 
@@ -112,6 +166,28 @@ def _range(grey: Bytes) -> Array:
     """Return, for each pixel, the largest minus the smallest intensity in the square around its disc: uint8 (H, W)."""
     square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
+
+
+def _replicated(grey: Bytes, radius_px: int) -> Array:
+    """Pad `grey` with copies of its border, which add no intensity to any disc: the pixel copied is nearer the
+    middle."""
+    r = radius_px
+    return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
+
+
+def _bit(grey: Bytes) -> NDArray[np.uint64]:
+    """Return a set for each pixel, as a 64-bit word: only bit n is set, n being the last six bits of the intensity."""
+    sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
+    return sets
+
+
+def _different(padded: Bytes, radius_px: int) -> Array:
+    """Count the different intensities in each disc, by unions of sets of 256 bits: (..., H + 2r, W + 2r) to (..., H,
+    W)."""
+    bit, word_of = _bit(padded), padded >> 6
+    unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
+    sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
+    return sizes
 
 
 def _shannon_of(small: Array, radius_px: int) -> Singles:

@@ -12,6 +12,7 @@ from pictures import textured
 from edgevpr.techniques import entropy, gradients
 
 DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[3] / "shared/data")
+ENTROPIES = ("filled_bins", "shannon")
 
 
 def _wall(seed: int) -> np.ndarray:
@@ -26,6 +27,12 @@ def _noise(seed: int) -> np.ndarray:
 def _stripes() -> np.ndarray:
     """Two far levels whose last bits are alike: the endings alone see one."""
     return np.where(np.arange(128) // 3 % 2, 64, 192).astype(np.uint8)[None].repeat(128, axis=0)
+
+
+def _every_ending(seed: int) -> np.ndarray:
+    """Every disc has all 64 values of the last six bits, and far more than 64 values."""
+    ending = np.add.outer(28 * np.arange(128), 63 * np.arange(128)) & 63
+    return (ending + 64 * np.random.default_rng(seed).integers(0, 4, ending.shape)).astype(np.uint8)
 
 
 def _patchwork(seed: int) -> np.ndarray:
@@ -43,35 +50,58 @@ PICTURES = {
     "noise": _noise(4),
     "ramp": np.add.outer(np.arange(128), np.arange(128)).astype(np.uint8),
     "stripes": _stripes(),
+    "every ending": _every_ending(7),
     "patchwork": _patchwork(5),
     "blurred patchwork": cv2.GaussianBlur(_patchwork(6), (0, 0), 1.5),
 }
 
 
-def _assert_same_goodness(grey: np.ndarray, cell_px: int) -> None:
+def _assert_same_goodness(grey: np.ndarray, which: str, cell_px: int) -> None:
     """At the usual thresholds, at the extremes, and at those that split the picture's own blocks, ties included."""
-    means = entropy.block_means(entropy.shannon(grey), cell_px)
+    means = entropy.block_means(getattr(entropy, which)(grey), cell_px)
     own = np.quantile(means, [0, 0.02, 0.25, 0.5, 0.75, 0.98, 1], method="nearest")
     for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
-        good = entropy.good_blocks(grey, "shannon", cell_px, threshold)
+        good = entropy.good_blocks(grey, which, cell_px, threshold)
         np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("cell_px", [8, 16])
 @pytest.mark.parametrize("name", PICTURES)
-def test_good_blocks_are_those_of_the_whole_map(name, cell_px):
-    _assert_same_goodness(PICTURES[name], cell_px)
+def test_good_blocks_are_those_of_the_whole_map(name, cell_px, which):
+    _assert_same_goodness(PICTURES[name], which, cell_px)
 
 
 @pytest.mark.data
+@pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("set_name", ["corridor", "grief_stromovka_seasons", "aerial_caliterra"])
-def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name):
+def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name, which):
     paths = sorted((DATA / set_name / "query").glob("*.*"))
     if not paths:
         pytest.skip(f"no image set {set_name} in {DATA}: name the folder of the sets in EDGEVPR_DATA")
     photograph = cv2.imread(str(paths[len(paths) // 2]), cv2.IMREAD_GRAYSCALE)
-    _assert_same_goodness(cv2.resize(photograph, (256, 256)), 16)
+    _assert_same_goodness(cv2.resize(photograph, (256, 256)), which, 16)
+
+
+@pytest.mark.parametrize("which", ENTROPIES)
+@pytest.mark.parametrize("name", PICTURES)
+def test_no_entropy_leaves_its_bounds_and_the_exact_one_is_exact(name, which):
+    grey = PICTURES[name]
+    bounds = entropy._BOUNDS[which](grey, 16)
+    means = entropy.block_means(getattr(entropy, which)(grey), 16)
+    assert (bounds.blocks(bounds.low) <= means + 1e-6).all()
+    assert (bounds.blocks(bounds.high) >= means - 1e-6).all()
+    exact = bounds.exact(np.ones(bounds.low.shape, bool)).reshape(bounds.low.shape)
+    np.testing.assert_allclose(bounds.blocks(exact), means, atol=1e-6)
+
+
+def test_most_blocks_are_decided_by_bounds_alone():
+    grey = cv2.resize(textured(8, 256, 256), (512, 512))
+    for which, threshold in (("shannon", 0.4), ("filled_bins", 0.5)):
+        bounds = entropy._BOUNDS[which](grey, 16)
+        decided = (bounds.blocks(bounds.low) >= threshold) | (bounds.blocks(bounds.high) < threshold)
+        assert decided.mean() > 0.5
 
 
 def test_octants_vote_like_angles_in_every_direction():
