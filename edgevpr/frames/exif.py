@@ -21,21 +21,37 @@ _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXI
 _XMP = re.compile(rb"""((?:drone-dji|drone-parrot|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
 
 
+_log = logging.getLogger(__name__)
+
+
+class _Impossible(ValueError):
+    """A value is there and cannot be, such as a latitude of 99 degrees."""
+
+
 def read_exif(path: str | Path) -> GeoTag:
     """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
-    impossible (minutes of 99, a date of 1e308) is None.
+    impossible is None. Impossible EXIF values (minutes of 99, a date of 1e308) are reported in the log.
 
     The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. The
     heading is that of the gimbal, with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
     """
     tags, xmp = _exif_of(path), read_xmp(path)
-    position, alt_m = _known(_position, tags), _known(_alt_m, tags)
-    gps_time_s = _known(_gps_time_s, tags)
+
+    def known(read: Callable[[Tags], T]) -> T | None:
+        try:
+            return read(tags)
+        except _Impossible as error:
+            _log.warning("%s: its EXIF says %s, which cannot be: it is taken as unknown.", path, error)
+        except Exception:  # files of any origin: a tag may be absent, of another type or length, or divide by zero
+            pass
+        return None
+
+    position, alt_m, gps_time_s = known(_position), known(_alt_m), known(_gps_time_s)
     return replace(
         xmp,
         position=position and replace(position, alt_m=alt_m),
-        heading_deg=_known(_heading_deg, tags) if xmp.heading_deg is None else xmp.heading_deg,
-        t_utc_s=_known(_camera_time_s, tags) if gps_time_s is None else gps_time_s,
+        heading_deg=known(_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
+        t_utc_s=known(_camera_time_s) if gps_time_s is None else gps_time_s,
     )
 
 
@@ -49,16 +65,9 @@ def _exif_of(path: str | Path) -> Tags:
     return {}
 
 
-def _known(read: Callable[[Tags], T], tags: Tags) -> T | None:
-    """Return what `read` finds; None if it raises: a tag may be absent, of another type or length, or divide by 0."""
-    with contextlib.suppress(Exception):  # files of any origin
-        return read(tags)
-    return None
-
-
 def _within(value: float, low: float, high: float) -> float:
     if not low <= value <= high:
-        raise ValueError(f"{value} is not within {low} and {high}")
+        raise _Impossible(f"{value:g} where {low:g} to {high:g} is possible")
     return value
 
 
@@ -100,9 +109,14 @@ def _camera_time_s(tags: Tags) -> float:
 
 
 def _time_s(text: str) -> float:
-    if not re.match(r"\d{4}:", text):  # `parse_time` would take a bare number for seconds, which EXIF does not have
-        raise ValueError(text)
-    return parse_time(text)
+    if not text.strip("\0 :0"):  # the standard's way of writing "unknown", and that of a clock that was never set
+        raise KeyError(text)
+    try:
+        if ":" in text:  # without a colon it would be seconds, which EXIF does not have
+            return parse_time(text)
+    except (ValueError, OverflowError):
+        pass
+    raise _Impossible(repr(text[:40]))
 
 
 def read_xmp(path: str | Path) -> GeoTag:

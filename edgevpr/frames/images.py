@@ -28,6 +28,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
+_FOLDERS_NAMED = 3  # subfolders suggested in an error message
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
 _SMALL_PX, _SMALL_QUALITY, _TAPE_QUALITY = 640, 80, 95
 
@@ -45,12 +46,14 @@ def list_images(folder: str | Path) -> list[Path]:
     Raises SourceError for a folder that cannot be read or has no images."""
     folder = Path(folder)
     try:
-        names = sorted((path.name for path in folder.iterdir() if is_image(path.name)), key=counting_order)
+        names = sorted((path.name for path in folder.iterdir()), key=counting_order)
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from None
-    if not names:
-        raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give the one that does.")
-    return [folder / name for name in names]
+    if images := [folder / name for name in names if is_image(name)]:
+        return images
+    inner = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
+    advice = " or ".join(inner[:_FOLDERS_NAMED]) or "the one that does"
+    raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give {advice}.")
 
 
 def is_image(name: str) -> bool:
@@ -75,6 +78,8 @@ def read_image(path: str | Path) -> Image:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
+    except MemoryError:
+        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
     if _is_incomplete(data):
         raise ImageError(f"{path} is empty, cut short or damaged: copy it again from the camera.")
     image = None

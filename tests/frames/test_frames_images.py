@@ -120,6 +120,14 @@ def test_a_file_that_is_no_image_or_another_one_than_is_read_is_refused(name, co
     assert capfd.readouterr().err == ""
 
 
+def test_an_image_that_does_not_fit_in_memory_is_refused_like_any_other(tmp_path, monkeypatch):
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("edgevpr.frames.images.read_file", full)
+    assert "memory" in complaint(tmp_path / "large.tif")
+
+
 def test_a_missing_image_a_folder_a_pipe_and_a_device_are_refused_and_not_waited_for(tmp_path):
     complaint(tmp_path / "nothing.jpg")
     (tmp_path / "folder.jpg").mkdir()
@@ -148,6 +156,17 @@ def test_a_folder_without_images_is_refused(tmp_path):
         list_images(tmp_path / "nowhere")
     with pytest.raises(SourceError, match="listed"):
         list_images(tmp_path / "notes.txt")
+
+
+def test_where_the_images_lie_in_a_folder_inside_that_one_is_named(tmp_path):
+    for name in ("notes", "day_2", "day_10"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "notes" / "._IMG_1.jpg").touch()
+    for name in ("day_10", "day_2"):
+        (tmp_path / name / "IMG_1.jpg").touch()
+    with pytest.raises(SourceError) as refused:
+        list_images(tmp_path)
+    assert str(refused.value).endswith(f" {tmp_path}/day_2 or {tmp_path}/day_10.")
 
 
 def png(width, height, rows=b""):
