@@ -98,10 +98,12 @@ class Flight:
             step_s = 1 / rate_hz(config, recogniser)
             navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted=not config.mavlink.send_fixes)
             link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
-            source = world.open_source(step_s)
+            source, source_uri = world.open_source(step_s), config.source.uri
             stack.callback(source.close)
-            if link and not source.is_live:
-                _log.warning("%s is a recording: its fixes say where it was made, not where you are", config.source.uri)
+            if link and not source.is_live and config.mavlink.send_fixes:
+                _log.warning("%s is a recording: the fixes sent say where it was made, not where you are", source_uri)
+            if link and not source.is_live and learner:
+                _log.warning("%s is a recording: what it learns is put where the vehicle is now", source_uri)
             herald = Herald(flight_log, link)
             autopilot = None
             if link:
