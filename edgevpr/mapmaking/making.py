@@ -99,12 +99,13 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of those
-    that have a position.
+    """Result of `make_map`. `technique`, `cells`: its name and its `TechniqueSpec.cells`. `places`, `with_position`:
+    number of places in the map, and of those that have a position.
     `result`: counts of the frames read. `refined`, `calibration`: results of these two steps (None: not done).
     `without_data`: places of an orthophoto that were left out for lack of data (None: not of an orthophoto)."""
 
     technique: str
+    cells: int | None
     places: int
     with_position: int
     result: MappingResult
@@ -152,6 +153,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 calibration = calibrate_map(place_map, technique, config, pictures, shown)
         return MadeMap(
             technique=technique.spec.name,
+            cells=technique.spec.cells,
             places=len(place_map),
             with_position=info_of(place_map).with_position,
             result=result,

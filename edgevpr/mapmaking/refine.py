@@ -49,6 +49,11 @@ class Refined:
     footprint_m: float | None = None
     contradictory: tuple[tuple[int, str, float], ...] = ()
 
+    @property
+    def not_tied(self) -> int:
+        """Number of places that have a position but too few ties to be refined."""
+        return self.places - self.without_position - self.surveyed - self.refined
+
 
 def refine(
     place_map: PlaceMap, technique: Technique, watch: Watch[tuple[int, int]], images: str | Path | None = None
