@@ -33,8 +33,8 @@ _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up f
 def open_pictures(
     uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
 ) -> "WholePictures | None":
-    """Open a stream or file with `options` of FFmpeg and time-outs for opening and each read (None: no time-outs).
-    Returns None if it cannot be opened or has no pictures."""
+    """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
+    for each read (None: no limits). Returns None if it cannot be opened or has no pictures."""
     with av.logging.Capture() as said:
         try:
             container = av.open(uri, options=options, timeout=timeouts_s)
@@ -48,7 +48,7 @@ def open_pictures(
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A packet of the stream. `is_doubtful`: packets before it may be missing."""
+    """A packet of the stream, and whether it can be trusted. `is_doubtful`: packets before it may be missing."""
 
     packet: "Packet[Any]"
     is_doubtful: bool
@@ -62,8 +62,8 @@ class WholePictures:
     """The complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is rejected,
     and so are all pictures after it up to the next key frame, which is decoded without others.
 
-    FFmpeg reads ahead while it opens a stream. `are_missed`: it reported lost packets then. As it is not known which,
-    all packets are rejected until `caught_up` is called."""
+    FFmpeg reads ahead while it opens a stream. `are_missed`: it reported lost packets during that. As it does not say
+    which packets are lost, all are rejected until `caught_up` is called."""
 
     def __init__(self, container: "InputContainer", are_missed: bool) -> None:
         self.container, self.stream = container, container.streams.video[0]
@@ -100,7 +100,8 @@ class WholePictures:
         return Fetched(packet, self._doubtful >= 0)
 
     def skip(self) -> Refusal:
-        """Reject the packet just fetched, and those after it up to the next key frame; return the reason."""
+        """Reject the packet just fetched without decoding it, and all after it up to the next key frame. Returns the
+        reason of the rejection: LATE, or that of an earlier rejection which still lasts."""
         return self._refuse(Refusal.LATE)
 
     def decode(self, fetched: Fetched) -> "list[VideoFrame] | Refusal":

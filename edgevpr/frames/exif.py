@@ -1,5 +1,5 @@
-"""Data that the camera wrote into an image file: position, heading and time from EXIF, attitude and height from XMP.
-Used for the images of a folder without a positions.csv. An attitude is roll and pitch."""
+"""Data that the camera wrote into an image file: position, heading and time from EXIF, roll, pitch and height from XMP.
+Used for the images of a folder without a positions.csv."""
 
 import contextlib
 import logging
@@ -25,15 +25,15 @@ _log = logging.getLogger(__name__)
 
 
 class _Impossible(ValueError):
-    """A value is there and cannot be, such as a latitude of 99 degrees."""
+    """Raised for a value that is present but impossible, such as a latitude of 99 degrees."""
 
 
 def read_exif(path: str | Path) -> GeoTag:
     """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
     impossible is None. Impossible EXIF values (minutes of 99, a date of 1e308) are reported in the log.
 
-    The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. The
-    heading is that of the gimbal, with its roll and pitch, else that of EXIF. For the height see `read_xmp`.
+    The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. Heading,
+    roll, pitch and height are those of `read_xmp`; if it gives no heading, the heading is that of EXIF.
     """
     tags, xmp = _exif_of(path), read_xmp(path)
 
@@ -123,8 +123,9 @@ def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Parrot and Pix4D from the first 300 KB of a file. Never raises: a value that is absent,
     damaged or impossible is None.
 
-    The heading is that of the top of the picture, or if unknown that of the aircraft. Roll and pitch are the deviation
-    of the camera from straight down. The height is over the take-off point, and above the ground only if that is level.
+    The heading is the compass direction of the top of the picture, or if that is unknown, of the aircraft's nose. Roll
+    and pitch are the deviation of the camera from straight down. The height is over the take-off point, which is the
+    height above the ground only where the ground is level. Position and time are None.
     """
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
@@ -155,7 +156,8 @@ def _number(values: Mapping[str, bytes], name: str, low: float = -360.0, high: f
 
 
 def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Convert angles of a gimbal, with a pitch of -90 straight down, to (heading, roll, pitch) in degrees."""
+    """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
+    where roll and pitch are the camera's deviation from straight down. All in degrees."""
     # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
     # is the camera's viewing direction: roll and pitch are 0 when it looks straight down. Then the gimbal's own roll
     # only turns the picture: a gimbal may report half a turn in yaw as half a turn in roll.

@@ -101,7 +101,7 @@ def read_image(path: str | Path) -> Image:
 
 
 def decoded(jpeg: bytes) -> Image:
-    """Decode a JPEG that edgevpr has written to uint8, (H, W, 3) BGR or (H, W) grey."""
+    """Decode a JPEG written by edgevpr. Returns uint8, (H, W, 3) BGR or (H, W) grey."""
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_ANYCOLOR)  # type: ignore[return-value]  # uint8
 
 

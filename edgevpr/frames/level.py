@@ -30,8 +30,8 @@ _SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera without distortion. `fov_deg` is its field of view across the longest side of the picture, and `up_deg`
-    the compass direction of the top of the picture while the nose points north."""
+    """A camera's lens without distortion, and how the camera is mounted. `fov_deg`: its field of view across the
+    longest side of the picture. `up_deg`: compass direction of the picture's top while the nose points north."""
 
     fov_deg: float
     up_deg: float = 0.0
@@ -42,8 +42,8 @@ class View:
     """Direction, size and offset of a picture on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `aside`: the point straight under the camera, from the picture's middle, (right, up) in shares of the longest side.
-    `zoom`: factor by which the picture was enlarged, so that its longest side shows that many times less ground.
+    `aside`: offset from the picture's middle to the point straight under the camera, (right, up) in shares of the
+    longest side. `zoom`: factor by which the picture was enlarged; its longest side shows that many times less ground.
     `lean_m`: offset on the ground (east, north) in metres from the point in the picture's middle to the point straight
     under the camera. Set only for a picture that was not warped because its lens is unknown.
     `reason`: words that say why a tilted picture was not warped (None: it was, or needed no warp)."""
@@ -56,7 +56,7 @@ class View:
     reason: str | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of the flight log for this view, rounded."""
+        """Return this view as fields of the flight log, with rounded numbers. None: unknown."""
         return {
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
@@ -94,8 +94,8 @@ def levelled(
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
     scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). Its middle shows the
     same point as before or, with `below`, the point under the camera. `overlay`, bool (H, W), is False where the
-    picture shows no ground (None: nowhere). An image that needs or bears no warp is returned as it is. No value of
-    frame or vehicle raises.
+    picture shows no ground (None: it shows ground everywhere). A picture of known pose, or that needs no warp, or is
+    tilted too far for one, is returned unchanged. Impossible values in frame or vehicle never raise.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
@@ -138,9 +138,9 @@ def levelled(
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
-    """Return the view of a picture whose lens is unknown: `lean_m`, from the roll, pitch, heading and height of the
-    frame, or where it has none of `vehicle`; or `reason` if it is tilted too far; or neither if too little is known.
-    No value of frame or vehicle raises."""
+    """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`, computed
+    from the roll, pitch, heading and height of `frame`, or where the frame has none those of `vehicle`; or only
+    `reason`, if the picture is tilted too far; or neither, if too little is known. Impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -162,9 +162,9 @@ class _Taking:
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
     looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
     `straight` is the rotation from lens to level picture without a turn, `tilt_deg` the angle between the viewing
-    direction and straight down, and `is_too_tilted` says that it bears no warp. `top_deg` is the compass direction of
-    the picture's top (None: unknown). `own_m` is the ground length of the longest side if the picture were level (None:
-    height unknown). `corners` (3, 4) are homogeneous pixels."""
+    direction and straight down, and `is_too_tilted` is True if that is too much for a warp. `top_deg` is the compass
+    direction of the picture's top (None: unknown). `own_m` is the ground length of the longest side if the picture were
+    level (None: height unknown). `corners` (3, 4) are the picture's corners in homogeneous pixels, one per column."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
@@ -199,7 +199,7 @@ class _Taking:
 
 
 def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
-    """Yield roll, pitch, heading (degrees) and height (m) of the frame, or where it has none those of the vehicle."""
+    """Yield roll, pitch, heading (degrees) and height (m): each of the frame, else of the vehicle, else None."""
     for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
         values = (getattr(frame, name), getattr(vehicle, name, None))
         yield next((value for value in values if value is not None and math.isfinite(value)), None)
@@ -220,13 +220,15 @@ def _body_from_lens(up_deg: float) -> Doubles:
 
 
 def _quadrangle(corners: Doubles, side: int) -> Mask:
-    """Return bool (side, side), True inside the quadrangle whose corners are homogeneous pixels, float (3, 4)."""
+    """Return a mask, bool (side, side), True inside a quadrangle. `corners`, float (3, 4), are its corners in
+    homogeneous pixels, one per column."""
     points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
     return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS).view(np.bool_)
 
 
 def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
-    """Warp an image to (side, side) pixels by a homography (3, 3), after which `shrink` pixels along a side are one."""
+    """Warp an image to (side, side) pixels by the homography `out_from_pixel` (3, 3). `shrink`: number of input pixels
+    along a side that become one output pixel."""
     if shrink > 2:  # averaged first, since a warp alone would ignore most pixels
         height, width = image.shape[:2]
         small = max(1, round(width / shrink)), max(1, round(height / shrink))

@@ -31,7 +31,7 @@ _AROUND_PX = 4  # pixels masked around each edge: digits of a display change, an
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """A mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to the size of a frame.
+    """An overlay mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to a frame's size.
     `sha256` is the hash of the mask's pixels, not of its file."""
 
     allowed: Bools

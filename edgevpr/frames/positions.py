@@ -81,8 +81,8 @@ def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
 
 def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
     """Read the rows of a table with the columns `needed`. Returns for each row
-    * its place "FILE, line N", for messages, and
-    * its values as text, by column.
+    * the text "FILE, line N", for error messages, and
+    * its values as text, by column name.
     If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
@@ -112,8 +112,8 @@ def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> li
 
 
 def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
-    """Convert a row of a table (text by column) to a tag. Raises UsageError, which begins with `where`, for a wrong
-    value."""
+    """Convert a table's row (text by column name; columns as in `read_positions`) to a GeoTag. Raises UsageError, whose
+    message begins with `where`, for a wrong value."""
     known = {column: number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
     lat_deg, lon_deg = known["lat"], known["lon"]
     if (lat_deg is None) != (lon_deg is None):
@@ -135,8 +135,8 @@ def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Pos
 
 
 def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError, which begins
-    with `where`, for text that is no number within `low`..`high`."""
+    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError, whose message
+    begins with `where`, for text that is no number within `low`..`high`."""
     text = row.get(column)
     if not text:
         return None
@@ -245,7 +245,8 @@ def read_track(csv_path: str | Path) -> VideoTrack:
 
 
 def _between(one: float | None, other: float | None, share: float, is_angle: bool = False) -> Any:
-    """Return the number at `share` of the way; None if one of both is. Angles in degrees turn the shorter way."""
+    """Interpolate linearly: return the number at `share` (0..1) of the way from `one` to `other`; None if either is
+    None. With `is_angle` both are degrees, and the way is the shorter turn."""
     if one is None or other is None:
         return None
     way = other - one

@@ -36,7 +36,7 @@ class Source(Protocol):
     `dropped`: number of pictures not read in time; None for a recording, which drops none.
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
     `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
-    `condition`: the state of the source. `state`: the same for people ("reading", "lost, reopening in 2 s")."""
+    `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s")."""
 
     is_live: bool
 
@@ -74,7 +74,8 @@ class Source(Protocol):
 
 
 class RecordingSource:
-    """Base class of sources that end, see `Source`. Only frames whose names are in `only` are read (None: all)."""
+    """Base class of sources that end: folders and video files. For the attributes see `Source`. Only frames whose names
+    are in `only` are read (None: all)."""
 
     is_live, ended, condition, state = False, False, Condition.RUNNING, "reading"
     dropped: int | None = None
@@ -89,7 +90,7 @@ class RecordingSource:
         return self._only is None or name in self._only
 
     def end(self) -> None:
-        """Say from now on that no more frames will come."""
+        """Mark the source as ended: no more frames will come."""
         self.ended, self.condition, self.state = True, Condition.ENDED, "ended"
 
     def close(self) -> None:
@@ -103,8 +104,9 @@ def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
 
 
 class FolderSource(RecordingSource):
-    """Gives each image of a folder once, in counting order of the names, with the data of its line in the table
-    `positions` (None: positions.csv in or beside the folder), or if it has no line, with its EXIF data."""
+    """Gives each image of a folder once, in counting order of the names (2 before 10), with the position, attitude and
+    time of its line in the table `positions` (None: positions.csv in or beside the folder), or if it has no line, with
+    those of its EXIF data. `clock`: the monotonic clock in seconds, for the frames' times."""
 
     def __init__(
         self, folder: Path, positions: Path | None, clock: Callable[[], float], only: Collection[str] | None = None

@@ -51,7 +51,8 @@ def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
 
 
 class StreamCapture:
-    """The pictures of an open stream: a `Capture`. `opened_s` is the time on `clock` just before the opening."""
+    """The pictures of an open stream: a `Capture`. `whole` decodes it. `clock` is the monotonic clock in seconds, and
+    `opened_s` its time just before the opening."""
 
     def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
         self._whole, self._clock = whole, clock
@@ -203,7 +204,8 @@ class StampedTime:
 
 
 class UnstampedTime:
-    """Estimates when pictures were taken, for streams without time stamps (MJPEG over HTTP), by the wait for each.
+    """Estimates when pictures were taken, for streams without time stamps (MJPEG over HTTP). Only the time spent
+    waiting for each picture is known.
 
     After a wait of usual length, the picture has just arrived. After a longer wait it may have been delayed on its way,
     by as much as the wait. A picture returned without any wait was in a buffer, at most since the last wait ended."""

@@ -1,4 +1,5 @@
-"""A source that records its frames on a tape while they are read, and a source that replays them later.
+"""A source that records its frames on a tape while they are read, and a source that replays them later. A tape records
+all that comes into a flight, as values under names, and plays it back in the same order (`core.types.Tape`).
 
 Each picture is recorded as a JPEG, and the flight itself works with the picture decoded from that JPEG. So a replay has
 the flight's pictures, to the last bit.
@@ -20,8 +21,8 @@ _STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
 
 
 class RecordedSource:
-    """A source that records the frames and the state of `source` on a tape. `keep` stores the JPEG of a frame and
-    returns the number under which it is stored."""
+    """A source that records the frames of `source` on a tape, and its attributes (see `Source`) whenever one is read.
+    `keep` stores the JPEG of a frame and returns the number under which it is stored."""
 
     def __init__(self, source: Source, tape: Tape, keep: Callable[[bytes], int]) -> None:
         self.is_live, self.total = source.is_live, source.total
@@ -59,8 +60,8 @@ class RecordedSource:
 
 
 class ReplayedSource:
-    """The source of a recorded flight: frames and state come from its tape. `picture` returns the picture stored under
-    a number, uint8 (H, W, 3) BGR or (H, W) grey."""
+    """The source of a recorded flight: frames and attributes (see `Source`) come from its tape. `picture` returns the
+    picture stored under a number, uint8 (H, W, 3) BGR or (H, W) grey."""
 
     def __init__(self, tape: Tape, picture: Callable[[int], Image]) -> None:
         self.is_live, self.total = tape.read("is_live", lambda: False), 0
@@ -73,8 +74,8 @@ class ReplayedSource:
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame of the tape; None if none had come in time in the flight. Raises ImageError if the
-        flight's frame could not be used. `timeout_s` is ignored."""
+        """Return the next frame of the tape; None if in the flight no frame came within the time-out. Raises ImageError
+        if the flight's frame could not be used. `timeout_s` is ignored."""
         known: Any = self._tape.read("frame", lambda: None)
         if known is None:
             return None

@@ -93,7 +93,8 @@ class VideoSource(RecordingSource):
             self._ready.extend(pictures)
 
     def _advance(self, picture: "VideoFrame") -> bool:
-        """Go on to `picture`. Return True if `step_s` of video time have passed since the last one returned."""
+        """Set index and video time to those of `picture`, the next one decoded. Return True if it should be given: at
+        least `step_s` of video time have passed since the picture given last."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
         # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.

@@ -18,9 +18,9 @@ class Accuracy:
     """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is right, 0..1, the mean
     over the `sets` image sets that nothing was tuned on, with `queries` queries in total.
 
-    `asked`: queries of all image sets. `accepted`: those whose best place was accepted. `accepted_wrong`: those whose
-    accepted place was wrong. `accepted_elsewhere`: those whose accepted place was not even a neighbour of the right
-    one.
+    The other fields are numbers of queries. `asked`: all queries of all image sets, also of those used for tuning.
+    `accepted`: their best place was accepted. `accepted_wrong`: it was accepted, and wrong. `accepted_elsewhere`: it
+    was accepted, and not even a neighbour of the right place.
     """
 
     recall_at_1: float
@@ -33,7 +33,8 @@ class Accuracy:
 
     @property
     def beside(self) -> str:
-        """Number of accepted places that were wrong but neighbours of the right one, for people; empty for none."""
+        """Number of accepted places that were wrong but neighbours of the right one, as text for a table such as
+        " (+3 beside)"; empty for none."""
         count = self.accepted_wrong - self.accepted_elsewhere
         return f" (+{count} beside)" if count else ""
 
@@ -52,8 +53,8 @@ def labelled(label: str, candidates: int | None) -> str:
 def of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
     """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
 
-    `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: fewer than the default (None: the
-    default).
+    `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
+    if fewer than the technique's default (None: the default).
     """
     figures = _content()[camera or "forward"].get(labelled(label, candidates))
     return Accuracy(**figures) if figures else None

@@ -1,8 +1,9 @@
 """Choice of a technique for a board, by accuracy and cost.
 
-The front is the list of all options that fit the board, can be trusted, and are not both less accurate and dearer than
-another. If a least accuracy is asked for, the cheapest of the front that reaches it is chosen, else the most accurate.
-A technique that accepted a wrong place on the image sets is never chosen automatically: its fixes would be sent.
+An option is a technique in one form with one number of candidates. The front is the list of all options that fit the
+board, can be trusted, and are not both less accurate and dearer (in CPU time) than another. If a least accuracy is
+asked for, the cheapest of the front that reaches it is chosen, else the most accurate. A technique that accepted a
+wrong place on the image sets is never chosen automatically: its fixes would be sent.
 """
 
 import math
@@ -35,10 +36,10 @@ class Demand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """Fit of a technique on a board. `t_query_s`: wall seconds of a query. `cpu_s`: its CPU-seconds of all cores
-    together. `map_ram_mb`, `map_disk_mb`: the map's index and file. `process_ram_mb`: RAM of the process with the
-    index. `reachable_hz`: most queries per second. `shortfalls`: why it does not fit (empty: it fits). `remedies`: what
-    would make it fit."""
+    """Says if a technique fits on a board, and what it takes there. `t_query_s`: wall seconds of a query. `cpu_s`: its
+    CPU-seconds of all cores together. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
+    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: most queries per second. `shortfalls`: why it
+    does not fit (empty: it fits). `remedies`: changes that would make it fit, such as "at up to 2 Hz"."""
 
     t_query_s: float
     cpu_s: float
@@ -58,9 +59,9 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
-    """An option to choose: a technique in one form, with its costs on the board and its `fit`. `label` is its unique
-    name, `name` that of the technique. `candidates` are fewer than the default (None: the default). `accuracy` is None
-    if it was not measured."""
+    """An option to choose (see the module), with its costs on the board and its `fit`. `label` is its unique name,
+    `name` that of the technique. `candidates` is set if they are fewer than the technique's default (None: the
+    default). `accuracy` is None if it was not measured."""
 
     label: str
     name: str
@@ -89,8 +90,8 @@ class Option:
 
 
 def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
-    """Yield the technique `name` with its default number of candidates, then with each smaller number that was
-    measured. `label` is technique and form; `costs` are those on `board`."""
+    """Yield the options of the technique `name`: with its default number of candidates, then with each smaller number
+    whose accuracy was measured. `label` is technique and form; `costs` are those on `board`."""
     measured = accuracy.fewer_candidates(label, demand.camera)
     for candidates in (None, *(count for count in measured if count < (costs.candidates or 0))):
         fewer = replace(costs, candidates=candidates or costs.candidates)
@@ -105,8 +106,8 @@ def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: 
 
 
 def front(wanted: Iterable[Option]) -> list[Option]:
-    """Return the options of the front (see above): fitting, trusted, and not both less accurate and dearer than
-    another. The cheapest is first."""
+    """Return those of the `wanted` options that are on the front (see the module), the cheapest first. An option is
+    trusted if it has no `objection`."""
     best_so_far: list[Option] = []
     sound = [option for option in wanted if option.objection is None]
     for option in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
@@ -116,8 +117,8 @@ def front(wanted: Iterable[Option]) -> list[Option]:
 
 
 def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> Option | None:
-    """Choose an option of the front: the most accurate, or the cheapest with a recall@1 of at least `min_recall`.
-    Options of the board's own technique (`board.technique`) go before all others. None if there is no such option.
+    """Choose an option of the front: the cheapest with a recall@1 of at least `min_recall` (None: the most accurate).
+    Options of the board's own technique (`board.technique`) go before all others. Returns None if none is suitable.
 
     Without `min_recall`, the board's own technique is chosen even if it was not measured, since the profile names it.
     """
@@ -141,8 +142,8 @@ def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float 
 
 
 def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
-    """Check whether a technique fits: index into the budget, process into the board's memory, queries into the CPU
-    time. If it does not, look for what would make it fit.
+    """Check whether a technique fits: its index into the budget of RAM for the map, its process into the board's
+    memory, its queries into the CPU time. If one does not, look for changes of the demand that would make it fit.
 
     A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
     the share `cpu_share` of the cores.

@@ -19,11 +19,12 @@ from edgevpr.runtime.preflight.trial import Trial
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan(Demand):
-    """Plan of a flight, beside what it demands of a technique.
+    """Plan of a flight: its demands of a technique (`Demand`), and what its energy is computed from.
 
-    `flight_min`: minutes in the air. `regulator_efficiency`: share of the pack's energy that reaches the board, 0..1.
-    `hover_w`: watts that the aircraft draws to hover (None: not given). `min_recall`: least recall@1 asked for (None:
-    the highest that fits). Raises UsageError for a number that is not finite or not above 0.
+    `flight_min`: minutes in the air. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's energy
+    that reaches the board, 0..1. `hover_w`: watts that the aircraft draws to hover (None: not given). `min_recall`:
+    least recall@1 asked for (None: the highest that fits). Raises UsageError for a number that is not finite or not
+    above 0.
     """
 
     flight_min: float
@@ -44,12 +45,13 @@ class FlightPlan(Demand):
 class TechniqueEstimate:
     """Estimate of one technique, in one form, on the board. `option` has its costs there, its fit and its accuracy.
 
-    `on_front`: it is on the front of `choose`. `measured`: True for stored costs, False for costs measured just now.
+    `on_front`: it is on the front (see the module `choose`). `measured`: True for costs that were stored earlier, False
+    for costs measured just now.
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
-    `flight_mah`: what the board draws in the flight. `flight_marginal_mah`: its part that the queries add (5.7). All
-    charges are drawn from the pack, and `flight_pack_frac` is `flight_mah` as a share of its capacity.
-    `lost_min`: minutes of hovering on a full pack that the board costs. `lost_marginal_min`: its part that recognising
-    costs (both None: hover power unknown).
+    `flight_mah`: charge that the board draws in the flight. `flight_marginal_mah`: the part of it that the queries add
+    (equation 5.7). All charges are drawn from the pack; `flight_pack_frac` is `flight_mah` as a share of its capacity.
+    `lost_min`: minutes of hovering on a full pack that the board costs. `lost_marginal_min`: the part of them that the
+    queries cost (both None: hover power unknown).
     """
 
     option: Option
@@ -68,9 +70,10 @@ class FlightEstimate:
     """Estimates of all techniques on one board.
 
     `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
-    "unscaled" (this machine's, since a score is missing). `measured_on`: date of the stored figures (None: none were
-    used). `recommended`: label of the technique to use (None: none can be; see `choose`). `reason`: why, in a sentence.
-    `notes`: remarks on the estimate. `unusable`: techniques that cannot be used here, each with the reason.
+    "unscaled" (this machine's, since the speed score of one of them is missing). `measured_on`: date of the stored
+    figures (None: none were used). `recommended`: label of the option to use (None: there is none). `reason`: why it
+    is recommended, or why none is, in a sentence. `notes`: remarks on the estimate. `unusable`: techniques that cannot
+    be used here, each with the reason.
     """
 
     board: str
@@ -157,7 +160,8 @@ def _estimated(option: Option, board: Board, plan: FlightPlan, measured: bool, o
 def _recommended(
     rows: tuple[TechniqueEstimate, ...], board: Board, plan: FlightPlan, map_technique: str | None
 ) -> tuple[str | None, str]:
-    """Choose among the options of `map_technique` (None: among all); return `recommended` and `reason`."""
+    """Choose among the options of `map_technique` (None: among all). Returns `recommended` and `reason` as in
+    `FlightEstimate`."""
     usable = {row.option.label: row for row in rows if map_technique in (None, row.option.name)}
     served = f"the map was built with {map_technique}, and " if map_technique else ""
     if not usable:

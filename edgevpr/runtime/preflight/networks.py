@@ -32,8 +32,10 @@ _LIMIT_S = 120.0  # of a trial: at this limit, each of its ten pictures takes tw
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """One card in a listing. `problem`: why card and network file cannot be used together, in a sentence (None: they
-    can); then only `name` is set beside it. `techniques`: those that use it by default."""
+    """One line of the list of networks: the card (the YAML file that describes a network) called `name`. `problem`: why
+    the card or its network file cannot be used, in a sentence (None: both can); if it is set, all other fields except
+    `name` are empty. `file`: path of the network file. `outputs`: kinds of output that the network has. `techniques`:
+    the techniques and settings that use the network by default."""
 
     name: str
     problem: str | None = None
@@ -64,15 +66,16 @@ class Verified:
 
 
 def list_models() -> tuple[Listed, ...]:
-    """List all cards, including those that cannot be read. No network is run."""
+    """List the networks of all cards, including those that cannot be read. No network is run."""
     return tuple(_listed(name) for name in card_names())
 
 
 def verify(card: Card, threads: int = 1, limit_s: float = _LIMIT_S) -> Verified:
-    """Run `verify_here` in a child process, for at most `limit_s` seconds.
+    """Check that the network of a card works, by `verify_here` in a child process, for at most `limit_s` seconds.
 
-    No other network has loaded anything there that would be missing from the figures. A network that is too large for
-    the board, or never ends, ends the child process instead of this one. Raises EdgevprError if that happens.
+    In a new process no other network has loaded libraries, whose memory would be missing from the figures. A network
+    that is too large for the board, or never ends, ends the child process instead of this one. Raises EdgevprError if
+    that happens, or if the network does not work.
     """
     job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads}
     answer = ask_child("edgevpr.runtime.preflight.networks", job, limit_s, f"Trying {card.file_path}")
@@ -118,8 +121,8 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
 
 def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     """Copy a network's file and card to the user's models folder, if the network works. The SHA-256 on the card must be
-    that of the file; a card without one gets it. Returns the figures of the network and the path of the new card.
-    Raises EdgevprError."""
+    that of the file; if the card has none, it is added. Returns the figures of the network and the path of the new
+    card. Raises EdgevprError if the network does not work, or cannot be added."""
     card = read_card(card_path, needs_hash=False)
     found = file_sha256(file)
     if card.sha256 not in ("", found):

@@ -23,8 +23,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Outlook on a flight. `reason`: which technique flies and why, in one line. `candidates`: number of places to
-    compare a query with. `t_query_s`: seconds that a query will take (None: the technique could not be tried)."""
+    """Expectation of a flight, made before it. `reason`: the technique that is used and why, in one line for the log.
+    `candidates`: number of places to compare a query with. `t_query_s`: seconds that a query will take (None: the
+    technique could not be tried)."""
 
     reason: str
     candidates: int
@@ -60,9 +61,9 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Report which technique flies and why, and measure now whether the board can afford it. If it cannot, fewer
-    candidates are taken that fit, unless the configuration sets their number (see `choose`). A failed measurement is
-    only reported: it must not prevent a flight."""
+    """Report the technique that the flight uses and why, and measure now whether the board can afford it. If it cannot,
+    the number of candidates is reduced to the largest trusted one that fits, unless the configuration sets the number
+    (see `choose`). A failed measurement is only reported: it must not prevent a flight."""
     technique = recogniser.technique
     usual = candidates = recogniser.candidates or technique.candidates
     t_query_s = None
@@ -82,7 +83,8 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
 
 
 def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
-    """Return the technique with the candidates that the flight will compare, and its accuracy and cost as a text."""
+    """Return two things: the technique with the number of candidates that the flight will compare, as an option; and
+    its accuracy and cost as text."""
     technique, board = recogniser.technique, recogniser.meter.board
     spec, costs = technique.spec, _costs_on(technique, board)
     costs = replace(

@@ -40,13 +40,14 @@ _LINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measure
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
-    """Costs of a technique on one machine.
+    """Costs of a technique on one machine, measured or converted. A `StageCost` is wall time and CPU time.
 
-    `encode`: of one frame. `match_per_place`: of comparing one place, read from the map file. `compare_once`: part of
-    comparing that does not grow with the number of places; less for fewer than `in_full` places.
+    `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
+    file. `compare_once`: part of comparing that does not grow with the number of places; if fewer than `in_full` places
+    are compared, a proportional share of it.
     `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
-    technique has one stage, and compares all). `scan_per_place`: of scanning one place. `scan_once`: of preparing the
-    query for it.
+    technique has one stage, and compares all). `scan_per_place`: cost of scanning one place. `scan_once`: cost of
+    preparing a query for the scan.
     `process_mb`: peak resident memory of the process without a map.
     `is_network`: pictures go through a network. `sequence`: number of queries matched together.
     """
@@ -87,11 +88,11 @@ def probe(
     wall_clock: Callable[[], float] = time.perf_counter,
     cpu_clock: Callable[[], float] = time.process_time,
 ) -> TechniqueCosts:
-    """Measure the costs of a technique here and now. Pictures of `noise` go through the steps of a query, first with an
-    empty map, then with a small map on disk, then with a large index.
+    """Measure the costs of a technique on this machine. Pictures of `noise` go through the steps of a query, first with
+    an empty map, then with a small map on disk, then with a large index.
 
-    Each is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of other
-    programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
+    Each picture is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of
+    other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
     meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
     bench = _Bench(technique, meter, tried_s)
@@ -135,8 +136,8 @@ def probe(
 
 
 class _Bench:
-    """A technique at work on the same pictures, again and again. `sequence`: number of queries that it matches
-    together."""
+    """Measures a technique: lets it recognise the same pictures of noise again and again, and returns what each step
+    cost. `sequence`: number of queries that the technique matches together. `tried_s`: seconds for the repetitions."""
 
     def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
         self.sequence = length_of(technique.spec, None)
@@ -146,7 +147,7 @@ class _Bench:
         ]
 
     def fill(self, trial_map: PlaceMap) -> None:
-        """Fill a map with copies of the first picture."""
+        """Add the trial's places to a map, all of them copies of the first picture."""
         alone = self._walk(trial_map, empty_index(self._technique.spec, 0, None), 1)
         first = _stepped(alone, self._frames[0])
         if first.descriptor is None:
@@ -155,7 +156,8 @@ class _Bench:
             trial_map.add(self._frames[0], first.descriptor, landmarks=alone.landmarks(first))
 
     def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> list[Steps]:
-        """Let each picture be matched several times; return the least cost of every step, one `Steps` per picture."""
+        """Match each picture several times with `place_map`, of which `index` is in RAM and `candidates` places are
+        compared. Returns one `Steps` per picture: the least cost of every step."""
         walk = self._walk(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
@@ -207,7 +209,8 @@ def _beyond(cost: StageCost, part: StageCost) -> StageCost:
 
 
 def _least(costs: list[StageCost]) -> StageCost:
-    """Return the least CPU time, and as wall time the same or, if less, the least wall time. While one core works, less
-    wall than CPU time cannot pass, so that waiting for other programs is left out; with several cores it can."""
+    """Return the least cost of several tries: the least CPU time, and as wall time the least CPU time too or, if that
+    is less, the least wall time. So the wall time spent waiting for other programs is left out, and work on several
+    cores, whose wall time is less than its CPU time, is kept."""
     cpu_s = min(cost.cpu_s for cost in costs)
     return StageCost(min(cpu_s, *(cost.wall_s for cost in costs)), cpu_s)

@@ -34,8 +34,8 @@ class Ratios:
 
 
 def counted_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the instructions of the technique `name` with these parameters on an ARM core, counted for fields of
-    `TechniqueCosts`; None if they were not counted."""
+    """Return the number of instructions that the technique `name` with these parameters takes on an ARM core, by the
+    name of the field of `TechniqueCosts` that they are the cost of; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
     work: dict[str, float] = _counted()[parameters.get("camera", "forward")]
@@ -48,11 +48,11 @@ def is_same(here: Board, board: Board) -> bool:
 
 
 def ratios(here: Board, board: Board) -> Ratios | None:
-    """Return the ratios of `board` to `here`, the machine that measured; None if a score is unknown.
+    """Return the speed of `board` divided by that of `here`, the machine that measured; None if a score is unknown.
 
-    If the score at products or passes is missing, it is computed from `arm64_mips` and the instructions counted for
-    that part of the micro-benchmark. Without `arm64_mips`, `single` stands in for passes, and a modest share of it for
-    products.
+    The scores are fields of `MachineSpeed`. If `products` or `passes` is missing, it is computed from `arm64_mips` and
+    the instructions counted for that part of the micro-benchmark. Without `arm64_mips`, the single-thread score
+    `single` is used for passes, and a modest share of it for products.
     """
     if is_same(here, board):
         return Ratios(1.0, 1.0)
@@ -104,7 +104,8 @@ def _passes(score: MachineSpeed) -> float | None:
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
-    """Return the cost of a stage on `board`, a thread of which is `ratio` times as fast, with at most `threads`."""
+    """Return the cost of a stage on `board`, where a thread is `ratio` times as fast. `threads`: most threads that the
+    stage may use there (None: as many as the board has cores)."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return cost * (1 / ratio)

@@ -35,7 +35,7 @@ _PACKAGES = ("numpy", "opencv", "onnxruntime")  # what the names of packages beg
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredFigures:
     """Figures of all techniques on one machine. `date`: local time of the measurement. `identity`: see `identity()`.
-    `threads`: of a network. `score`: speed by the micro-benchmark."""
+    `threads`: number of threads that networks used. `score`: the machine's speed by the micro-benchmark."""
 
     date: str
     identity: dict[str, Any]
@@ -44,8 +44,8 @@ class StoredFigures:
     trials: tuple[Trial, ...]
 
     def of(self, offer: Trial) -> Trial | None:
-        """Return the stored trial of an offer. None if it was not measured, could not be used then, or has another
-        network now."""
+        """Return the stored trial of the technique and settings of `offer`, a trial not yet made. None if none was
+        stored, if the technique could not be used then, or if it has another network now."""
         for trial in self.trials:
             if trial.costs and trial.label == offer.label and _same_settings(trial, offer):
                 with contextlib.suppress(EdgevprError):
@@ -117,10 +117,11 @@ def load(path: Path) -> tuple[StoredFigures | None, str | None]:
 
 
 def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Board:
-    """Return the machine `here` with the score from which its figures are scaled: of the same kind as that of `board`.
+    """Return the machine `here` with the speed score from which its figures are scaled to `board`. Both scores must be
+    of one kind.
 
-    If `board` has a published score only (no `passes`) and that of `here` is verified, it is the one of the profile.
-    Otherwise it is that of the micro-benchmark, stored or run now (two seconds).
+    If `board` has a published score only (no `passes`) and that of `here` is verified, the score in the profile of
+    `here` is kept. Otherwise it is that of the micro-benchmark, stored or run now (two seconds).
     """
     published = here.benchmark_score.verified and board.benchmark_score.passes is None
     if is_same(here, board) or published:
@@ -161,6 +162,6 @@ def measured_profile(figures: Path, score: MachineSpeed) -> tuple[Path | None, s
 
 
 def _same_settings(trial: Trial, offer: Trial) -> bool:
-    """Tell whether an offer asks for the settings that were tried. A setting that is not named has its default."""
+    """Return True if `offer` has the settings that `trial` was made with. A setting not named has its default."""
     had = {**techniques.parameters(offer.name), **trial.parameters}
     return {**had, **offer.settings} == {**had, **trial.settings}

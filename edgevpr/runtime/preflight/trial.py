@@ -22,11 +22,12 @@ _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest bo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A technique to try, with its settings, one of which may be its form. `label` tells it from others.
+    """A technique to try (an offer), or that was tried, with its settings, one of which may be its form. `label` is its
+    unique name.
 
     Once it was tried, it has its `costs`, or the `problem`, a sentence that says why it cannot be used here.
-    `parameters`: all that the technique then had. `model`: fingerprint of its network. `weights`: name of the network's
-    weights (both None: no network). `measured`: the costs were stored earlier.
+    `parameters`: all parameters of the technique when it was tried. `model`: fingerprint of its network. `weights`:
+    name of the network's weights (both None: no network). `measured`: the costs were stored earlier.
     """
 
     label: str
@@ -43,9 +44,9 @@ class Trial:
 def offers(
     names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
 ) -> tuple[Trial, ...]:
-    """Return a trial to make for each technique in each of `forms`; one only if it has no forms or its `settings` name
-    one. `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a card that is
-    incomplete."""
+    """Return the trials to make, not yet made: one for each technique of `names` in each of `forms`, or only one if it
+    has no forms or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name,
+    ModelError for a card that is incomplete."""
     listed = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
@@ -58,8 +59,9 @@ def offers(
 def try_each(
     wanted: Iterable[Trial], threads: int, known: Callable[[Trial], Trial | None] = lambda offer: None
 ) -> Iterator[Trial]:
-    """Yield each of the `wanted` trials with its result: the one that is `known`, else one made now in a child process.
-    An unusable technique has one result, under its name. `threads` are those of a network."""
+    """Yield each of the `wanted` trials with its result. `known` returns the result of a trial made earlier (None:
+    there is none; it is made now in a child process). A technique that cannot be used has one result, labelled with its
+    name. `threads`: number of threads for networks."""
     refused = set()
     for offer in wanted:
         if trial := known(offer):
