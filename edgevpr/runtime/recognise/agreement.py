@@ -60,7 +60,8 @@ class Overlay:
 
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
-    """Return how the place of `one` lies on that of `other`, if both say how the same query lies on their place."""
+    """Return how one place lies on another, given `one` and `other`, the overlays of the same query on these two
+    places."""
     turn_scale = _turn_scale(other) / _turn_scale(one)
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
@@ -76,8 +77,8 @@ class Agreement:
     The query is turned by `rotation_deg` (clockwise, 0..360) about its middle, scaled by `scale` (above 1 if it was
     taken from higher up), and its middle is moved from the place's middle by `shift_share` (dx to the right, dy down),
     as shares of the place's longest side. It then lies over the place. `covariance_share2` (var x, cov xy, var y) is
-    that of the shift. All four are None without inliers. `is_expected` is False if the pictures agree, but not in the
-    expected way.
+    that of the shift. All four are None without inliers. `is_expected` is False if the landmarks agree, but on another
+    overlay than the one that was expected.
     """
 
     inliers: int
@@ -106,8 +107,8 @@ class Agreement:
 
 
 def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
-    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many agree elsewhere, return
-    that other agreement, with `is_expected` False."""
+    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many agree on another overlay,
+    return the agreement on that one, with `is_expected` False."""
     found = agreement(query, place, expected)
     if found.inliers >= CONFIRMED:
         return found
@@ -119,8 +120,8 @@ def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
 
 
 def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures. Only ways to lay the query on the place near to the `expected` one are
-    tried (None: all)."""
+    """Compare the landmarks of two pictures. Only ways to lay the query on the place that are near to the `expected`
+    overlay are tried (None: all ways)."""
     possible = min(len(query), len(place))
     if possible < _FEWEST:
         return Agreement(inliers=0, matched=0, possible=possible)
@@ -165,7 +166,8 @@ def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
 
 
 class Verification:
-    """Compares the landmarks of one query with those of places. They are computed when first needed."""
+    """Compares the landmarks of one query with those of places. The query's landmarks are computed when first
+    needed."""
 
     def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._spec, self.picture = spec, picture
@@ -173,8 +175,9 @@ class Verification:
         self._query: Landmarks | None = None
 
     def proof(self, ranking: Ranking) -> Agreement | None:
-        """Compare the landmarks of the query with those of the best place, expected as its match says. None if they
-        cannot be compared: the place has no landmarks, or its match no shift or rotation.
+        """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that the
+        match of this place gives. None if they cannot be compared: the place has no landmarks, or its match no shift or
+        rotation.
 
         Raises PlaceError if the landmarks of the place cannot be read; the place is then left out.
         """
@@ -182,9 +185,10 @@ class Verification:
         return held_against(self._of_query(), known, expected) if expected and known is not None else None
 
     def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
-        """Return the number of landmarks of the best place elsewhere (see `places.retrieve.elsewhere`) that agree as
-        its own match expects: 0 if there is no such place, and the largest possible number if its landmarks are
-        unknown. The places with the numbers `same` are not elsewhere. Raises PlaceError as `proof`."""
+        """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
+        that agree on the overlay given by the match of that place. It is 0 if there is no place elsewhere, and the
+        largest possible number if its landmarks are unknown. The places with the numbers `same` do not count as
+        elsewhere. Raises PlaceError as `proof` does."""
         away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
         if not len(away):
             return 0
@@ -192,9 +196,9 @@ class Verification:
         return OF_PLACE if known is None else agreement(self._of_query(), known, expected).inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
-        """Return the numbers of the first places that show the same ground as the best one: their landmarks agree with
-        those of the best place as both matches expect. Empty if places have positions, which then tell. Raises as
-        `proof`."""
+        """Of the best few places compared, return the numbers of those that show the same ground as the best one: their
+        landmarks agree with those of the best place, on the overlay that follows from the two matches. Empty if the
+        best place has a position, since distances then tell the same. Raises PlaceError as `proof` does."""
         slots = ranking.compared_slots[:_MAY_BE_THE_SAME]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
@@ -209,7 +213,8 @@ class Verification:
         )
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
-        """Return the overlay of the query on a place by its match, and the place's landmarks (None: unknown)."""
+        """Return the overlay of the query on the place in row `slot` of the index, by its match (None: the match has no
+        shift or rotation), and the place's landmarks (None: unknown)."""
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
             return None, None
@@ -237,7 +242,7 @@ def _complex(landmarks: Landmarks) -> Array:
 
 
 def _differing_bits(one: Bytes, other: Bytes) -> Singles:
-    """Count the bits in which each two descriptions differ: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
+    """Count the bits in which each pair of descriptions differs: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
     ours, theirs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
     return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
 
@@ -248,7 +253,9 @@ def _turn_scale(expected: Overlay) -> np.complex64:
 
 
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
-    """Return bool (N, M): which landmark of the place each of the query can be, by position, direction and size."""
+    """Return bool (N, M): True where a landmark of the query can be that landmark of the place, by position, direction
+    and size, if the query lies on the place about as `expected`. `asked` (N,) and `known` (M,) are the points of query
+    and place."""
     factor = _ANY_SCALE if expected.scale is None else _SCALE
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
@@ -260,7 +267,9 @@ def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, e
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Return bool like `shift`: True for each way that is near to the expected one."""
+    """Return True for each way near to the expected overlay (None: for each way with a plausible scale). A way is given
+    by its two complex numbers `turn_scale` (rotation and scale) and `shift`, or arrays of them; the result has their
+    shape."""
     if expected is None:  # only the scale is limited
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
     beside = turn_scale / _turn_scale(expected)
@@ -271,7 +280,9 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
-    """Return the way, defined by two matches, that most matches follow; None if no way is near to the expected one."""
+    """Return the way that most matches follow, out of those that two matches define; None if no way is near to the
+    expected overlay. `asked` and `known`, complex (n,), are the points of the matches in query and place, best matches
+    first."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]
@@ -289,7 +300,8 @@ def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tupl
 
 
 def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
-    """Return the way that lays `asked` over `known`, complex (n,) each, by least squares."""
+    """Return the way that lays the query's points `asked` over the place's points `known`, complex (n,) each, by least
+    squares."""
     middle, there = asked.mean(), known.mean()
     spread = np.vdot(asked - middle, asked - middle).real
     turn_scale = np.vdot(asked - middle, known - there) / spread if spread > 0 else 1.0 + 0j
@@ -297,7 +309,8 @@ def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
 
 
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the shift along each axis, shares squared, from the inliers, complex (n,) each."""
+    """Return the variance of the shift along each axis, as a share squared, from the inliers: their points `asked` in
+    the query and `known` in the place, complex (n,) each."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()

@@ -179,8 +179,8 @@ class Belief:
         return self._posterior(p)
 
     def _left(self) -> tuple[_Hypotheses, float, float]:
-        """Apply the chances of leaving, entering and jumping between two queries. Returns the hypotheses, with less
-        weight and credit, and the probabilities of being lost and of having appeared anywhere on the map."""
+        """Apply the chances of leaving, entering and jumping between two queries. Returns the hypotheses with less `w`
+        and `credited`, the probability of being lost, and that of having entered or jumped to any place."""
         held = float(self._now.w.sum())
         lost = (1 - self._enters) * self._lost + _LEAVES * held
         stays = 1 - _LEAVES - _JUMPS
@@ -282,7 +282,7 @@ class Belief:
 
 
 def _unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
-    """Return the hypotheses after their motion, if the query sees none of them, which has the probability `chance`."""
+    """Return the hypotheses after their motion, if the query proposes none of them: `w` times this `chance`."""
     share = np.stack([way.share for way in ways], 1)[..., None]
     at = np.stack([way.at for way in ways], 1)
     covariance = np.stack([way.covariance for way in ways], 1)
@@ -298,7 +298,7 @@ def _apart(one: Doubles, other: Doubles) -> Doubles:
 
 
 def _density(way: _Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
-    """Return the density (M, K), by a way of M hypotheses, of positions `at` (K, 2) with `covariance` (K, 2, 2)."""
+    """Return the density (M, K) at positions `at` (K, 2) with `covariance` (K, 2, 2), if M hypotheses move by `way`."""
     xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
@@ -316,7 +316,8 @@ def _firm(covariance: Doubles, least: float) -> Doubles:
 
 
 def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
-    """Combine K positions and K others by covariance intersection (Julier and Uhlmann 1997): errors are common."""
+    """Combine K positions with K others, whose errors are related, by covariance intersection (Julier, Uhlmann
+    1997)."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
     by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)
@@ -337,7 +338,7 @@ def _mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles,
 
 
 def _usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
-    """Keep the likeliest finite proposals, invertible and with a sum of 1 at most; their indices come first."""
+    """Return the indices of the likeliest finite proposals, and these, made invertible and with a sum of 1 at most."""
     is_near = (np.abs(proposed.at) < _FARTHEST).all(1) & (np.abs(proposed.covariance) < _FARTHEST**2).all((1, 2))
     numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & is_near)
     numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:_MOST]]

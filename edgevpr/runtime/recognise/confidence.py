@@ -33,8 +33,9 @@ _LEAST = 1e-15  # least chance, so that its logarithm exists
 
 @dataclass(frozen=True, slots=True)
 class Logistic:
-    """A logistic regression. The logit is `bias` plus the sum of each of the `weights` times the evidence of the name
-    in `names`. `scales` are the standard deviations of that evidence over many sites."""
+    """A logistic regression on the evidence of a match. Its logit is `bias` plus the sum of each figure of the evidence
+    in `names` times the weight at the same position in `weights`. `scales` are the standard deviations of these figures
+    over many sites; an adaptation to a map uses them."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]
@@ -62,8 +63,9 @@ class Tail:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Meaning of the logits of a model. `off_map` and `off_place` are the tails of wrong matches of both ways. `slope`
-    and `offset` are those of the line from -log(chance) to the logit of the confidence."""
+    """Conversion of the logits of a model to a confidence. `off_map` and `off_place` are the tails of the matches that
+    are wrong because the query is off the map, or at another place. The logit of the confidence is a straight line over
+    -log(chance), with `slope` and `offset`."""
 
     off_map: Tail
     off_place: Tail
@@ -71,17 +73,17 @@ class Scale:
     offset: float
 
     def confidence(self, chance: float) -> float:
-        """Return the probability that a match is right, given the chance that a wrong match offers as much evidence."""
+        """Return the probability that a match is right, given its chance (see the module)."""
         logit = self.offset - self.slope * math.log(max(chance, _LEAST))
         return 1 / (1 + math.exp(-max(-_MOST, min(_MOST, logit))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """Confidence of the matches of one technique and kind of evidence. `of_map` is the regression that tells whether
-    the query shows ground of the map, `of_place` whether the best place is the right one, and `scale` the meaning of
-    their logits. `adapted_scale` is the scale for a model adapted to its map (None: this model is adapted). `made` is
-    its date, and `made_of` describes in words the data it was fitted to."""
+    """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression that
+    tells whether the query shows ground of the map, `of_place` whether the best place is the right one, and `scale`
+    converts their logits. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
+    adapted). `made` is its date, and `made_of` describes in words the data it was fitted to."""
 
     of_map: Logistic
     of_place: Logistic

@@ -1,18 +1,18 @@
 """Evidence of a match: the figures that its confidence is computed from (see `confidence`), and map calibration.
 
 There are three kinds: for a camera that looks ahead (AHEAD), and for one that looks straight down, with landmarks
-(DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if
-they show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
+(DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if they
+show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
 
-* agree: log of the share of regions that agree; ahead, of its geometric mean over query and place
-* lead: `agree` minus that of the best place elsewhere
-* lead_around: the same of the score, averaged over a place, the one before and the one after it (ahead)
-* coverage: log of the share of the place's regions that agree, each counted once
-* mutual: log of the share of regions that are each other's most similar (ahead)
-* mutual_best: 1 if no place elsewhere has more of them, else 0 (ahead)
-* rank_gap: mean log rank of the regions (see `Support`) minus the least of all places compared (ahead)
-* back, likeness: log of `Support.back`, and `Support.likeness` (ahead)
-* landmarks: log of one more than the number of landmarks that agree as expected (down)
+* agree: logarithm of the share of regions that agree; ahead, of its geometric mean over query and place
+* lead: `agree` minus the largest `agree` of a place elsewhere
+* lead_around: the same for the logarithm of the score, averaged over a place and its neighbours in the index (ahead)
+* coverage: logarithm of the share of the place's regions that agree, each counted once
+* mutual: logarithm of the share of regions that are each other's most similar (ahead)
+* mutual_best: 1 if this share is larger at no place elsewhere, else 0 (ahead)
+* rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
+* back, likeness: logarithm of `Support.back`, and `Support.likeness` (ahead)
+* landmarks: logarithm of one more than the number of landmarks that agree as expected (down)
 """
 
 import json
@@ -51,10 +51,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCalibration:
-    """Calibration of a map, from `asked` altered pictures of its own places. `models` maps kinds of evidence to models,
-    and `made` is the date. At the `precision` asked for then, the share `accepted` of the pictures is accepted.
-    `accepted_wrong` of the accepted matches are wrong, among them those of places that were left out of the map for the
-    test. `recognisable` maps the number of each place tested to the mean confidence (0..1) of its right matches."""
+    """Calibration of a map: the result of looking for a number (`asked`) of altered pictures of its own places.
+    `models` maps kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` that
+    the calibration was made for, the share `accepted` of the pictures is accepted. `accepted_wrong` of the accepted
+    matches are wrong, among them those of places that were left out of the map for the test. `recognisable` maps the
+    number of each place tested to the mean confidence (0..1) of its right matches."""
 
     models: Mapping[str, Model]
     made: str
@@ -103,7 +104,7 @@ def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
 
 
 def kind_of(evidence: Evidence) -> str:
-    """Return the kind of this evidence."""
+    """Return the kind of this evidence, by the figures it has."""
     if "likeness" in evidence:
         return AHEAD
     return DOWN if "landmarks" in evidence else DOWN_BARE
@@ -229,12 +230,15 @@ def read_calibration(text: str) -> MapCalibration:
 
 
 def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:
-    """Return the log ratio of the share of the best place to the largest share `away` (elsewhere)."""
+    """Return the logarithm of the ratio of the best place's share to the largest share of a place elsewhere. `share`
+    maps slots to shares of agreeing regions, `best` is the slot of the best place, and `away` are the slots of places
+    elsewhere."""
     return _log_share(share[best]) - _log_share(max((share[slot] for slot in away), default=_BY_CHANCE))
 
 
 def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
-    """Return the weighted mean of each place's share with those of the places before and after it in the index."""
+    """Average the share of each place with those of the places before and after it in the index. `share` and the result
+    map the places' slots to shares."""
     least = min(share.values())  # stands for a place that was not compared
     return {
         slot: (own + _BESIDE * (share.get(slot - 1, least) + share.get(slot + 1, least))) / (1 + 2 * _BESIDE)

@@ -37,8 +37,8 @@ _LEAST_SPACING_M = 5.0
 class Followed:
     """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
     (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
-    at no position of the belief, `mass` that of the `estimate` of its position (None: unknown, or the map has no
-    positions)."""
+    at no position of the belief. `estimate` is its most likely position (None: unknown, or the map has no positions),
+    and `mass` the probability that it is near this position."""
 
     slot: int | None
     confidence: float
@@ -52,8 +52,9 @@ class Followed:
 
 
 class _Survey:
-    """Distances and `origin` of a map (None: it has no positions) when it has this number of `places`; `spread` is the
-    standard deviation of the position of a place without a pose."""
+    """Measures of a map that the belief needs, computed when the map has `places` places: the `origin` of the belief's
+    plane (None: the map has no positions), the `scale` with the distances that count, and `spread`, the standard
+    deviation of the position of a place without a pose."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
@@ -71,8 +72,8 @@ class _Survey:
             )
 
     def is_outdated(self, index: PlaceIndex) -> bool:
-        """Return True if the map must be measured again: most places have got positions since, or there are twice as
-        many. The first few places do not show how far apart the others are."""
+        """Return True if the measures must be computed again: most places have a position now, and either they had none
+        before, or there are twice as many places. The first few places do not show how far apart the others are."""
         is_measured = self.origin is not None and len(index) < 2 * self.places
         return not is_measured and bool((~np.isnan(index.lat_deg)).mean() > _HALF)
 
@@ -116,8 +117,8 @@ class Follower:
         self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: Sureness, where: Located | None
     ) -> Followed:
         """Return the result of one look together with the flight so far; nothing is kept before `settle`. `evidence` is
-        that of the best place of the `ranking`, which `sure` turns into probabilities. `where` is the position of the
-        aircraft computed from it (None: that of the place is taken)."""
+        that of the best place of the `ranking`, and `sure` turns it into probabilities. `where` is the position of the
+        aircraft computed from the best place (None: the position of the place itself is taken)."""
         if self._survey is None or self._belief is None or self._survey.is_outdated(index):
             self._survey = _Survey(self._map, index)
             self._belief = Belief(self._survey.scale)
@@ -155,7 +156,9 @@ class Follower:
         return moved(self._elapsed_s, self._fastest_m_s, self._velocity_m_s)
 
     def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Limit a confidence over the same ground to that of the first picture there or that of this look alone."""
+        """Return `confidence`, limited if position `at` is over the same ground as the query before: repeated pictures
+        of it prove nothing new. The limit is the confidence after the first picture there or, if larger, `by_itself`,
+        that of this look alone."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence
@@ -175,7 +178,8 @@ def _on_earth(posterior: Posterior, origin: Position | None) -> Located | None:
 def _proposals(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Turn a ranking into proposals; the slots of their places, int (K,), come first."""
+    """Turn a ranking into what the query proposes to the belief. Returns the slots of the proposed places, int (K,),
+    and their proposals. `where` is as in `Follower.heard`."""
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
     covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))
@@ -203,7 +207,8 @@ def _proposals(
 
 
 def _shares(votes: Doubles) -> Doubles:
-    """Return the shares (K,) of probability of places with these votes (K,)."""
+    """Divide a probability among K places: return the share (K,) of each, with a sum of 1. `votes` (K,) are the shares
+    of regions that agree at each place (see `votes_of`)."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

@@ -69,8 +69,8 @@ class Prior:
         self._known: Hints | None = None
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame that exclude any place of the index; None if there are none, or if they are not
-        trusted now.
+        """Return the hints for a frame; None if there are none, or if hints are not trusted now. An area that contains
+        all places or none is no hint, nor is a heading if the index knows no headings.
 
         `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown.
         """
@@ -86,8 +86,9 @@ class Prior:
         return self._known if self._are_believed else None
 
     def _reach(self, now_s: float, vehicle: Vehicle | None, margin_m: float) -> Reach | None:
-        """Return the area where the aircraft must be by its last known position: that of the autopilot, if it has GPS
-        (without, it drifts, and our own fix is better), else our fix, if that is at most a minute old."""
+        """Return the area where the aircraft must be by its last known position, None if that is unknown or no speed is
+        set. The position is that of the autopilot if it has GPS (without, it drifts, and our own fix is better), else
+        our last fix if that is at most a minute old."""
         known = self._last_fix if self._last_fix and now_s - self._last_fix[1] <= _FIX_GOOD_FOR_S else None
         if vehicle and vehicle.has_gps:
             known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s

@@ -52,13 +52,13 @@ _LEAST_FOLLOWED = 0.5  # least probability by the flight so far, for a match tha
 @dataclass(frozen=True, slots=True)
 class Sureness:
     """Acceptance by confidence. `models` gives a model for each kind of evidence. A match is accepted if its confidence
-    is at least the threshold at which the share `precision` of the matches is right."""
+    is at least the model's threshold for `precision`, the share of accepted matches that must be right."""
 
     models: Mapping[str, Model]
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees as well."""
+        """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees about as well."""
         confidence = self.models[kind_of(evidence)].confidence(evidence)
         return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, _EVEN)
 
@@ -73,9 +73,14 @@ class Sureness:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptRule:
-    """Conditions for accepting a match: the least score, the least lead over the best place farther than `neighbour_m`
-    metres away, and the least quality of the query's picture. With `sure`, the confidence decides, and both limits hold
-    in addition. A match with a score below `worth_a_look` is never accepted, and its landmarks are not compared."""
+    """Conditions under which `judge` accepts a match.
+
+    * `min_score`: the least score
+    * `min_margin`: the least lead over the best place elsewhere, that is more than `neighbour_m` metres away
+    * `min_quality`: the least quality of the query's picture
+    * `sure`: the confidence needed besides (None: score and lead alone decide)
+    * `worth_a_look`: the least score at which landmarks are compared and, with `sure`, a match can be accepted
+    """
 
     min_score: float
     min_margin: float
@@ -187,7 +192,8 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
 
 
 def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | None:
-    """Return the reason if a match with this score and lead (None: no place elsewhere) fails the limits, else None."""
+    """Return the reason if a match fails the least score or the least lead of `rule`, else None. `ahead` is its lead
+    (None: there is no place elsewhere)."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
         return f"score {score:.3f} is below {least:.3f}"
@@ -199,7 +205,8 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
 
 
 def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
-    """Decide by the confidence of the match, or by the flight so far; the reason gives the figures."""
+    """Decide by the confidence of the match and, if it is known, by the probability of the place by the flight so
+    far."""
     evidence, followed, rival = findings.evidence, findings.by_flight, findings.rival
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
@@ -224,7 +231,7 @@ def is_hardly_ahead(evidence: Evidence | None) -> bool:
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:
-    """Return the reason if the landmarks show that it is another place, else None."""
+    """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
     if not proof.is_expected:
         return f"its landmarks lie otherwise than its regions: {proof.inliers} agree on another step"
     if score >= _CLEAR_SCORE and proof.inliers < _LEAST_INLIERS and proof.possible >= _LANDMARKS_ENOUGH:
@@ -233,7 +240,8 @@ def _disproves(proof: Agreement, score: float) -> str | None:
 
 
 def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | None:
-    """Return the reason if what agrees may be a display drawn over every frame, else None."""
+    """Return the reason if the best match may come from a display drawn over every frame: it shows no motion, and
+    neither does the match of a place elsewhere. Else return None."""
     best = int(ranking.slots[0])  # only a camera that looks down gives a shift: ahead, this cannot be told
     if not _is_at_rest(ranking.compared.get(best)):
         return None
@@ -255,7 +263,8 @@ def _is_at_rest(match: FineMatch | None) -> bool:
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
-    """Return the reason if the mean score of a sequence is not to be trusted, else None."""
+    """Return the reason if the mean score of a sequence is not to be trusted, else None: the newest queries no longer
+    fit, or a place elsewhere fits about as well if it is passed at another speed."""
     away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"

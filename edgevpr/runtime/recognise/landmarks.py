@@ -1,5 +1,5 @@
 """Landmarks of a picture: points that can be found again in another picture of the same ground, each described by 256
-bits. `verify` compares those of query and place.
+bits. `agreement` compares those of query and place.
 
 The points are FAST corners and the bits are ORB descriptions (Rublee et al. 2011). A place keeps few of them, spread
 over the picture. A query has more, so that most of the place's visible points are among them.
@@ -80,7 +80,8 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
 
 
 def _spread(at_px: Singles, most: int) -> Ints:
-    """Choose at most `most` points (K, 2), best first: the best of every cell, then the second best, and so on."""
+    """Choose at most `most` of the points `at_px` (K, 2), given best first, so that they spread over the picture: the
+    best of every cell of a grid, then the second best, and so on. Returns their indices in this order."""
     # Keep only the best of the points of one corner.
     _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)

@@ -24,8 +24,9 @@ _log = logging.getLogger(__name__)
 
 
 class Levelling:
-    """Levels the pictures of a camera that looks straight down, see `frames.level`; without a `lens`, they stay as they
-    are, and it is only computed by how much they look aside.
+    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` the pictures stay
+    as they are, and only the distance on the ground from the point below the camera to the picture's middle is
+    computed.
 
     `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
     (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
@@ -78,13 +79,15 @@ def levelling_of(
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled picture, if known, for the hints."""
+    """Return the frame with the heading of the top of its levelled picture, which hints compare; unchanged if it is
+    unknown."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
 def laid(frame: Frame, view: View) -> Frame:
-    """Return a frame with a position changed to what a place stores: the heading of its levelled picture and, if height
-    and heading are known, its pose and the position of the picture's middle instead of the aircraft's."""
+    """Change a frame to what a place stores. Its heading becomes that of the levelled picture. If it has a position,
+    this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
+    with a known height and heading it gets a pose."""
     frame = seen_as(frame, view)
     if frame.position and view.lean_m:
         east_m, north_m = view.lean_m

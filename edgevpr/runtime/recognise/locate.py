@@ -60,8 +60,9 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lies:
-    """Estimate of how the query lies on a place: `step` (2,) from the place's middle, right and down, as a share of its
-    longest side, with its `covariance` (2, 2); the others as in `FineMatch`."""
+    """Estimate of how the query lies on a place, which has this id, position and pose. `step` (2,) is the shift from
+    the place's middle to the query's middle, to the right and down, as a share of the place's longest side, with its
+    `covariance` (2, 2). `rotation_deg` and `height_ratio` are as in `FineMatch`."""
 
     place_id: int
     position: Position
@@ -74,8 +75,9 @@ class _Lies:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """Position of the aircraft by one place: `at_m` (2,) east and north of the best place, metres, with its covariances
-    (2, 2) `of_step` and `of_pose`."""
+    """Position of the aircraft as computed from one place (`lies`). `at_m` (2,) is metres east and north of the best
+    place. It has two covariances (2, 2): `of_step` by the errors of the match, `of_pose` by those of the place's
+    pose."""
 
     lies: _Lies
     at_m: Doubles
@@ -172,7 +174,8 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Combine positions by several places: east and north (2,) of the best place, metres, and the covariance (2, 2)."""
+    """Combine the positions computed from several places. Returns their mean (2,), metres east and north of the best
+    place, and its covariance (2, 2)."""
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:
@@ -184,7 +187,8 @@ def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
 
 
 def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
-    """Return how the query lies on a place by its match; None if the match has no shift, or the place no pose."""
+    """Return how the query lies on a place by the shift of its match, the displacement vote; None if the match has no
+    shift or rotation, or the place no pose. `cells` is as in `located`."""
     match, place = candidate.match, candidate.place
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
@@ -205,20 +209,22 @@ def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
 
 
 def _by_landmarks(best: _Lies, proof: Agreement) -> _Lies:
-    """Return how the query lies on the best place by its agreeing landmarks."""
+    """Return how the query lies on the best place by its agreeing landmarks, which replace the estimate by the
+    match."""
     covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
     step, rotation_deg = np.array(proof.shift_share), proof.rotation_deg or 0.0
     return replace(best, step=step, covariance=covariance, rotation_deg=rotation_deg, height_ratio=proof.scale)
 
 
 def _shows_the_same(lies: _Lies, best: _Lies) -> bool:
-    """Return True if both places can show the middle of the query, by the distance of their own middles."""
+    """Return True if both places can show the middle of the query: their own middles are not too far apart."""
     room_m = (lies.pose.footprint_m + best.pose.footprint_m) / 2
     return float(np.hypot(*_off_m(best.position, lies.position))) <= room_m
 
 
 def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
-    """Compute the position of the aircraft by one place; `aside` is as in `View`."""
+    """Compute the position of the aircraft from one place. `origin` is the position of the best place, and `aside` the
+    point below the aircraft in the query's picture, as in `View`."""
     pose = lies.pose
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
@@ -243,5 +249,5 @@ def _off_m(origin: Position, position: Position) -> Doubles:
 
 
 def triple(covariance: Doubles) -> Covariance:
-    """Return a covariance matrix (2, 2) as its three numbers."""
+    """Return a covariance matrix (2, 2) as (variance, covariance, variance), the inverse of `matrix_of`."""
     return float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])

@@ -194,7 +194,8 @@ class Recogniser:
         return verdict, where
 
     def _found(self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor) -> _Judged:
-        """Search for a query as expected and, if nothing is accepted, at all other heights as well."""
+        """Search for a query as expected and, if nothing is accepted, at all other heights as well. Returns what
+        `_judged` does."""
         prior, spec, search = self._prior, self.technique.spec, self.search
         height_ratio = prior.height_ratio if prior else 1.0
         if prior:
@@ -230,7 +231,9 @@ class Recogniser:
         self, event: Recognition, ranking: Ranking, looked: Verification, followed: Followed | None = None
     ) -> _Judged:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
-        flight makes another place more likely, judge that one (`followed`: the flight's result is known already)."""
+        flight makes another place more likely, judge that one (`followed`: the flight's result is known already).
+        `looked` compares the landmarks of the query. Returns the verdict, the place judged, and the aircraft's position
+        (None: unknown)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)

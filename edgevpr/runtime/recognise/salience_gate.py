@@ -54,7 +54,8 @@ class Thresholds:
 @dataclass(frozen=True, slots=True)
 class Worth:
     """Judgement of a frame. `salience` has its scores. `short_by` is how far the worst score is below its threshold (0:
-    the frame passes), `lacks` its name, and `reason` a sentence about it (both None: the frame passes)."""
+    the frame passes), `lacks` the name of this score, and `reason` a sentence about it (both None: the frame
+    passes)."""
 
     salience: Salience
     short_by: float = 0.0
@@ -123,8 +124,8 @@ def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> 
 
 
 def best_of(shortfalls: list[float]) -> list[bool]:
-    """Lower all thresholds in steps of 0.03 until some of these frames pass. Returns for each frame whether it passes
-    then; `shortfalls` are their `Worth.short_by`."""
+    """Find the best of some frames: lower all thresholds in steps of 0.03 until at least one frame passes. Returns for
+    each frame whether it passes then; `shortfalls` are the frames' `Worth.short_by`."""
     steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
     return [bool(step == steps.min()) for step in steps]
 
