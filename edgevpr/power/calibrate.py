@@ -47,8 +47,8 @@ class MeterError(EdgevprError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meter:
-    """A power meter. `look` returns watts. `certain` is False if `title` contains an assumption, such as how the meter
-    is wired."""
+    """A power meter. The function `look` reads it, in watts. `certain` is False if `title` contains an assumption, such
+    as how the meter is wired."""
 
     title: str
     look: Callable[[], float]
@@ -203,8 +203,9 @@ def hold_load(share: float) -> Iterator[None]:
 
 
 def work_a_period(share: float, work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Call `work` again and again for `share` (above 0, up to 1) of one duty period, and return the seconds to rest
-    then (0 at full load). After a last call that took longer, the rest is longer too, so that the ratio stays right."""
+    """Call `work` again and again for `share` (above 0, up to 1) of one duty period. Returns the seconds to rest
+    afterwards (0 at full load). If the last call took longer, the rest is longer too, so that the load stays
+    `share`."""
     start_s = clock()
     while clock() - start_s < share * DUTY_PERIOD_S:
         work()

@@ -45,7 +45,8 @@ def cpu(root: Path = _ROOT) -> str:
 
 
 def title(root: Path = _ROOT) -> str:
-    """Return the machine's name and processor as one text, which is always the same and so identifies the machine."""
+    """Return the machine's name and processor as one text, the same at every start, so that it identifies the
+    machine."""
     words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
     return "".join(c if c.isprintable() else " " for c in words)
 

@@ -43,8 +43,8 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
 
 
 class OwnMemory:
-    """Memory of this process: RSS, and PSS (with shared pages in proportion). PSS is read at most once in twenty
-    seconds: the kernel walks through all pages for it, which takes some hundredths of the time of a query."""
+    """Reads the memory of this process: RSS, and PSS (with shared pages in proportion). PSS is read at most once in
+    twenty seconds: the kernel walks through all pages for it, which takes some hundredths of the time of a query."""
 
     def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = machine.pss_mb) -> None:
         self._clock, self._read = clock, read
@@ -60,8 +60,9 @@ class OwnMemory:
 
 
 class QueryMeter:
-    """Meter of the steps of one query after another, and of the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) give seconds; `memory_mb` is like `OwnMemory.look` (None: that one)."""
+    """Measures the steps of one query after another, and the charge that each query draws from the pack of a board.
+    `wall_clock` and `cpu_clock` (all threads) return seconds; `memory_mb` returns what `OwnMemory.look` does (None:
+    that method is used)."""
 
     def __init__(
         self,
@@ -135,8 +136,9 @@ def query_cost(
 
 
 class RunningEnergy:
-    """Sum of the stages of a flight since it was made: `marginal_j`, joules at the board's input that they added, and
-    `stages_cpu_s`. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads."""
+    """Adds up the stages of a flight, from the creation of this object on: `marginal_j` is the energy that they added,
+    in joules at the board's input, and `stages_cpu_s` their CPU-seconds. `clock` returns wall seconds, `cpu_clock`
+    CPU-seconds of all threads."""
 
     def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
@@ -151,7 +153,7 @@ class RunningEnergy:
             self.stages_cpu_s += stage.cpu_s
 
     def process(self) -> StageCost:
-        """Return the time since the start, and the CPU time of the whole process in it."""
+        """Return the wall seconds since the creation of this object, and the whole process's CPU-seconds since."""
         return StageCost(self._clock() - self._start_s, self._cpu_clock() - self._cpu_start_s)
 
 
@@ -176,8 +178,9 @@ def machine_load() -> MachineLoad:
 
 
 class OwnLoad:
-    """Share of all `cores` that this process uses, and of its time in which other programs keep it waiting, between two
-    calls of `look`. `clock` gives wall seconds, `cpu_clock` CPU-seconds of all threads of this process."""
+    """Measures two shares between two calls of `look`: how much of all `cores` this process uses, and for how much of
+    the time other programs keep its work waiting. `clock` returns wall seconds, `cpu_clock` CPU-seconds of all threads
+    of this process."""
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
@@ -190,15 +193,17 @@ class OwnLoad:
         return self._clock() - self._looked_s
 
     def busy(self, work: StageCost) -> None:
-        """Record a piece of work. Its `cpu_s` is that of the thread that did it or waited for it
-        (`time.thread_time`)."""
+        """Record a piece of work, for `look`. Its `cpu_s` is that of the one thread (`time.thread_time`) that did the
+        work or waited for it."""
         self._busy_s += work.wall_s
         self._ran_s += work.cpu_s
 
     def look(self) -> tuple[float, float]:
-        """Return two shares since the last call, 0..1:
-        - the share of all cores that this process used;
-        - the share of the time that its recorded work took; 0 if other programs did not keep it waiting."""
+        """Return two shares of the time since the last call, 0..1:
+
+        * the share of all cores that this process used,
+        * the share of the time that its recorded work took if other programs kept this work waiting, else 0.
+        """
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
         waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s

@@ -70,7 +70,8 @@ def pass_round() -> Callable[[], object]:
 
 
 def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
-    """Return the rounds per second of one thread, and of `threads` at once; `make` returns the work of a round."""
+    """Return the calls of the work per second by one thread alone, and in total by `threads` threads at once. `make` is
+    called once for each thread and returns the function that this thread calls again and again."""
     alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))  # a slower round was disturbed by something else
     start = Barrier(threads)
     with ThreadPoolExecutor(threads) as pool:
@@ -79,7 +80,8 @@ def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[f
 
 
 def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
-    """Return the seconds of each round of `work`, after an uncounted first one and the barrier of all threads."""
+    """Call `work` again and again, and return the seconds of each call. A first call is not counted; after it, this
+    thread waits at the barrier `start` until all threads are ready."""
     work()
     start.wait()
     times_s: list[float] = []

@@ -20,8 +20,8 @@ _SLOWS = 2 | 4 | 8
 @dataclass(frozen=True, slots=True)
 class ThermalState:
     """State at one reading: `temperature_c` of the hottest CPU sensor, `frequency_mhz` of the fastest cluster of cores
-    (None: unknown), `throttled`, True if the machine slows itself down (None: it cannot tell), and `why`, the signs
-    ("": none)."""
+    (None: unknown), `throttled`, True if the machine slows itself down now (None: it cannot tell), and `why`, the signs
+    that it does or did, as text ("": none)."""
 
     temperature_c: float | None
     frequency_mhz: float | None
@@ -42,7 +42,7 @@ class ThermalWatch:
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
 
     def look(self) -> ThermalState:
-        """Read the sensors. Never raises: the value of one that has gone, or says what cannot be, is None."""
+        """Read the sensors. Never raises: a value that cannot be read, or is impossible, becomes None."""
         degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
         khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
@@ -54,7 +54,9 @@ class ThermalWatch:
         return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
 
     def _reasons(self, bits: int, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
-        """Yield (slows, what) for everything seen: True if it slows the machine down now, and a text about it."""
+        """Yield a pair for each sign that the machine slows down: True if it does so now (False: it is only a warning,
+        or over), and a text about the sign. `bits` are the flags of the firmware (0: none), `khz` is the CPU's
+        frequency now."""
         if now := [word for bit, word in _BITS if bits & bit]:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
         if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:

@@ -72,8 +72,8 @@ class QueryAnswer:
 
 
 class Walk:
-    """A recogniser that is open on a map, set up by `options`. `length` is the number of queries that are matched
-    together. `is_in_order` is True if an answer depends on the queries before it."""
+    """A recogniser that is open on a map and set up by `options`, for asking one query after another. `length` is the
+    number of queries that are matched together. `is_in_order` is True if an answer depends on the queries before it."""
 
     def __init__(
         self,

@@ -77,7 +77,7 @@ def joined(
 
 
 def names_in(folder: str | Path) -> tuple[str, ...]:
-    """Return the names of all images in a folder, in counting order."""
+    """Return the names of all images in a folder, in counting order (2.png before 10.png)."""
     return tuple(decoded_name(path.name) for path in list_images(folder))
 
 

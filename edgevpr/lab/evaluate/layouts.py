@@ -133,8 +133,9 @@ def _offsets_m(tags: Tags, origin: Position) -> Doubles:
 
 
 def _near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Doubles, rule: Nearness) -> GroundTruth:
-    """Return the ground truth of each query that has a right reference. `query_m` and `reference_m`, (N, 2), are metres
-    from a common origin. Raises UsageError where none has."""
+    """Return the ground truth: for each query with a right reference by `rule`, the names of its right references. The
+    other queries are left out. `query_m` and `reference_m`, (N, 2), are metres east and north of a common origin.
+    Raises UsageError if no query has a right reference."""
     prints = []
     if rule.overlap is not None:
         prints = [_print(*each, rule) for each in zip(references.items(), reference_m.tolist(), strict=True)]

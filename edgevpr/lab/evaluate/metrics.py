@@ -41,14 +41,14 @@ class Quality:
 
 
 def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Return the positions in `ranked`, int (K,), numbers of references, best first, of those that are not `ignored`,
-    bool (references,): where a match counts as neither right nor wrong."""
+    """Return the positions in `ranked`, int (K,), of the references that are not `ignored`. `ranked` are numbers of
+    references, best first. `ignored`, bool (references,), is True where a match counts as neither right nor wrong."""
     return np.flatnonzero(~ignored[ranked])
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Return the rank, from 0, of the first reference of `ranked`, as above, that is `right`, bool (references,);
-    infinite if none is."""
+    """Return the rank, from 0, of the first right reference; infinite if there is none. `ranked` are numbers of
+    references, best first. `right`, bool (references,), is True for those that are right."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
 

@@ -170,7 +170,8 @@ def _against(title: str, unit: str, rows: Sequence[Numbered], cost: Callable[[Me
 
 
 def _matches(dataset: Dataset, row: MeasuredRow, number: int, most: int) -> str:
-    """Return about `most` matches of a row: wrong ones, highest scores first, then right ones, lowest scores first."""
+    """Return about `most` matches of a row, with their pictures: wrong ones, highest scores first, then right ones,
+    lowest scores first. `number` sets the colour of the row's name."""
     wrong = sorted((answer for answer in row.answers if not answer.is_right), key=lambda answer: -answer.score)
     right = sorted((answer for answer in row.answers if answer.is_right), key=lambda answer: answer.score)
     shown = "".join(_match(dataset, answer) for answer in [*wrong[:most], *right[: max(1, most - len(wrong))]])

@@ -54,6 +54,6 @@ def key_of(*parts: Any) -> str:
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Return by what it is seen that a file has changed: its name, its size, and the time when it was written."""
+    """Return (name, size in bytes, time of writing in ns) of a file. If one of them differs, the file has changed."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns

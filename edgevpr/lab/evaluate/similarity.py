@@ -34,9 +34,10 @@ def read_similarities(path: str | Path) -> Doubles:
 def truth_of(
     path: str | Path, scores: Doubles, queries: Sequence[str] | None, references: Sequence[str] | None
 ) -> tuple[GroundTruth, Sequence[str] | None]:
-    """Read a ground truth (a CSV, GT.npz or ground_truth_new.npy) with an entry for each row of `scores`; return it and
-    the references, as `measure` takes them. `queries` and `references` are the names of all images, where they are
-    known. Raises UsageError if it does not fit."""
+    """Read a ground truth (a CSV, GT.npz or ground_truth_new.npy) with an entry for each row of `scores`. Returns it
+    and the names of the references that the columns stand for (None: those in the ground truth, see `measure`).
+    `queries` and `references` are the names of all images (None: unknown). Raises UsageError if the file does not
+    fit."""
     if Path(path).suffix.lower() in WHAT_IT_IS:
         rows, columns = (list(map(str, range(count))) for count in scores.shape)
         return read_numbered(Path(path), queries or rows, references or columns), references or columns

@@ -71,7 +71,8 @@ class VideoPictures:
 
 
 def _written(frames: Iterable[Frame], folder: Path) -> int:
-    """Write each frame that has a position to `folder`, as a PNG, and positions.csv with all; return how many it is."""
+    """Write each frame that has a position to `folder`, as a PNG, and a positions.csv with all frames. Returns the
+    number of PNG files."""
     tags: dict[str, GeoTag] = {}
     for frame in frames:
         # Like frame_000006_t0.240_s.png: a space would separate names in a ground truth.
@@ -96,8 +97,8 @@ def _frames(source: Source) -> Iterator[Frame]:
 
 
 def without_position(folder: Path) -> tuple[int, int]:
-    """Return, from the folder of a video's pictures, two counts: frames that have no position, and so no picture;
-    all frames."""
+    """Return two counts of frames, by the positions.csv in the folder of a video's pictures: those without a position,
+    which have no picture, and all frames."""
     tags = read_positions(folder / _POSITIONS)
     return sum(tag.position is None for tag in tags.values()), len(tags)
 

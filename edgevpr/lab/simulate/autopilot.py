@@ -1,5 +1,6 @@
 """A simulated autopilot at the other end of a MAVLink link, as strict as a real one: `FlightController` connected to a
-port and to the clock. Used by `edgevpr simulate` and by tests."""
+port and to the clock. Used by `edgevpr simulate` and by tests. A *companion* is an onboard computer, such as the one
+that runs edgevpr."""
 
 import logging
 import select
@@ -27,9 +28,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSummary:
-    """Everything that the simulated autopilot received. `messages` counts them by name. `companion` is the last onboard
-    computer heard, as "system/component" (None: none). `fixes_failed` came at a time when none is accepted, as while
-    there is GPS; `fixes_denied` had a wrong form; `fixes` are the accepted ones."""
+    """Everything that the simulated autopilot received. `messages` counts them by name. `companion` is the last
+    companion heard, as "system/component" (None: none). `fixes_failed` counts fixes that came at a time when none is
+    accepted, as while there is GPS; `fixes_denied` counts those with a wrong form; `fixes` are the accepted ones."""
 
     messages: dict[str, int]
     companion: str | None
@@ -62,10 +63,10 @@ def run_autopilot(
     """Simulate an autopilot at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost. Its UTC is that of
     this machine.
 
-    With a `track` the vehicle flies along it from the first message of a companion that is more than a question, and
-    stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS, and accepts no
-    fix. `parameters` (name to value as text) are set before the start. Raises LinkError if the link cannot be opened,
-    UsageError for an unknown vehicle or parameter, and for a wrong value.
+    With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
+    information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
+    and accepts no fix. `parameters` (name to value as text) are set before the start. Raises LinkError if the link
+    cannot be opened, UsageError for an unknown vehicle or parameter, and for a wrong value.
     """
     motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
@@ -75,7 +76,7 @@ def run_autopilot(
 
 
 def serve(controller: FlightController, link_url: str, stop: threading.Event | None = None) -> AutopilotSummary:
-    """Connect `controller` to `link_url` until the same events as in `run_autopilot`; return what it received."""
+    """Connect `controller` to `link_url` until one of the events that end `run_autopilot`; return what it received."""
     address = parse_link(link_url)
     try:
         transport = open_port(address)
@@ -95,7 +96,7 @@ def serve(controller: FlightController, link_url: str, stop: threading.Event | N
 
 
 class _Conversation:
-    """The link of a simulated autopilot: sends its messages, passes on and counts those received."""
+    """Connects a `FlightController` to a port: sends its messages, and passes on and counts those received."""
 
     def __init__(self, transport: Port, controller: FlightController) -> None:
         self._transport, self._controller = transport, controller
@@ -133,8 +134,9 @@ class _Conversation:
         )
 
     def _take(self, message: Message) -> None:
-        """Count a message, start the track if it is more than a question, and answer the last companion heard or,
-        before there is one, any sender of heartbeats."""
+        """Count a received message, and start the motion along the track if a companion does more than ask for
+        information. Choose the receiver of the answers: the last companion heard or, before there is one, any sender of
+        heartbeats."""
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256

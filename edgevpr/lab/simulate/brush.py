@@ -115,7 +115,7 @@ def roof(
 
 
 def crown(rng: np.random.Generator, radius_px: int) -> Singles:
-    """Make the dome of one tree, float32 (2 `radius_px` + 1,) * 2 in 0..1.2, and 0 outside of its ragged outline."""
+    """Make the dome of one tree, float32 (D, D), D = 2 `radius_px` + 1: 0..1.2, and 0 outside of its ragged outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
     lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
@@ -125,7 +125,7 @@ def crown(rng: np.random.Generator, radius_px: int) -> Singles:
 
 
 def stand(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
-    """Paint one tree, a `crown` that rises to `top_m` metres. Where crowns overlap, the higher one is seen."""
+    """Paint one tree, a `dome` made by `crown`, `top_m` metres high. Where crowns overlap, the higher one is seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
     if not (radius <= column < canvas.shape[1] - radius and radius <= row < canvas.shape[0] - radius):
@@ -156,7 +156,8 @@ def parcels(
     rng: np.random.Generator, width_m: float, depth_m: float, field_m2: float
 ) -> tuple[list[Doubles], list[tuple[int, Doubles]]]:
     """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns the pieces, convex
-    polygons (N, 2), and the cuts as (level, its two ends): 0 crosses all the land, 1 its halves, and so on."""
+    polygons (N, 2), and the cuts, each as a level and its two ends (2, 2): a cut of level 0 crosses all the land, one
+    of level 1 a half of it, one of level 2 a quarter, and so on."""
     fields, cuts = [], []
     todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
     while todo:
@@ -181,7 +182,7 @@ def longest_side(polygon: Doubles) -> Doubles:
 
 
 class Bend:
-    """Bends straight lines by about `by_m` metres. Points near each other move alike."""
+    """Function object that bends straight lines by about `by_m` metres. Points near each other move alike."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
@@ -210,7 +211,8 @@ def _area_m2(polygon: Doubles) -> float:
 
 
 def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Cut a convex polygon by the line through `through` at right angles to `across`: its halves, the cut's ends."""
+    """Cut a convex polygon along the line that passes `through` a point, at right angles to the vector `across`.
+    Returns its two halves, and the two ends of the cut (2, 2)."""
     side = (piece - through) @ across
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []

@@ -41,8 +41,9 @@ class ReceivedFix:
 
 class FlightController:
     """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
-    start. `start_utc_s` is its UTC at the start, seconds since 1970. `fixes` are the accepted ones, `answers` what it
-    said to each (a MAV_RESULT), `reports` the messages that it can make, by number."""
+    start. `start_utc_s` is its UTC at the start, seconds since 1970. `fixes` are the accepted fixes, `answers` the
+    reply (a MAV_RESULT) to each fix received, and `reports` the functions that make its messages, by message number.
+    `brain` is the simulated firmware."""
 
     def __init__(
         self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
@@ -80,7 +81,7 @@ class FlightController:
         self.brain.parameters.set(name, value)
 
     def begin(self) -> None:
-        """Note that a companion in flight has been heard. The first call starts the motion along the track."""
+        """Note that an onboard computer in flight has been heard. The first call starts the motion along the track."""
         if not self._has_begun:
             self._has_begun = True
             self.brain.motion.begin(self.brain.now_s)
@@ -122,7 +123,7 @@ class FlightController:
         return []
 
     def _obey(self, command: Message) -> tuple[int, list[Message]]:
-        """Obey a command; return the result (MAV_RESULT) and what else is said."""
+        """Obey a command. Returns the result (MAV_RESULT) and the messages to send after it."""
         number = int(command.param1) if math.isfinite(command.param1) else -1
         is_known = number in self.reports or number in SILENT
         match command.command:

@@ -87,9 +87,9 @@ class JudgedAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSummary:
-    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log, and `used_mah`
-    and `marginal_mah` the charge of the flight and of its recognising. `heard` is the summary of the simulated flight
-    controller, by the names of `AutopilotSummary`."""
+    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log. `used_mah` is
+    the charge of the whole flight, `marginal_mah` the part of it that recognising added. `heard` is the summary of the
+    simulated flight controller, by the names of `AutopilotSummary`."""
 
     places: int
     answers: list[JudgedAnswer]

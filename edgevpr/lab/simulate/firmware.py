@@ -30,8 +30,8 @@ _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_
 
 
 class Firmware(ABC):
-    """The position estimator of a vehicle, and all that edgevpr reads which depends on it. It flies no mode and has no
-    failsafe: what a pilot would see, edgevpr does not. The estimate is kept as its error against the truth, `error_m`
+    """The position estimator of a vehicle, and all that edgevpr reads which depends on it. Flight modes and failsafes
+    are not simulated, since edgevpr does not see them. The estimate is kept as its error against the truth, `error_m`
     (complex), the growth of that error, `drift_m_s`, and `sd_m`, the standard deviation that the estimator assumes."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
@@ -115,8 +115,9 @@ class Firmware(ABC):
         self.sd_m = max(_LEAST_SD_M, sd_m)
 
     def _fuse(self, measured: PositionMeasurement, wind_m_s: complex, reset_after_s: float) -> bool:
-        """Fuse a measurement that is within the gate; reset the position to one outside of it if none was within for
-        `reset_after_s` seconds. Returns True in both cases; then the filter also learns the true `wind_m_s`."""
+        """Fuse a measured position that is within the gate, `GATE_SD` standard deviations of the estimate. Reset the
+        estimate to one outside of the gate if none was within it for `reset_after_s` seconds. Returns True in both
+        cases; then the filter also learns the true `wind_m_s`, complex."""
         innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg)
         self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, measured.sd_m))
         if self.test_ratio <= 1:

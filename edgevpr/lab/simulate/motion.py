@@ -44,7 +44,7 @@ class Motion:
     is_known = False
 
     def begin(self, now_s: float) -> None:
-        """Note that at `now_s` a companion in flight was first heard."""
+        """Note that at `now_s` an onboard computer in flight was first heard."""
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move for `dt_s` seconds, up to `now_s`, and return the state then."""
@@ -52,7 +52,7 @@ class Motion:
 
 
 class AlongTrack(Motion):
-    """A vehicle that flies along a track once a companion in flight is heard, stays at its end, and obeys nothing."""
+    """A vehicle that flies along a track once an onboard computer is heard. It stays at the end and obeys nothing."""
 
     is_known = True
 

@@ -28,9 +28,10 @@ _FARTHEST = 3.0  # heights from the point below the camera to a corner of its pi
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list[GeoTag]:
-    """Read a track. A positions.csv gives a picture for each line with a position, a mission file one `every_m` along
-    its waypoints; each has a height above the ground, `height_m` if it is not None, a heading and a time. Raises
-    UsageError for a track that cannot be read, or has no height or no picture."""
+    """Read a track as the pictures to take along it. A positions.csv gives a picture for each line with a position, a
+    mission file one every `every_m` metres along its waypoints. Each picture gets a height above the ground (`height_m`
+    if it is not None, else that of the track), a heading and a time. Raises UsageError for a track that cannot be read,
+    or has no height or no picture."""
     if Path(path).suffix.lower() == ".csv":
         shots = [tag for tag in read_positions(path).values() if tag.position]
     else:
@@ -69,8 +70,8 @@ def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
 
 
 def poses_of(shots: list[GeoTag], seed: int) -> list[CameraPose]:
-    """Return the pose of the camera for each picture, with 0 m east and north. Where the track has neither roll nor
-    pitch, they vary slowly by up to 2 degrees, and so does the heading."""
+    """Return the pose of the camera for each picture, placed at 0 m east and north. Where the track has neither roll
+    nor pitch, both vary slowly by up to 2 degrees, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
     sways = _SWAY_DEG * np.stack([wander(rng, len(shots)) for _ in range(3)])
     poses = []

@@ -1,5 +1,5 @@
-"""The messages in which a simulated autopilot reports its state: one function for each, from a `Firmware` to the
-message, or None if there is nothing to report. `SILENT` are messages that exist but are never sent. Used by
+"""The messages in which a simulated autopilot reports its state: one function for each, from a `Firmware` (`brain`) to
+the message, or None if there is nothing to report. `SILENT` are messages that exist but are never sent. Used by
 `controller`."""
 
 import math

@@ -51,7 +51,7 @@ class Encoder(nn.Module):
         return _response_normalised(functional.max_pool2d(x, 3, 2, ceil_mode=True))
 
     def code(self, features: torch.Tensor) -> torch.Tensor:
-        """Compute the input of the decoder, (N, 4, 14, 19): the descriptor before it is flat and of length 1."""
+        """Compute the decoder's input, (N, 4, 14, 19): the descriptor before it is flattened and scaled to length 1."""
         return functional.relu(self.norm3(self.conv3(features)))
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -19,7 +19,7 @@ _MOST_IMAGES = 200
 @dataclass(frozen=True, slots=True)
 class Quantised:
     """Result of quantising a network: the path of the new card, the number of images used for calibration, and the
-    trials of both networks on this machine."""
+    results of trying the network on this machine `before` and `after`."""
 
     card: str
     images: int

@@ -145,7 +145,9 @@ def _gathered(
     rng: np.random.Generator,
     unusable: list[ImageError],
 ) -> tuple[Singles, int]:
-    """Collect about `wanted` of the rows that `described` yields, and count the pictures."""
+    """Collect descriptors of the pictures in `folders`: from each array (n, D) that `described` yields for a picture,
+    so many random rows that all pictures give about `wanted`. Returns them, float32 (N, D), and the number of
+    pictures."""
     share = int(-(-wanted // sum(len(list_images(name)) for name in folders)))
     pictures, points = 0, [np.empty((0, 1), np.float32)]
     for pictures, picture in enumerate(read_pictures(folders, "describing", unusable), start=1):  # noqa: B007
@@ -194,7 +196,7 @@ def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -
 
 
 def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
-    """Find, for each point, the number of its nearest centre, int (N,), and the square of its distance, float32."""
+    """Find the nearest centre of each point. Returns its number, int (N,), and its squared distance, float32 (N,)."""
     numbers = np.empty(len(points), np.intp)
     distance = np.empty(len(points), np.float32)
     half_squares = 0.5 * np.einsum("kd,kd->k", centres, centres)

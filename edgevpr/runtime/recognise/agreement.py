@@ -60,8 +60,7 @@ class Overlay:
 
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
-    """Return how one place lies on another, given `one` and `other`, the overlays of the same query on these two
-    places."""
+    """Return how one place lies on another, given the overlays `one` and `other` of the same query on these places."""
     turn_scale = _turn_scale(other) / _turn_scale(one)
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
@@ -166,8 +165,7 @@ def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
 
 
 class Verification:
-    """Compares the landmarks of one query with those of places. The query's landmarks are computed when first
-    needed."""
+    """Compares the landmarks of one query, which are computed when first needed, with those of places."""
 
     def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._spec, self.picture = spec, picture
@@ -300,8 +298,7 @@ def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tupl
 
 
 def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
-    """Return the way that lays the query's points `asked` over the place's points `known`, complex (n,) each, by least
-    squares."""
+    """Return the way that lays `asked` of the query over `known` of the place, complex (n,) each, by least squares."""
     middle, there = asked.mean(), known.mean()
     spread = np.vdot(asked - middle, asked - middle).real
     turn_scale = np.vdot(asked - middle, known - there) / spread if spread > 0 else 1.0 + 0j

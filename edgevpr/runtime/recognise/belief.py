@@ -316,8 +316,7 @@ def _firm(covariance: Doubles, least: float) -> Doubles:
 
 
 def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
-    """Combine K positions with K others, whose errors are related, by covariance intersection (Julier, Uhlmann
-    1997)."""
+    """Combine K positions and K others of related errors by covariance intersection (Julier and Uhlmann 1997)."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
     by_one, by_other = share * np.linalg.inv(of_one), (1 - share) * np.linalg.inv(of_other)

@@ -205,8 +205,7 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
 
 
 def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
-    """Decide by the confidence of the match and, if it is known, by the probability of the place by the flight so
-    far."""
+    """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
     evidence, followed, rival = findings.evidence, findings.by_flight, findings.rival
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")

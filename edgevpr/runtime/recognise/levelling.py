@@ -79,7 +79,7 @@ def levelling_of(
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled picture, which hints compare; unchanged if it is
+    """Return the frame with the heading of the top of its levelled picture, for the hints; unchanged if it is
     unknown."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 

@@ -209,8 +209,7 @@ def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
 
 
 def _by_landmarks(best: _Lies, proof: Agreement) -> _Lies:
-    """Return how the query lies on the best place by its agreeing landmarks, which replace the estimate by the
-    match."""
+    """Return `best`, how the query lies on the best place, corrected by its agreeing landmarks (`proof`)."""
     covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
     step, rotation_deg = np.array(proof.shift_share), proof.rotation_deg or 0.0
     return replace(best, step=step, covariance=covariance, rotation_deg=rotation_deg, height_ratio=proof.scale)

@@ -194,8 +194,8 @@ class Recogniser:
         return verdict, where
 
     def _found(self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor) -> _Judged:
-        """Search for a query as expected and, if nothing is accepted, at all other heights as well. Returns what
-        `_judged` does."""
+        """Search for a query as expected and, if nothing is accepted, at all other heights. Returns as `_judged`
+        does."""
         prior, spec, search = self._prior, self.technique.spec, self.search
         height_ratio = prior.height_ratio if prior else 1.0
         if prior:
