@@ -25,17 +25,13 @@ from edgevpr.cli.shared import (
     positive,
     show,
 )
+from edgevpr.cli.wording import of_check, of_info, of_made, of_refined
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import Cuttings, FlownPictures
 
-_WITHOUT_POSITIONS = (
-    "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
-    "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
-    "video, give --positions with time,lat,lon, in seconds from its first frame"
-)
 _OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "margin_m")
 _OF_A_RECORDING = ("positions", "rate_hz")
 
@@ -142,9 +138,7 @@ def map_build(args: Namespace) -> int:
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
     more |= {} if made.without_data is None else {"without_data": made.without_data}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
-    show({**about, **asdict(made.result), **more}, args.json)
-    if made.places and not made.with_position and not args.json:
-        print(f"{args.map}: {_WITHOUT_POSITIONS}")
+    show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made))
     return exit_code(unusable)
 
 
@@ -156,7 +150,7 @@ def map_refine(args: Namespace) -> int:
 
     with PlaceMap.open_for_adding(args.map) as place_map:
         refined = refine_map(place_map, technique_of(place_map), args.images, progress)
-    show({"map": args.map, **asdict(refined)}, args.json)
+    show({"map": args.map, **asdict(refined)}, args.json, of_refined(args.map, refined))
     return 0
 
 
@@ -169,7 +163,7 @@ def map_calibrate(args: Namespace) -> int:
     config, pictures = config_of(args, args.config), _pictures(args)
     with PlaceMap.open_for_adding(args.map) as place_map:
         found = calibrate_map(place_map, technique_of(place_map), config, pictures, progress)
-    show({"map": args.map, "calibration": found.figures()}, args.json)
+    show({"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"])
     return 0
 
 
@@ -183,11 +177,13 @@ def map_info(args: Namespace) -> int:
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
     each_bytes = bytes_per_place(info.spec)
-    known: dict[str, Any] = {"calibration": calibration.figures() if calibration else None}
-    if calibration is None and info.spec.name == WITH_CONFIDENCE:
-        known["confidence"] = not_calibrated(info.places)
+    if calibration:
+        confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
+    else:
+        confidence = not_calibrated(info.places) if info.spec.name == WITH_CONFIDENCE else None
     ram_mb = info.places * each_bytes / 1e6
-    show({**asdict(info), **known, "bytes_per_place": each_bytes, "ram_mb": ram_mb}, args.json)
+    known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
+    show({**asdict(info), **known, "ram_mb": ram_mb}, args.json, of_info(info, confidence, ram_mb))
     return 0
 
 
@@ -196,7 +192,7 @@ def map_check(args: Namespace) -> int:
     from edgevpr.places.examine import check
 
     found = check(args.map, partial(progress, label="checking"))
-    show({**asdict(found), "is_whole": found.is_whole}, args.json)
+    show({**asdict(found), "is_whole": found.is_whole}, args.json, of_check(found))
     return 0 if found.is_whole else 1
 
 
@@ -205,7 +201,7 @@ def map_repair(args: Namespace) -> int:
     from edgevpr.places.examine import check, repair
 
     found = check(args.map, partial(progress, label="checking"))
-    show(found, as_json=False)
+    show(found, False, of_check(found))
     if found.is_whole:
         print("nothing is damaged: the map is as it was")
         return 0

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.shared import add_json, command, exit_code, group, path_of, show
+from edgevpr.cli.wording import of_networks
 from edgevpr.core.errors import EdgevprError, ImageError, ModelError
 from edgevpr.core.text import progress
 
@@ -91,8 +92,8 @@ def models_list(args: Namespace) -> int:
     from edgevpr.core.files import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
-    folders = [str(folder) for folder in model_folders()]
-    show({"folders": folders, "networks": [asdict(each) for each in list_models()]}, args.json)
+    found = list_models()
+    show([asdict(each) for each in found], args.json, of_networks(found, list(map(str, model_folders()))))
     return 0
 
 

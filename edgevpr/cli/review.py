@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, path_of, show, write_out
+from edgevpr.cli.wording import of_replay, of_what_if
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.text import waiting
 
@@ -111,11 +112,13 @@ def run_replay(args: Namespace) -> int:
     waiting("")
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
     if args.config:
-        show({**beside(flight.lines, again.lines), **end}, args.json)
+        found = beside(flight.lines, again.lines)
+        show({**found, **end}, args.json, of_what_if(found, again.why_ended))
         return 0
     lines, packets = compare(flight.lines, again.lines), again.packets
     is_same = not (lines.others or packets.others or packets.renumbered)
-    show({"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}, args.json)
+    value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
+    show(value, args.json, of_replay(again, lines, packets))
     return 0 if is_same else 1
 
 

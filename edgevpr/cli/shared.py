@@ -3,7 +3,7 @@
 import json
 import sys
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -121,14 +121,14 @@ def exit_code(unusable: list[ImageError]) -> int:
     return 1 if unusable else 0
 
 
-def show(value: Any, as_json: bool, text: str | None = None) -> None:
-    """Print a result, a dataclass or a dictionary: as JSON for programs, or for people as `text` (None: a line for each
-    field)."""
+def show(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> None:
+    """Print a result, a dataclass or a dictionary: as JSON for programs, or for people as `text`, whole or in lines of
+    which control characters are escaped (None: a line for each field)."""
     fields = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
     if as_json:
         print(json.dumps(fields, indent=2, default=str))
     else:
-        print("\n".join(map(shown, lines_of(fields))) if text is None else text)
+        print(text if isinstance(text, str) else "\n".join(map(shown, lines_of(fields) if text is None else text)))
 
 
 def lines_of(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
@@ -153,7 +153,7 @@ def _worded(value: Any) -> str:
         return ", ".join(map(_worded, value))
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def report(*sentences: str) -> None:

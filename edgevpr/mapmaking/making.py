@@ -206,8 +206,11 @@ def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None) -> tupl
     camera = "nadir" if is_cut else camera
     source = order.pictures.open()
     name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS if is_cut else None)
-    name = name or picked_technique(order.board, source.total or 1, camera)
-    settings = order.parameters | camera_setting(name, camera)
+    if name is None or is_cut:
+        name = name or picked_technique(order.board, source.total or 1, camera)
+        settings = order.parameters | camera_setting(name, camera)
+    else:  # a technique that knows no camera refuses one that was asked for
+        settings = order.parameters | ({"camera": camera} if camera else {})
     if place_map is not None:  # one without places is false
         return source, technique_of(place_map, order.technique, settings, here)
     return source, made_for(here.threads, name, settings)

@@ -77,7 +77,7 @@ def calibration_in(path):
 def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert built(path, flight / "ref") == 0
-    assert f"calibration:\n  made               {(found := calibration_in(path)).made}" in capsys.readouterr().out
+    assert f"expect: {(found := calibration_in(path)).described()}\n" in capsys.readouterr().out
     assert built(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
@@ -86,11 +86,11 @@ def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, c
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES + 1)
     assert built(tmp_path / "small.gpkg", flight / "ref") == 0
     assert f"it has {PLACES} places" in caplog.text
-    assert "calibration:" not in capsys.readouterr().out
+    assert "expect:" not in capsys.readouterr().out
     monkeypatch.setitem(sys.modules, "edgevpr.mapmaking.calibrate", None)  # as where SciPy is missing
     assert built(tmp_path / "bare.gpkg", flight / "ref") == 0
     assert "SciPy" in caplog.text
-    assert f"added              {PLACES}\n" in capsys.readouterr().out
+    assert f" {PLACES} places added" in capsys.readouterr().out
 
 
 def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, capsys):
@@ -106,7 +106,7 @@ def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, 
 def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
     found = calibration_in(bare)
-    assert found.made in capsys.readouterr().out
+    assert found.described() in capsys.readouterr().out
     assert main(["map", "info", str(bare), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 

@@ -59,7 +59,7 @@ def test_map_info_tells_what_is_inside(capsys, valley):
     assert info["places"] == info["with_position"] == 6
     assert info["spec"]["name"] == "cohog"
     assert main(["map", "info", str(valley)]) == 0
-    assert "with position      6\n" in capsys.readouterr().out
+    assert " 6 places, 6 with a position\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, ca
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
-    assert "is whole           yes" in said.out
+    assert said.out.splitlines()[1:] == ["  SQLite      the file is sound", "  checksums   all match"]
     assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
     assert "nothing" in capsys.readouterr().out
@@ -76,7 +76,7 @@ def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, caps
     damage(valley, *DAMAGE)
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 1
-    assert "damaged            4, its heading_deg is 'north'" in capsys.readouterr().out.splitlines()
+    assert "  damaged     place 4: its heading_deg is 'north'" in capsys.readouterr().out.splitlines()
     assert main(["map", "check", str(valley), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert (found["places"], found["is_whole"]) == (4, False)

@@ -85,7 +85,7 @@ def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of
     assert built["not_memorable"] == {"entropy": 30 - len(low)}
     capsys.readouterr()
     assert main(["map", "info", str(place_map)]) == 0
-    assert f"of low quality     {len(low)}\n" in capsys.readouterr().out
+    assert f"  salience    {len(low)} of low quality" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -117,8 +117,8 @@ def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
     main(["map", "refine", str(map_path)])
     assert positions() == first
     said = capsys.readouterr().out
-    assert "refined            28\n" in said
-    assert "contradictory      10, 009.jpg, 2" in said
+    assert "28 of 28 places refined" in said
+    assert "place 10 (009.jpg): recorded 2" in said
 
 
 def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
@@ -160,13 +160,13 @@ def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir"]
     assert main(["map", "build", str(path), *flags]) == 0
-    assert "  refined            28\n" in capsys.readouterr().out
+    assert "28 of 28 places refined" in capsys.readouterr().out
     with PlaceMap.open(path) as place_map:
         poses = [place.pose for place in place_map.places()]
     assert [pose.footprint_m for pose in poses] == pytest.approx([FOOTPRINT_M] * 28, rel=0.15)
     assert all(pose.recorded for pose in poses)
     assert main(["map", "info", str(path)]) == 0
-    assert "with pose          28\n" in capsys.readouterr().out
+    assert "  pose        of 28 places" in capsys.readouterr().out
 
 
 def some_of(built, path, numbers, position=lambda number, place: place.position):

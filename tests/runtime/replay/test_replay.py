@@ -191,10 +191,10 @@ def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_pat
     ended(fly(*QUICK))
     log = str(tmp_path / "flight.jsonl")
     assert main(["replay", log]) == 0
-    assert "is same            yes" in capsys.readouterr().out
+    assert " lines are the same, 0 differ" in capsys.readouterr().out
     monkeypatch.setattr("edgevpr.runtime.recognise.recognition.round", lambda value, digits=0: 7.0, raising=False)
     assert main(["replay", log]) == 1
-    assert "    score " in capsys.readouterr().out
+    assert ": score was " in capsys.readouterr().out
     assert main(["replay", log, "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert len(found["lines"]["others"]) == PLACES
@@ -243,7 +243,7 @@ def test_what_if_the_map_or_the_technique_were_another_or_more_precision_asked(f
     assert found["summary"]["accepted"] == [PLACES, 0]
     config.write_text(f"technique: hog\nmap: {recording / 'hog.gpkg'}\n")
     assert main(["replay", log, "--config", str(config)]) == 0
-    assert f"queries            {PLACES}, {PLACES}" in capsys.readouterr().out
+    assert f"{PLACES} of {PLACES} queries end alike" in capsys.readouterr().out
     config.write_text("match: {accept_precission: 0.9}\n")
     assert main(["replay", log, "--config", str(config)]) == 2
     assert "`accept_precision`" in capsys.readouterr().err

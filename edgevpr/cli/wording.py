@@ -1,0 +1,160 @@
+"""Texts of the results that people read most: of making and checking maps, of replays, and of networks. Each
+function returns the lines of one result; JSON has the same values by their names (see `show`)."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.core.text import aligned, shown
+
+if TYPE_CHECKING:
+    from edgevpr.mapmaking.making import MadeMap
+    from edgevpr.mapmaking.refine import Refined
+    from edgevpr.places.examine import MapCheck
+    from edgevpr.places.mapinfo import MapInfo
+    from edgevpr.review.compare import Difference, Lines, Packets
+    from edgevpr.review.replay import Replayed
+    from edgevpr.runtime.preflight.networks import Listed
+
+WITHOUT_POSITIONS = (
+    "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
+    "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
+    "video, give --positions with time,lat,lon, in seconds from its first frame"
+)
+_SHOWN = 20  # differences of a replay at most
+
+
+def of_made(path: str, made: "MadeMap") -> Iterator[str]:
+    """Yield what `map build` has made, and what to expect of the map."""
+    result = made.result
+    yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all"
+    if result.already_here:
+        yield f"  {result.already_here} images were in the map already"
+    if result.not_memorable:
+        lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
+        yield f"  left out: {lacking}"
+    if made.without_data is not None:
+        yield f"  left out: {made.without_data} for want of data, {result.says_nothing} for want of texture"
+    if result.of_low_quality:
+        yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
+    if made.refined:
+        yield from of_refined(path, made.refined)
+    if made.calibration:
+        yield f"expect: {made.calibration.described()}"
+    if made.places and not made.with_position:
+        yield f"{path}: {WITHOUT_POSITIONS}"
+
+
+def of_refined(path: str, refined: "Refined") -> Iterator[str]:
+    """Yield where the pictures of a map were found to lie."""
+    if refined.without_position == refined.places:
+        yield "  not refined: no place has a position"
+        return
+    yield f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures"
+    if refined.footprint_m:
+        moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
+        yield f"  position    {moved}; as recorded they scatter by {refined.recorded_sd_m:.1f} m"
+        yield f"  footprint   {refined.footprint_m:.0f} m (median)"
+    if refined.surveyed:
+        yield f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are"
+    if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
+        yield f"  not tied    {not_tied} stay where they were recorded: a fix there is as fine as the spacing"
+    if refined.without_position:
+        yield f"  no position {refined.without_position} places"
+    for place_id, image, off_m in refined.contradictory:
+        yield f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies"
+
+
+def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
+    """Yield what a map holds. `confidence` says how sure its matches can be (None: they are judged by fixed limits)."""
+    spec = info.spec
+    settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
+    yield f"{info.path}: {info.places} places, {info.with_position} with a position"
+    yield f"  technique   {spec.name} ({settings})" + (f", model {spec.model_sha256}" if spec.model_sha256 else "")
+    if info.extent:
+        south, west, north, east = info.extent
+        yield f"  extent      {south:.6f}..{north:.6f} north, {west:.6f}..{east:.6f} east"
+    if info.first_time:
+        yield f"  time        {info.first_time} to {info.last_time}"
+    if info.mean_quality is not None:
+        yield f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)"
+    if info.with_pose:
+        seen = f"a picture shows {info.footprint_m:.0f} m of ground along its longest side"
+        yield f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; {seen}"
+    if info.of_low_quality:
+        yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
+    if confidence:
+        yield f"  confidence  {confidence}"
+    yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})"
+
+
+def of_check(found: "MapCheck") -> Iterator[str]:
+    """Yield what is damaged in a map."""
+    yield f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read"
+    yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
+    yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
+    lacking = f"{found.without_checksums} places lack some: damage of those cannot be seen"
+    yield f"  checksums   {lacking if found.without_checksums else 'all match'}"
+
+
+def of_networks(found: Sequence["Listed"], folders: list[str]) -> Iterator[str]:
+    """Yield the networks on this machine: what each is, and what uses it, or why it cannot be used."""
+    for each in found:
+        yield f"{each.name:<20} {'WRONG' if each.problem else 'ok   '}  {each.title or ''}"
+        if each.title:
+            unused = f"none, unless told: --param model={each.name}"
+            yield f"{'':<27} {each.licence}; {each.source}"
+            yield f"{'':<27} {each.file}; {' and '.join(each.outputs)}"
+            yield f"{'':<27} used by {', '.join(each.techniques) or unused}"
+        if each.problem:
+            yield f"{'':<27} {each.problem}"
+    yield f"{len(found)} networks in {' and '.join(folders)}"
+
+
+def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
+    """Yield how a replay differs from its flight."""
+    yield from _first([*(text for each in lines.others for text in _of_line(each)), *packets.others])
+    for name, (then, now) in lines.program.items():
+        yield f"The program differs: {name} was {then}, is {now}"
+    yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
+    yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
+    renumbered = f", {packets.renumbered} but for their number" if packets.renumbered else ""
+    yield f"MAVLink  {packets.alike} packets are the same{renumbered}, {len(packets.others)} differ"
+    if again.guessed:
+        yield f"This edgevpr asks {again.guessed} times for something else than the one that flew: its costs differ."
+    if again.why_ended:
+        yield f"The replay ends before the flight: {again.why_ended}; {lines.after} lines come after it."
+
+
+def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
+    """Yield how a flight ends with another configuration. `found` is the result of `beside`."""
+    others = found["queries"]
+    yield from _first([f"{each['query']}: {_said(each['then'])}; what if: {_said(each['now'])}" for each in others])
+    values = [["-" if each is None else str(each) for each in both] for both in found["summary"].values()]
+    names = (name.removesuffix("_m").replace("_", " ") + ", m" * name.endswith("_m") for name in found["summary"])
+    yield from aligned([("", "flight", "what if"), *((name, *each) for name, each in zip(names, values, strict=True))])
+    apart_m = found["apart_at_most_m"]
+    largest = "" if apart_m is None else f", their positions at most {apart_m:.1f} m apart"
+    yield f"{found['alike']} of {found['alike'] + len(others)} queries end alike{largest}"
+    if why_ended:
+        yield f"It ends before the flight: {why_ended}."
+
+
+def _first(texts: list[str]) -> list[str]:
+    more = [f"... and {len(texts) - _SHOWN} more (--json has all)"] if len(texts) > _SHOWN else []
+    return texts[:_SHOWN] + more
+
+
+def _of_line(difference: "Difference") -> list[str]:
+    where = f"{difference.t_mono_s:.3f} s, {difference.query or difference.kind}"
+    if difference.only_in:
+        return [f"{where}: only in the {difference.only_in}"]
+    return [f"{where}: {name} was {then}, is {now}" for name, (then, now) in difference.fields.items()]
+
+
+def _said(query: dict[str, Any] | None) -> str:
+    if query is None:
+        return "no query"
+    if not query["accepted"]:
+        return f"refused ({query['reason']})"
+    sure = "" if query["confidence"] is None else f" with {query['confidence']:.4f}"
+    return f"place {query['place']} accepted{sure}"
