@@ -185,7 +185,7 @@ def _measured(row: RowOnSet, workers: int) -> str | None:
 
 
 def _kept(row: RowOnSet, was_kept: bool) -> MeasuredRow:
-    """Read the result of a row on a set from its file."""
+    """Read the result of a row on a set from its file; `was_kept` tells whether an earlier run made it."""
     content = json.loads(row.path.read_text("utf-8"))
     return MeasuredRow(
         set_name=row.set_name,

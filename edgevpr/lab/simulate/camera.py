@@ -93,7 +93,8 @@ def lit(scene: Scene, light: Light, seed: int) -> Image:
 
 
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
-    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun."""
+    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun. `towards_sun`
+    (column, row) is the step of one pixel towards the sun, and `steepness` the tangent of its elevation."""
     # The sunlight of (x, y) is blocked if, for any k, the height k pixels towards the sun less k * drop exceeds that of
     # (x, y). The maximum over 2k pixels comes from those over the first and the next k: eight passes look 256 far.
     drop_cm = 100 * scene.metres_per_pixel * steepness

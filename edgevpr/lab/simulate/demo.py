@@ -55,9 +55,9 @@ _LEGEND = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedAnswer:
-    """One query: `at`, where it was taken, and `named`, the place that was recognised. Distances from `at` in metres:
-    `error_m` to that place, `nearest_m` to the nearest place of the map, and `fix_off_m` to the fix (None: the match
-    was not accepted)."""
+    """One query: `at` is the position where it was taken, `named` that of the place recognised. Distances from `at` in
+    metres: `error_m` to that place, `nearest_m` to the nearest place of the map, and `fix_off_m` to the fix (None: the
+    match was not accepted)."""
 
     query: str
     reference_image: str

@@ -95,7 +95,7 @@ def seen_from(
     orthophoto: Orthophoto, at: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
     """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR. Returns None if the orthophoto lacks a
-    tenth or more of its ground. Raises UsageError if it shows the horizon."""
+    tenth or more of the ground in the picture. Raises UsageError if the picture shows the horizon."""
     corners_m = view_on_ground(pose, camera)
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _FARTHEST * pose.height_m:
         raise UsageError(

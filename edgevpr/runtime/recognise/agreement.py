@@ -211,8 +211,8 @@ class Verification:
         )
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
-        """Return the overlay of the query on the place in row `slot` of the index, by its match (None: the match has no
-        shift or rotation), and the place's landmarks (None: unknown)."""
+        """Return the overlay of the query on the place in row `slot` of the index, by its match, and the place's
+        landmarks (None: unknown). Both are None if the match has no shift or rotation."""
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
             return None, None

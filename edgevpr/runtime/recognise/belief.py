@@ -48,7 +48,7 @@ _FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its midd
 class _Hypotheses:
     """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
     `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
-    unknown). `credited` (M,) is the log likelihood ratio already counted for the ground around `anchor` (M, 2)."""
+    unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2)."""
 
     w: Doubles
     at: Doubles

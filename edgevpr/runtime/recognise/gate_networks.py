@@ -137,7 +137,7 @@ class Detector:
 
 
 def _cuts(side: int, count: int) -> list[slice]:
-    """Cut a side of so many pixels into `count` overlapping parts."""
+    """Cut a side of `side` pixels into `count` parts of equal length that overlap; return them as slices of pixels."""
     part = side / (count - (count - 1) * _OVERLAP)
     starts = [part * (1 - _OVERLAP) * number for number in range(count)]
     return [slice(round(start), min(side, round(start + part))) for start in starts]

@@ -33,7 +33,8 @@ class Hints:
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Return the fields of the flight log for hints that were used."""
+        """Return these hints, which were used, as fields of the flight log: `reach_m`, the radius of the area (None:
+        unknown), and `heading`, True if a heading is known."""
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 

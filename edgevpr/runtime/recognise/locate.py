@@ -154,8 +154,9 @@ def in_sd(step: Doubles, covariance: Doubles) -> float:
 
 
 def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
-    """Return position and pose of a new place, combined from its position `recorded`, with a standard deviation of one
-    axis, and that by the places around it, `where`. None if both contradict each other or `where` has no heading."""
+    """Return position and pose of a new place. Two positions of it are combined: `recorded`, whose standard deviation
+    along one axis is `recorded_sd_m`, and `where`, computed from the places around it. None if the two contradict each
+    other, or `where` has no heading or footprint."""
     off_m = _off_m(recorded, where.position)
     by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
@@ -209,7 +210,8 @@ def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
 
 
 def _by_landmarks(best: _Lies, proof: Agreement) -> _Lies:
-    """Return `best`, how the query lies on the best place, corrected by its agreeing landmarks (`proof`)."""
+    """Return how the query lies on the best place by its landmarks: `best` with shift, rotation and scale of
+    `proof`."""
     covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
     step, rotation_deg = np.array(proof.shift_share), proof.rotation_deg or 0.0
     return replace(best, step=step, covariance=covariance, rotation_deg=rotation_deg, height_ratio=proof.scale)

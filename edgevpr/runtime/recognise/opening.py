@@ -234,12 +234,13 @@ def _make_map(path: Path, technique: Technique, mask: Mask | None) -> None:
 
 
 def _wanted(config: Config) -> dict[str, str]:
-    """Return the parameters of the technique that the configuration sets."""
+    """Return the parameters of the technique that the configuration sets, by name."""
     wanted = {"camera": config.source.camera, "matching": config.match.matching, "form": config.match.form}
     return {key: value for key, value in wanted.items() if value}
 
 
 def _ram(config: Config, board: Board, technique: Technique) -> tuple[int, int]:
-    """Return the RAM that an index may take, and what each of its places takes beside it."""
+    """Return two sizes in bytes: RAM that an index may take, and RAM that a sequence of queries takes for each
+    place."""
     beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
     return int(budget_mb(config, board) * 1e6), beside_bytes
