@@ -1,7 +1,7 @@
 """The registry of the techniques of place recognition: their names, their parameters, and how to make one.
 
 Map building, flights and evaluations make every technique here; its module is imported only then. "The thesis", in this
-package, is Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*.
+package, is Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file about a network.
 """
 
 import inspect
@@ -73,8 +73,8 @@ def labelled(name: str, form: str | None) -> str:
 
 
 def network_output(name: str) -> str | None:
-    """Return the output of the network of its `model` that a technique of edgevpr uses, "features" or "descriptor".
-    None for a technique without such a parameter."""
+    """Return the output, "features" or "descriptor", that a technique of edgevpr uses of the network which its
+    parameter `model` names. None for a technique without this parameter."""
     if "model" not in parameters(name):
         return None
     return "descriptor" if name == "calc" else "features"
@@ -103,7 +103,8 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _maker(name: str) -> Callable[..., Any]:
-    """Return what makes the technique `name`; its signature has the parameters. Raises as `parameters` does."""
+    """Return the class or function that makes the technique `name`; its arguments are the technique's parameters.
+    Raises as `parameters` does."""
     if is_own(name):
         own: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_OWN[name]}")
         return own

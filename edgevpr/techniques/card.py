@@ -24,8 +24,9 @@ _ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
 class InputRule:
     """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std` (None: 1). `mean` and `std` are one
     number, or one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the
-    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it keeps its shape
-    in the upper left corner, and the rest has that level. With `layout` NHWC feature maps are (1, H, W, C) too."""
+    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it is not
+    stretched: it keeps its proportions in the upper left corner, and the rest has that level. `layout` is the order of
+    the axes of the input and of feature maps."""
 
     layout: str = key(choices=("NCHW", "NHWC"))
     height: int = bounded(8, 4096)
@@ -41,8 +42,9 @@ class InputRule:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Names of the network's outputs in the ONNX file (None: the card names none): a vector (1, D), a feature map (1,
-    C, H, W), all that the boxes of a detector are decoded from, and the memorability of a picture (1, 1) in 0..1."""
+    """Names of the network's outputs in the ONNX file (None: the network has no such output). `descriptor`: a vector
+    (1, D). `features`: a feature map (1, C, H, W). `boxes`: all outputs that the boxes of a detector are decoded from.
+    `memorability`: the memorability of a picture, (1, 1) in 0..1."""
 
     descriptor: str | None = None
     features: str | None = None
@@ -62,8 +64,8 @@ class DetectorRule:
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """One network. `path` is that of the card itself, `file` and `sha256` are the name and hash of the ONNX file beside
-    it. `similarity` is that of its descriptors."""
+    """The description of one network, read from a YAML file. `path` is that of the YAML file, `file` and `sha256` are
+    the name and hash of the ONNX file beside it. `similarity` is the measure by which its descriptors are compared."""
 
     path: Path
     title: str
@@ -102,7 +104,8 @@ def digest_of(values: list[Any]) -> str:
 
 
 def _used(part: InputRule | Outputs) -> dict[str, Any]:
-    """Return a section of a card as a dict, without unused keys that were added later: fingerprints stay the same."""
+    """Return a section of a card as a dict, without the keys added in later versions that the card does not use, so
+    that its fingerprint stays the same in all versions."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
 
 
@@ -125,7 +128,8 @@ def load_card(name: str) -> Card:
 
 
 def weights_of(spec: TechniqueSpec) -> str | None:
-    """Return a line on the weights of a technique: name, title, licence and source of the card (None: no network)."""
+    """Return a line for people on the weights that a technique uses: name, title, licence and source of the network's
+    card. None: the technique has no network."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -145,7 +149,7 @@ def read_card(path: Path, needs_hash: bool = True) -> Card:
 
 
 def _problems(card: Card, sha256: str) -> Iterator[str]:
-    """Yield what is wrong with a card that types and ranges do not tell, and what to do."""
+    """Yield a sentence for each fault of a card that the checks of types and ranges cannot find, with its remedy."""
     boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
     per_channel = f"write one number or {channels}, one a channel"
     if not re.fullmatch(sha256, card.sha256):

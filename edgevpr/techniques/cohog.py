@@ -61,13 +61,15 @@ _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
-    """The technique CoHOG. Its parameters in the thesis: W1 = H1 is `w1` (pixels), W2 = H2 is `w2` (pixels), L is
-    `bins` (orientations), GT is `gt`, the least entropy of a good block, 0 to 1 (below 0: the default for `entropy`).
+    """The technique CoHOG. `w1`: side of the scaled picture in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
+    pixels (W2 = H2). `bins`: orientations (L). `gt`: least entropy of a good block, 0 to 1 (GT; below 0: the default
+    for `entropy`). `entropy` is "shannon" or "filled_bins" (see the module `entropy`). `matching` is "displacement" or
+    "thesis", see above.
 
-    `entropy` is "shannon" or "filled_bins". With `camera` "nadir" the picture is put into a square with its proportions
-    kept, so that a rotated picture shows the same ground. A query is tried from five heights (with `matching` "thesis"
-    from one) in 24 rotations, and `words` is the file of words. The map records all but `matching`: either reads the
-    same map.
+    With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
+    the same ground. A query is tried under hypotheses: five heights (with `matching` "thesis" one) in 24 rotations each
+    (see `views`). `words` is the name of the file of visual words. The map records all parameters but `matching`: both
+    ways of matching read the same map.
     """
 
     w1: int = 512
@@ -155,8 +157,9 @@ class CoHog:
         )
 
     def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Compute the blocks float32 (n, n, 4 bins) of a square picture, and which of them are seen, and good: bool (n,
-        n)."""
+        """Describe a square picture, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
+        4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
+        blocks."""
         blocks = normalised_blocks(oriented_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             seen = np.ones(blocks.shape[:2], bool)
@@ -165,7 +168,8 @@ class CoHog:
         return blocks, seen, good_blocks(levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
     def pack(self, coarse: Bytes, mean: Singles) -> Bytes:
-        """Make rows in RAM, uint8 (N, B), from coarse uint8 (N, 12, 12, bins) and the map's mean (12, 12, bins)."""
+        """Make the rows of the index in RAM, uint8 (N, B), from the coarse parts of N places, uint8 (N, 12, 12, bins),
+        and the map's mean (12, 12, bins)."""
         return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
@@ -208,16 +212,17 @@ class CoHog:
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
     def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
-        """Return the slow patterns float32 (G, 20) of the good regions of a view of the query (see `views`), and their
-        numbers int (G,) on its grid. `turn` is its rotation in steps of 15 degrees."""
+        """Return, for the good regions of a view of the query (see `views`), their patterns, float32 (G, 20) (see
+        `slow_patterns`), and their numbers on the view's grid, int (G,). `turn` is the view's rotation in steps of 15
+        degrees, `ratio` its height ratio."""
         view = self._views_of(query).regions(ratio, turn, self._patterns)
         return view.regions, view.numbers
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
         regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
-        query is tried under `hypotheses` (None: all). The best counts, and `align` refines its shift, rotation and
-        height."""
+        query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
+        counts, and `align` refines its shift, rotation and height."""
         reference = self._reference(fine)
         matches = {each: self._matched(self._view(query, each), reference) for each in self._tried(hypotheses)}
         best = max(matches, key=lambda each: matches[each].score)
@@ -245,8 +250,9 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score of `match` from a quarter of the good regions or, at other heights, about as many. Returns
-        it and, with a nadir camera, the hypothesis of that score, as a list of one."""
+        """Estimate the score of `match` from a quarter of the good regions or, at other heights, about as many, to find
+        the places that are worth a full comparison. Returns two things: the estimated score, and a list with the number
+        of the hypothesis that reached it (None: a forward camera, which has no hypotheses)."""
         reference = self._reference(fine)
         scores = {}
         for number in self._tried(hypotheses):
@@ -262,7 +268,8 @@ class CoHog:
         return hypotheses if hypotheses is not None and self._is_nadir else self._hypotheses
 
     def _reference(self, fine: Bytes) -> Singles:
-        """Return the stored fine part of a place, which is square roots, as `_comparable` blocks."""
+        """Restore the blocks of a place from its stored `fine` part, which holds their square roots, as vectors that
+        can be compared (see `_comparable`)."""
         blocks = fine.astype(np.float32)
         blocks *= blocks
         return self._comparable(blocks)
@@ -289,7 +296,7 @@ class CoHog:
         return self._patterns(blocks) if self._votes else unit_rows(blocks)
 
     def _patterns(self, regions: Singles) -> Singles:
-        """Return regions float32 (N, 4 bins) as their slow patterns (N, patterns), each of length 1."""
+        """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `slow_patterns`)."""
         return unit_rows(regions @ slow_patterns(self.bins))
 
     def _matched(self, view: ViewRegions, reference: Singles) -> FineMatch:

@@ -5,8 +5,8 @@ in cells, is its vote. If the place is the same, the votes pile up on one shift;
 The score is the share of the votes at the peak.
 
 A picture of another kind (a screen, a test card) has many regions that resemble the same few regions of the place.
-Their votes can pile up as well. So the regions of the place that the agreeing votes lead to are counted, each once.
-Regions are numbered row by row.
+Their votes can pile up as well. So the different regions of the place that the agreeing votes lead to are counted, as a
+second measure. Regions are numbered row by row.
 """
 
 import math
@@ -82,7 +82,7 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
 
 
 def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
-    """Return only the `share` of a `displacement`, which takes the same arguments, in half the time."""
+    """Return only the `share` of the result of `displacement` for these arguments, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
@@ -112,8 +112,9 @@ def support(
 
 
 def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
-    """Return the mean logarithm of the rank, by similarity to each region (n, P), of the best of the 3x3 at `x`,
-    `y`."""
+    """Return the mean logarithm of a rank, 0 for the best possible. Each of the query's `regions` (n, P) has moved to
+    the position `x`, `y` of the place. Its rank says how many regions of the place resemble it more than the best of
+    the 3x3 regions around that position."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
@@ -127,7 +128,9 @@ def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int)
 
 
 def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> tuple[Ints, Singles, Array]:
-    """Return the number of the shift of each vote, the votes of each shift, and the weighted sums around each shift."""
+    """Count the votes for each shift; for the arguments see `displacement`. Returns the number of the shift that each
+    region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and the
+    weighted sum of the votes around each shift, on a grid without this border."""
     # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
     # border around the possible shifts leaves room for the square around the peak.
     room = len(counts) - 1
@@ -142,22 +145,24 @@ def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float
 
 @lru_cache
 def _numbers(side: int, wide: int) -> Ints:
-    """Return the numbers that `side` x `side` regions have in a grid of width `wide`: int (side * side,)."""
+    """Return the numbers that `side` x `side` regions have in the corner of a grid of width `wide`, row by row: int
+    (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 
 @lru_cache
 def _weights(counts: tuple[float, ...]) -> Singles:
-    """Return the weight of a vote by its distance from the peak: float32 (2 n - 1, 2 n - 1) for n counts."""
+    """Return the weights of the votes for the shifts around a peak, with the peak in the middle: float32 (2 n - 1, 2 n
+    - 1) for n `counts`, see `displacement`."""
     off = np.abs(np.arange(1 - len(counts), len(counts)))
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Exact position of a query's picture on a place. After turning it by `turn_deg` (clockwise) and scaling it by
-    `scale`, its middle lies at `shift_cells` (x, y) from that of the place. `covariance_cells2` (var x, cov xy, var y)
-    is that of the distances by which single regions miss this fit."""
+    """Exact position of a query's picture on that of a place. After turning the query's picture by `turn_deg`
+    (clockwise) and scaling it by `scale`, its middle lies at `shift_cells` (x, y) from the middle of the place's.
+    `covariance_cells2` (var x, cov xy, var y) is that of the distances by which single regions miss this fit."""
 
     shift_cells: tuple[float, float]
     turn_deg: float

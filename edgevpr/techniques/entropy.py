@@ -82,8 +82,9 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bounds:
-    """Bounds `low` and `high` of an entropy, float32 (h, w), on a grid over the image. Their means over the blocks are
-    `down` @ values @ `across`.T. `exact` computes the entropy at the True points of a bool (h, w), one value each."""
+    """Bounds `low` and `high` of an entropy, float32 (h, w), at the points of a grid over the image. Values on this
+    grid are averaged over the blocks by `down` @ values @ `across`.T. `exact` computes the entropy itself at the True
+    points of a bool (h, w), one value each."""
 
     low: Array
     high: Array
@@ -148,14 +149,14 @@ def _shannon_copy(grey: Bytes) -> Array:
 
 @lru_cache(maxsize=4)
 def _pairs(cells: int) -> Array:
-    """Return the matrix float32 (cells - 1, cells) that averages each cell and the next one."""
+    """Return the matrix float32 (cells - 1, cells) that averages each cell of a row and the cell after it."""
     return (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
 
 
 @lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
-    """Return the matrix float32 (cells - 1, 100) that enlarges a row of the copy and averages it over `_pairs` of
-    cells."""
+    """Return the matrix float32 (cells - 1, 100) that enlarges a row of the 100x100 copy to `side_px` pixels, and
+    averages it over each pair of neighbouring cells of `cell_px` pixels."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
@@ -169,21 +170,22 @@ def _range(grey: Bytes) -> Array:
 
 
 def _replicated(grey: Bytes, radius_px: int) -> Array:
-    """Pad `grey` with copies of its border, which add no intensity to any disc: the pixel copied is nearer the
-    middle."""
+    """Pad `grey` with copies of its border. They add no new intensity to a disc: the pixel that is copied is nearer to
+    the middle of the disc, and so inside it."""
     r = radius_px
     return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
 
 
 def _bit(grey: Bytes) -> NDArray[np.uint64]:
-    """Return a set for each pixel, as a 64-bit word: only bit n is set, n being the last six bits of the intensity."""
+    """Return for each pixel a set with one element, as a 64-bit word: only bit n is set, n being the last six bits of
+    the pixel's intensity."""
     sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
     return sets
 
 
 def _different(padded: Bytes, radius_px: int) -> Array:
-    """Count the different intensities in each disc, by unions of sets of 256 bits: (..., H + 2r, W + 2r) to (..., H,
-    W)."""
+    """Count the different intensities in the disc around each pixel, by unions of sets of 256 bits: a picture padded by
+    the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
     bit, word_of = _bit(padded), padded >> 6
     unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
@@ -225,7 +227,8 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
 
 
 def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
-    """Combine each plane over discs by an associative ufunc (add, bitwise_or): (..., H + 2r, W + 2r) to (..., H, W)."""
+    """Combine the values in the disc around each pixel of each plane by an associative ufunc (add, bitwise_or): planes
+    padded by the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
     r, pitch = radius_px, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]
     flat = planes.ravel()

@@ -60,8 +60,8 @@ def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
 
 
 def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Put a picture into the middle of a square, its border repeated outwards. Returns it, and bool (side, side), True
-    for pixels of the picture that `mask` allows (None: all)."""
+    """Put a picture into the middle of a square, its border repeated outwards. Returns the square, and bool (side,
+    side), True for pixels of the picture that `mask` allows (None: all)."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
@@ -118,7 +118,8 @@ def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) 
 
 
 def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Compute `_vote_by_angle` for 8 orientations over 360 degrees, without angles, branches or scattered sums.
+    """Compute the same sums as `_vote_by_angle` for 8 orientations over 360 degrees, but faster: without angles,
+    branches or scattered sums.
 
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
     orientation of the diagonal gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the
@@ -168,7 +169,8 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 
 
 def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
-    """Return the length of each gradient, written to `out` if given, and a spare array of the same shape."""
+    """Return the length of each gradient, written to `out` if given, and an array of its shape that the caller may
+    overwrite."""
     squares, spare = np.multiply(dx, dx, out=out), dy * dy
     squares += spare
     return cv2.sqrt(squares, squares), spare
@@ -194,12 +196,12 @@ def unit_rows(rows: Singles) -> Singles:
 
 @lru_cache
 def slow_patterns(bins: int) -> Singles:
-    """Return the patterns of low frequency, which hold most of the information of a block of 2x2 cells of `bins`
-    orientations. They are orthonormal: float32 (4 bins, patterns), one pattern per column.
+    """Return the patterns of low ("slow") frequency, which hold most of the information of a block of 2x2 cells of
+    `bins` orientations: float32 (4 * bins, patterns), one per column, orthonormal. This matrix shortens the blocks.
 
-    A block is written as waves over the cells (mean, left against right, top against bottom, diagonal against diagonal)
-    and over the orientations (the frequencies of a Fourier series). Of the 32 patterns of 8 orientations, the 20 with
-    the most power on the data sets used for tuning are kept: comparing blocks is faster, and recall does not fall.
+    A pattern is a wave over the cells (mean, left against right, top against bottom, diagonal against diagonal) times a
+    wave over the orientations (a frequency of the Fourier series). Of the 32 patterns of 8 orientations, this returns
+    the 20 with the most power on the data sets used for tuning: comparing blocks is faster, and recall does not fall.
     """
     frequency = _frequencies(bins)
     return np.vstack(
@@ -224,5 +226,5 @@ def waves(bins: int) -> Singles:
 
 
 def _frequencies(bins: int) -> Ints:
-    """Return the frequency of each row of `waves`: int (bins,)."""
+    """Return the frequency of each row of `waves`, in periods per full circle of orientations: int (bins,)."""
     return (np.arange(bins) + 1) // 2

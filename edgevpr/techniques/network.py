@@ -1,8 +1,10 @@
 """Techniques that describe a picture by one vector of a network. Either the network gives the vector by itself, or a
 *head*, such as a pooling, makes it from the feature map.
 
-A card that names a descriptor is a technique of the card's name, without any code. The techniques of the thesis take
-parameters: `model` is the card of the weights, while `form` (see `vectors`) and `threads` are not part of a map.
+A card is the YAML file that describes a network. If the network gives a descriptor, the card is a technique by itself,
+under the card's name. The techniques of the thesis take parameters. `model` names the card of the network to use.
+`form` is what a number of the vector takes in RAM: "float", "8bit" or "1bit" (see `vectors`). `threads` is the number
+of threads of the network. A map does not depend on `form` and `threads`.
 """
 
 from collections.abc import Callable
@@ -34,8 +36,9 @@ Head = Callable[[Singles], Singles]  # from an output of a network to a vector, 
 
 
 class NetworkVector(VectorTechnique):
-    """The vector that a `head` makes of one output of a network (None: the output itself). The head raises ModelError
-    for a feature map that is too small for it. `spec` are further arguments of `VectorTechnique`."""
+    """A technique whose vector is made by a function `head` of one output of a network (None: the vector is the output
+    itself). The head raises ModelError for a feature map that is too small for it. `spec` are further arguments of
+    `VectorTechnique`."""
 
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
         self._backbone, self._head = backbone, head or np.asarray
@@ -144,9 +147,9 @@ def region_vlad(
 
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make the technique of a card: the vector of its network. It has no parameters, since the model hash in a map
-    covers them. The margins of its wrong matches are unknown: nothing is accepted until the configuration sets a
-    minimum."""
+    """Make the technique of a card: the vector of its network. A map records no parameters of it, since the hash of the
+    network in the map covers them. The margins of its wrong matches are unknown: no match is accepted until the
+    configuration sets a minimum margin."""
     backbone = backbone_of(card, "descriptor", threads)
     sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)

@@ -2,8 +2,8 @@
 
 The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean grid is subtracted. The L
 orientations of each cell are written as a Fourier series of L numbers, since neighbouring orientations rise and fall
-together, and only their signs are kept, one bit each. A query is compared under every shift of its grid. Each such
-*hypothesis* is one row of a matrix, the places of the map are another matrix, and one product compares them all.
+together, and only the signs of these numbers are kept, one bit each. A query is compared under every shift of its grid.
+Each such *hypothesis* is a row of a matrix, the places of the map are another matrix; one product compares them all.
 """
 
 from functools import lru_cache
@@ -36,8 +36,9 @@ SHIFTS = _shifts()
 
 
 def grid(blocks: Singles) -> Singles:
-    """Average the blocks of a picture over cells: float32 (n, n, 4 L), L orientations, to float32 (12, 12, L). Each
-    cell has length 1, so that contrast and haze do not count."""
+    """Make the grid of a picture from its blocks, float32 (n, n, 4 L). A block has L numbers, one per orientation, for
+    each of its 2x2 cells. These four are averaged, then the blocks in each of 12x12 larger cells: float32 (12, 12, L).
+    Each cell has length 1, so that contrast and haze do not count."""
     return seen_grid(blocks, np.ones(blocks.shape[:2], bool))[0]
 
 
@@ -97,8 +98,8 @@ def scan(asked: Singles, codes: Bytes) -> Singles:
 
 
 def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
-    """Compare as `scan` does, but faster: all places under a quarter of the shifts, each averaged with those around it,
-    then the best 500 places under all."""
+    """Compare as `scan` does, but faster: all places under a quarter of the shifts, each averaged with the shifts
+    around it, then only the best 500 places under all shifts."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
     scores = scan(_blurred() @ asked, codes)
@@ -109,7 +110,8 @@ def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _blurred() -> Singles:
-    """Return float32 (E, S): the weights of all S shifts in the mean around each of the E shifts of even dx and dy."""
+    """Return the weights, float32 (E, S), by which `scan_ahead` averages: row e has the weight of each of all S shifts
+    in the mean around the e-th of the E shifts whose dx and dy are even."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -118,12 +120,14 @@ def _blurred() -> Singles:
 
 @lru_cache(maxsize=8)
 def _sources(n: int) -> Ints:
-    """Return the number of the block, of n x n, that each of the 9 samples of each cell is taken from: int (144, 9)."""
+    """Return the blocks that are averaged in each of the 12x12 cells of a grid, 9 for a cell (some may be equal), by
+    their numbers, row by row, in the picture's n x n blocks: int (144, 9)."""
     at = np.floor((np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) * n).astype(np.intp)
     numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES, SIDE, _SAMPLES)
     return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2)
 
 
 def _to(step: int) -> slice:
-    """Return the part of one side that a grid moved by `step` cells still covers; its cells come from `_to(-step)`."""
+    """Return the slice of one axis of the grid to which cells are copied when the grid is moved by `step` cells along
+    it; they are copied from the slice `_to(-step)`."""
     return slice(max(0, step), SIDE + min(0, step))

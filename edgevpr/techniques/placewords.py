@@ -42,9 +42,9 @@ _VOTING_AT_ONCE = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryWords:
-    """The words of a query under each of R rotations. Each of E entries is a `word`, the number of its `region`, and
-    the rotation `turn` in steps: int (E,) each. `counts` uint16 (1025, R) is how often each word occurs under each
-    rotation; its last row, of no word, is 0."""
+    """The words of a query under each of R rotations, as E entries. `word`, `region`, `turn` int (E,): the word's
+    number, the number of the region that has it, and the rotation in steps of 360 / R degrees. `counts` uint16 (1025,
+    R): how often each word occurs under each rotation; its last row stands for "no word" and is 0."""
 
     word: Ints
     region: Ints
@@ -54,8 +54,9 @@ class QueryWords:
 
 
 def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.uint16]:
-    """Return the words of a place, uint16 (100,). `patterns` float32 (100, 20) are those of the regions `named`. A
-    region gets no word (1024) if it is not `good`, bool (100,), or if an earlier region has the same word."""
+    """Return the words of a place, uint16 (100,). `vocabulary` float32 (1024, 20): all words. `patterns` float32 (100,
+    20): those of the place's regions whose numbers `named` returns. A region gets no word (1024) if it is not `good`,
+    bool (100,), or if an earlier region has the same word."""
     words = np.where(good, nearest(vocabulary, patterns), NONE)
     _, first = np.unique(words, return_index=True)
     once = np.full(len(words), NONE, np.uint16)
@@ -66,10 +67,10 @@ def of_place(vocabulary: Singles, patterns: Singles, good: Bools) -> NDArray[np.
 def of_query(
     vocabulary: Singles, asking: dict[int, tuple[Singles, Ints]], within: int, sides: tuple[int, int]
 ) -> QueryWords:
-    """Return the words of a query under all rotations. A key of `asking` is a rotation in steps, clockwise, below
-    `within`, the steps in a quarter turn. Its value describes the good regions of the picture so turned: patterns
-    float32 (G, 20) and numbers int (G,). Further quarter turns follow from these. `sides` are the regions along one
-    side of the query and of a place, at most as many."""
+    """Return the words of a query under all rotations. `within` is the number of rotation steps in a quarter turn. A
+    key of `asking` is a clockwise rotation in steps, less than `within`; its value describes the good regions of the
+    picture so turned: patterns float32 (G, 20) and numbers int (G,). All other rotations are these and quarter turns.
+    `sides`: number of regions along one side of the query, and of a place, which has at most as many."""
     total = within * QUARTERS
     side, of_place = sides
     at_most = _AT_MOST * side**2 // of_place**2
@@ -92,11 +93,13 @@ def of_query(
 
 
 def scan(asked: QueryWords, rows: Array, expected: Ints | None = None, voting: float = 1.0) -> Singles:
-    """Score all places, `rows` uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a query that shows
-    as much ground as a place. `voting` scales the number of the pairs (place, rotation) that vote for shifts.
+    """Score all places by their words, `rows` uint16 (N, 100), under each rotation: float32 (N, R), at most 1 for a
+    query that shows as much ground as a place. `voting` is a factor of the number of pairs (place, rotation) for which
+    the second step of the scan is done.
 
-    `expected` int (N,) is the rotation of each place where the heading is known: it and the two beside it are scored,
-    and the others are -inf. A place with a number below 0 is scored under all rotations (None: all places are).
+    `expected` int (N,) is the rotation, in steps, under which each place is expected if headings are known. Then only
+    this rotation and the two beside it are scored, and the others are -inf. Below 0, or if `expected` is None, all
+    rotations are scored.
     """
     turns = asked.counts.shape[1]
     rows = np.minimum(rows, NONE)  # a file that edgevpr has not written may hold any number
@@ -159,7 +162,8 @@ def turned_blocks(blocks: Singles, quarters: int) -> Singles:
 
 @lru_cache
 def turned_numbers(side: int) -> Ints:
-    """Return the new number of each region after a quarter turn counter-clockwise: int (side * side,)."""
+    """Return the new number of each region of a picture with `side` x `side` regions after the picture is turned by a
+    quarter counter-clockwise: int (side * side,)."""
     was = np.rot90(np.arange(side * side).reshape(side, side)).ravel()
     now = np.empty_like(was)
     now[was] = np.arange(side * side)
@@ -198,7 +202,8 @@ def _shared(counts: NDArray[np.uint16], rows: Array) -> NDArray[np.uint16]:
 
 
 def _votes(asked: QueryWords, turn: int, rows: Array) -> Singles:
-    """Count, for each place of `rows` (P, 100), the shared words that agree on one shift under a rotation."""
+    """Return for each place of `rows` (P, 100) the largest number of words shared with the query, under the rotation
+    step `turn`, that agree on one shift: float32 (P,)."""
     mine = asked.turn == turn
     order = np.argsort(asked.word[mine], kind="stable")
     region = asked.region[mine][order]
@@ -230,14 +235,15 @@ def named(side: int) -> Ints:
 
 @lru_cache
 def _shuffled(side: int) -> Ints:
-    """Return a fixed random rank of each region: those of lowest rank keep a word that occurs too often in a query."""
+    """Return a fixed random rank of each region, int (side * side,). Where a word occurs too often in a query, only the
+    regions of lowest rank keep it."""
     return np.random.default_rng(0).permutation(side * side)
 
 
 @lru_cache
 def _bins(side: int, of_place: int) -> tuple[Ints, int]:
-    """Return the bin of the shift from each region of a query to each named region of a place, int (100, side * side),
-    and the number of bins along one side."""
+    """Return two things: the bin of the shift from each region of a query (`side` x `side` regions) to each of the 100
+    regions of a place that have words, int (100, side * side); and the number of bins along one side."""
     y, x = np.divmod(named(of_place)[:, None], of_place)
     query_y, query_x = np.divmod(np.arange(side * side), side)
     along = (side + of_place - 2) // _BIN_REGIONS + 1

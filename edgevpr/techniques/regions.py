@@ -30,9 +30,10 @@ Describe = Callable[[Singles], tuple[Singles, Singles]]
 
 
 class RegionTechnique(VectorTechnique):
-    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` turns a
-    feature map float32 (C, H, W) into the vector float32 (D,) and the regions float32 (N, C), each of length 1 (zeros
-    where fewer are found). `quality` computes the quality, 0 to 1, from bool (N,), True for each region found."""
+    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` is a
+    function that turns a feature map, float32 (C, H, W), into the vector float32 (D,) and the regions float32 (N, C),
+    each of length 1 (rows of zeros if fewer than N are found). `quality` is a function that computes the picture's
+    quality, 0 to 1, from bool (N,), True for each region found."""
 
     candidates = 40
 
@@ -136,7 +137,8 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe(features: Singles, boxes: Ints) -> Singles:
-    """Sum the activations (C, H, W) in each of `boxes` (N, 4) by channel, and L2-normalise: float32 (N, C)."""
+    """Describe regions of a feature map: sum the activations `features` (C, H, W) in each of `boxes` int (N, 4), as
+    `find_regions` returns them, by channel, and L2-normalise the sums. Returns float32 (N, C)."""
     channels, height, width = features.shape
     sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
     sums[1:, 1:] = features.transpose(1, 2, 0)

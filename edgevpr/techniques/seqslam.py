@@ -22,8 +22,8 @@ _LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation do
 
 class SeqSlam:
     """SeqSLAM: a place is a small picture of `width` x `height` pixels, a byte each (2 KB by default), normalised in
-    patches of `patch` x `patch` pixels. `sequence` is the number of successive queries that are matched together. It
-    belongs to the query, so one map serves all lengths."""
+    patches of `patch` x `patch` pixels. `sequence` is the number of successive queries that are matched together. The
+    map does not depend on it."""
 
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
@@ -70,9 +70,10 @@ class SeqSlam:
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
     def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
-        """Score each place by how much better the query fits it than the places around it in the map: `rows` uint8 (N,
-        length) to float32 (N,) in 0..1, and None (no hypotheses). 0.5 means that it fits as well as they do. The score
-        is linear in the enhanced difference, so the best mean score of a trajectory is its least summed difference."""
+        """Score each place by how much better the query fits it than the places around it in the map. `rows` are uint8
+        (N, length). Returns scores float32 (N,) in 0..1, and None, since there are no hypotheses. 0.5 means that the
+        place fits as well as those around it. The score is linear in the enhanced difference (see `enhanced`), so the
+        trajectory with the best mean score is that of the least summed difference."""
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
@@ -82,8 +83,8 @@ class SeqSlam:
 
 def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
-    do not count) are float32 (patches, pixels). Returns the same, 0 where not allowed or where the patch is flat, and
-    the standard deviations float32 (patches,)."""
+    do not count) are float32 (patches, pixels). Returns the normalised pixels, float32 (patches, pixels), 0 where not
+    allowed or where the patch is flat; and the standard deviations, float32 (patches,)."""
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)
@@ -91,9 +92,9 @@ def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
 
 
 def enhanced(differences: Array) -> Doubles:
-    """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,),
-    in (sample) standard deviations of the differences up to five places away, less their mean; 0 where they are all
-    equal. Sums of whole numbers keep a long map precise."""
+    """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,).
+    From each difference the mean of those up to five places away is subtracted, and the rest is divided by their
+    (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise."""
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)
     last = np.minimum(np.arange(len(whole)) + _WINDOW // 2 + 1, len(whole))

@@ -206,7 +206,8 @@ def prepare(image: Array, rule: InputRule) -> Singles:
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares of the input's width and height that `prepare` fills with the picture, without padding."""
+    """Return the shares, 0..1, of the network input's width and of its height that `prepare` fills with the picture;
+    the rest is padding."""
     if rule.pad is None:
         return 1.0, 1.0
     height, width = image.shape[:2]

@@ -1,9 +1,9 @@
 """Base of the techniques that describe a picture by one vector (also those in `network` and `regions`): the three forms
 of a vector in RAM, and the comparison of vectors. `hog` here needs no network.
 
-The map file keeps each vector in half precision. In RAM its *form* is `float` (half precision too), or one byte
-(`8bit`) or one bit (`1bit`) per number, after the mean of the map is subtracted: it does not help to tell places apart,
-and takes most of the range of a byte. The file is independent of the form, and one map serves all forms.
+The map file keeps each vector in half precision. In RAM a vector has one of three *forms*. `float` is half precision
+too. `8bit` and `1bit` are one byte or one bit per number, after the mean of all vectors of the map is subtracted: the
+mean does not help to tell places apart, and takes most of the range of a byte. The file is the same for all forms.
 """
 
 from typing import Any
@@ -29,13 +29,15 @@ _CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a se
 
 
 class VectorTechnique:
-    """Base class of the techniques that make one vector; a subclass implements `vector`.
+    """Base class of the techniques that describe a picture by one vector, and compare it with the vectors of all places
+    in RAM; a subclass implements `vector`. `form` says how the vectors are kept in RAM, see above.
 
     `similarity` is "cosine", "l1" or "l2"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
-    For "cosine" the score is the cosine in the form `float` (negative ones count 0), and (1 + cosine) / 2 of the
-    vectors less the mean in `8bit`. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the share of equal
-    bits. `margins` are the minimum margins of an accepted match in the forms `float`, `8bit` and `1bit`, known for the
-    shipped weights. With another `model` no match is accepted until the configuration sets a minimum margin.
+    For "cosine", the score in the form `float` is the cosine (0 if negative), and in `8bit` it is (1 + cosine) / 2 of
+    the vectors from which the map's mean is subtracted. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the
+    share of equal bits. `margins` are the minimum margins of an accepted match in the forms `float`, `8bit` and `1bit`,
+    known for the shipped weights. With another `model` no match is accepted until the configuration sets a minimum
+    margin.
     """
 
     candidates = 1  # there is no fine part to compare
@@ -95,9 +97,9 @@ class VectorTechnique:
         return Descriptor(coarse=coarse, quality=float(coarse.any()))
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
-        """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from `coarse` float16 (N, D) and the
-        map's mean (D,). A row of `8bit` is D int8 numbers, then two float32: the step of the numbers, the vector's
-        length."""
+        """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from the vectors `coarse`, float16 (N,
+        D), and the map's mean (D,). A row of `8bit` is D int8 numbers, then two float32 as bytes: the step by which the
+        numbers are multiplied, and the vector's length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for block in _blocks(len(coarse), self._length):
             left = coarse[block].astype(np.float32)
@@ -143,8 +145,8 @@ class VectorTechnique:
         return scores, None
 
     def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
-        """Score n places, `values` float32 (n, D), overwritten; `beside` (2, n) or (0, n): their steps and lengths in
-        `8bit`."""
+        """Score n places by their vectors `values`, float32 (n, D), which are overwritten. `beside` (2, n) are the
+        places' steps and lengths in the form `8bit`; in `float` it is empty, (0, n)."""
         if self._similarity == "cosine":
             scores: Singles = values @ vector
             if not len(beside):

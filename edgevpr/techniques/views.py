@@ -38,9 +38,10 @@ Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
-    """The good regions of a view: their `numbers` int (G,), row by row on a grid of `side` x `side`, and `regions`
-    float32 (G, P), each of length 1. The share of agreeing votes, times `worth`, is the score. For `CoHog.glance` only
-    every `step`-th region votes, and the factor is `worth_at_glance`."""
+    """The good regions of a view, to be compared with a place: their `numbers` int (G,), row by row on a grid of `side`
+    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `worth`: factor by which the share
+    of agreeing votes is multiplied to give the score (see above). For the estimate by `CoHog.glance` only every
+    `step`-th region votes, and the factor is `worth_at_glance`."""
 
     numbers: Ints
     regions: Singles
@@ -56,21 +57,22 @@ def hypothesis(number: int) -> tuple[float, int]:
 
 
 def cells_along(cells: int, ratio: float) -> int:
-    """Return the cells along one side of a view from the height ratio `ratio`, for a place with `cells`. The two
-    numbers differ by an even one, so that the middle region of the view lies on that of the place."""
+    """Return the number of cells along one side of a view of height ratio `ratio`, for a place with `cells` along one
+    side. The two differ by an even number, so that the middle region of the view lies on that of the place."""
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
 def scale_of(cells: int, ratio: float) -> float:
-    """Return the exact height ratio of a view: its whole number of cells along one side over the `cells` of a place."""
+    """Return the exact height ratio of a view: its number of cells along one side, which is whole, over the number
+    `cells` of a place."""
     return cells_along(cells, ratio) / cells
 
 
 class Views:
     """The views of one query, each made when it is first asked for. `square` is the unchanged view: its blocks float32
-    (n, n, 4 bins), and which of them are good, bool (n, n). `encode` makes the same of another view, with cells of
+    (n, n, 4 bins), and bool (n, n), True for good blocks. `encode` makes such a pair of another view, with cells of
     `cell_px` pixels. Only views within a quarter turn are encoded: the others have the same cells, turned. `seen` bool
-    (n, n) is True for blocks that lie on allowed pixels only."""
+    (n, n) is True for blocks of the unchanged view that lie on allowed pixels only."""
 
     def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
@@ -80,8 +82,8 @@ class Views:
         self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
-        """Return the blocks float32 (n, n, 4 bins) of the view of a height ratio and a rotation step, and which of them
-        are good, bool (n, n)."""
+        """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
+        float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
         quarters, within = divmod(turn, WITHIN_QUARTER)
         if (ratio, within) not in self._encoded:
             self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
@@ -89,12 +91,12 @@ class Views:
         return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
     def side_of(self, ratio: float) -> int:
-        """Return the regions along one side of the grid of a view: at least as many as a place has."""
+        """Return the number of regions along one side of the grid of a view, at least that of a place."""
         return max(cells_along(self._side + 1, ratio) - 1, self._side)
 
     def regions(self, ratio: float, turn: int, described: Callable[[Singles], Singles]) -> ViewRegions:
-        """Return all good regions of a view. `described` converts blocks (G, 4 bins) to vectors (G, P) to be
-        compared."""
+        """Return all good regions of the view of the height ratio `ratio` and the rotation step `turn`. `described`
+        converts blocks (G, 4 bins) to the vectors (G, P) that are compared."""
         blocks, good = self.blocks(ratio, turn)
         side = self.side_of(ratio)
         if ratio > 1:
@@ -112,7 +114,8 @@ class Views:
         )
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
-        """Return the picture of a view, rotated by `within` steps, its allowed pixels, and the pixels of a cell."""
+        """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three
+        things: grey float32 (side, side); bool (side, side), True for allowed pixels; and a cell's side in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
         grey: Array

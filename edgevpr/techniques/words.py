@@ -40,8 +40,8 @@ class Whitening:
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """Learned words `words` float32 (K, D). `sha256` is the hash of network and words together, which a map stores.
-    `whitening` is that of the VLAD vectors made with them (None: there is none)."""
+    """Learned visual words `words`, float32 (K, D). `sha256` is the hash of network and words together, which a map
+    stores. `whitening` is that of the VLAD vectors made with these words (None: they are not whitened)."""
 
     words: Singles
     sha256: str
@@ -49,8 +49,8 @@ class Words:
 
 
 def read_words(name: str, command: str) -> tuple[bytes, dict[str, Array], Singles]:
-    """Read the file of words `name` in a folder of models. Returns its content, its arrays and its words, float32.
-    Raises ModelError, which ends with the `command` that makes the file, if it is missing or damaged."""
+    """Read the file of words `name` in a folder of models. Returns its bytes, its arrays by name, and its words,
+    float32. Raises ModelError, which ends with the `command` that makes the file, if it is missing or damaged."""
     path = find_model(name)
     if path is None:
         raise ModelError(f"There are no words {name} in the folders of models: {command}.")
