@@ -21,8 +21,8 @@ _PR_SET_PDEATHSIG = 1  # prctl(2)
 def ask_child(module: str, job: Any, limit_s: float, what: str) -> Any:
     """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON).
 
-    Raises EdgevprError, a sentence that begins with `what` was done, if it takes longer or crashes, and the error that
-    the work itself raised.
+    Raises EdgevprError if the child takes longer or crashes, and for an error that the work itself raised. `what` names
+    the work at the beginning of the message, such as "Trying hog".
     """
     # The child gets its own session, so that only the parent process receives Ctrl-C.
     process = subprocess.Popen(

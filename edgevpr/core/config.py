@@ -43,10 +43,10 @@ def key(
     sets: bool = True,
     **default: Any,
 ) -> Any:
-    """Make a dataclass field whose value is None, lies `within` two numbers (None: anywhere) and is one of `choices`
-    (empty: any). `flag` sets it on the command line: its names and the placeholder of its value ("" : no flag), with
-    the help `text`. The flag of a boolean key has no value: giving it sets the key to `sets`. `default` is that of
-    `dataclasses.field`."""
+    """Make the dataclass field of a configuration key. Its value must be None, or lie `within` two numbers (None: any)
+    and be one of `choices` (empty: any). `flag` is the option that sets the key on the command line: its names and the
+    placeholder of its value, such as "--rate-hz HZ" (empty: no option); `text` is the option's help. The option of a
+    boolean key has no value: giving it sets the key to `sets`. `default` is passed on to `dataclasses.field`."""
     return field(metadata={"within": within, "choices": choices, "flag": flag, "text": text, "sets": sets}, **default)
 
 
@@ -189,8 +189,9 @@ class Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
-    """A configuration key: its dotted name ("source.rate_hz"), the type of its value (besides None), its flags on the
-    command line (empty: none), the placeholder of their value (None: argparse's own), and the rest as in `key`."""
+    """A configuration key: its dotted name ("source.rate_hz"); `kind`, the type of its value if not None; its flags on
+    the command line (empty: none); `metavar`, the placeholder of their value (None: argparse's own). The other fields
+    are the arguments of `key`."""
 
     name: str
     kind: type
@@ -203,7 +204,8 @@ class Key:
 
 
 def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
-    """Yield the keys of the dataclass `cls` and its sections in the order of the fields; names begin with `prefix`."""
+    """Yield the keys of the dataclass `cls` and of its sections, in the order of the fields. `prefix` is put before
+    each name: the dotted name of the section that `cls` is, such as "source." ("": the whole configuration)."""
     hints = typing.get_type_hints(cls)
     for each in fields(cls):
         kind = _kind(hints[each.name])

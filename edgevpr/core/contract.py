@@ -31,7 +31,7 @@ def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueSpec:
-    """The specification of a technique.
+    """The specification of a technique: the form of its descriptors, and its optional abilities.
 
     A map file stores the fields from `name` to `packed`. Only a technique with equal name, parameters, model and
     shapes and dtypes of both parts can use the map.
@@ -47,7 +47,8 @@ class TechniqueSpec:
     headings are known. None: headings are not used.
     `cells`: number of cells of `FineMatch.shift_cells` along a picture's longest side. None: shifts give no metres.
     `height_ratios`: heights of the camera, over that of the map, at which a query can be recognised.
-    `in_full`: of more candidates than so many, only the best by `Technique.glance` go to `match`. None: all do.
+    `in_full`: most candidates that are compared by `match`. Of more, those with the best estimates by
+    `Technique.glance` are chosen. None: all candidates are compared by `match`.
     """
 
     name: str
@@ -76,9 +77,10 @@ class Descriptor:
     """The descriptor of one image.
 
     `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read for
-    candidates only (None: the technique has none). `regions`: the region descriptors of a query. `good`: bool, one for
-    each region, True if it is compared. `quality`: share of the image that holds information, 0..1. `picture`: the
-    prepared query, for a technique that encodes it again in other rotations.
+    candidates only (None: the technique has none). `quality`: share of the image that holds information, 0..1.
+    A query may also have the following (None: the technique needs none). `regions`: the descriptors of its regions.
+    `good`: bool, one for each region, True if it is compared. `picture`: the prepared picture, for a technique that
+    encodes it again in other rotations.
     """
 
     coarse: np.ndarray
@@ -121,12 +123,12 @@ class Support:
 class FineMatch:
     """Result of comparing the query with one place: `score`, 0..1. Only some techniques give the rest (else None).
 
-    `shift_cells`: middle of the query from the middle of the place, (dx right, dy down), in cells of the place.
-    `covariance_cells2`: its covariance (var x, cov xy, var y).
+    `shift_cells`: offset (dx right, dy down) from the middle of the place's picture to that of the query's, in cells of
+    the place. `covariance_cells2`: covariance (var x, cov xy, var y) of this offset.
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
     `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
-    `support`: agreement of all other regions with this shift."""
+    `support`: further measures of the agreement with this shift."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
@@ -138,8 +140,9 @@ class FineMatch:
 
 
 class Technique(Protocol):
-    """The methods of a technique. Those whose `spec.fine` is None need no `match`, those whose `spec.packed` is None
-    no `pack`, and those whose `spec.in_full` is None no `glance`."""
+    """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
+    coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Those whose `spec.fine` is None need
+    no `match`, those whose `spec.packed` is None no `pack`, and those whose `spec.in_full` is None no `glance`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -151,7 +154,8 @@ class Technique(Protocol):
         """Encode an image, uint8 (H, W[, 3]). `mask`, bool (H, W), is False for pixels to be ignored (None: none)."""
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape); `mean` is the map's mean part."""
+        """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape). `mean`, of `coarse.shape`, is the
+        mean of all coarse parts of the map."""
 
     def coarse_scores(
         self,
@@ -170,11 +174,12 @@ class Technique(Protocol):
         `height_ratio`: expected `FineMatch.height_ratio` (None: 1). Given only to one with `spec.height_ratios`."""
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
-        """Compare the query with the fine part of one place under `hypotheses`, columns of `coarse_scores` (None:
-        all)."""
+        """Compare the query with the fine part of one place under `hypotheses` (None: all). These are numbers from 0 to
+        H - 1, the columns of the scores of hypotheses that `coarse_scores` returns."""
 
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Compare only a part of the query's regions with one place; arguments as of `match`. Returns an estimate of
-        the score that `match` would give, and the best of the hypotheses, as the list for `match` (None: no choice)."""
+        """Compare only a part of the query's regions with one place; for the arguments see `match`. Returns an estimate
+        of the score that `match` would give, and a list with only the best hypothesis, to be given to `match` (None:
+        there are no hypotheses)."""

@@ -145,7 +145,8 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that the query may show, and the result of comparing the two. Retrieval returns candidates best first."""
+    """A place that the query may show, and the result `match` of comparing the two. Retrieval returns a list of them,
+    the best first."""
 
     place: Place
     match: FineMatch
@@ -225,9 +226,10 @@ class QueryCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
-    """The outcome of the position fix of one query, the frame's name. `sent`: True, False (`why` gives the reason), or
-    None while the fix waits to be sent or, over TCP, for the acknowledgement of the receiver. `answer`: the autopilot's
-    answer, the name of a MAV_RESULT (None: none yet). Position and accuracy are None if there was nothing to send."""
+    """The outcome of the position fix that was made from one query. `query`: name of the frame. `sent`: True, False
+    (`why` gives the reason), or None while the fix waits to be sent or, over TCP, for the acknowledgement of the
+    receiver. `answer`: the autopilot's answer, the name of a MAV_RESULT (None: none yet). `lat_deg`, `lon_deg` and
+    `accuracy_m`: the position in the fix, None if there was nothing to send."""
 
     query: str
     sent: bool | None
@@ -250,7 +252,7 @@ class Tape:
         return look()
 
     def note(self, kind: str, *values: Any) -> None:
-        """Record values that came without being asked for through `read`, also from another thread."""
+        """Record values that were not obtained by `read`; may be called from any thread."""
 
 
 NO_TAPE = Tape()

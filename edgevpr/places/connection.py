@@ -181,7 +181,8 @@ class MapConnection:
         return sum(row is not None for _, row in self.scan("1"))
 
     def _take(self, connection: sqlite3.Connection) -> None:
-        """Make `connection` the current one; where Python can, let SQLite refuse rows too large to be of this map."""
+        """Make `connection` the current one. From Python 3.11 on, also make SQLite refuse values larger than any row of
+        this map can hold, such as those of a damaged file."""
         self.db = connection
         if self._lock is not None:
             mapfiles.start_log(connection)
@@ -200,7 +201,8 @@ class MapConnection:
             return None
 
     def _state_now(self) -> tuple[int | None, ...]:
-        """Return numbers that differ from the last ones if another program has written to the file or replaced it."""
+        """Return numbers about the file that differ from those of an earlier call if another program has written to the
+        file or replaced it in the meantime."""
         try:
             file = self.path.stat()
         except OSError as error:

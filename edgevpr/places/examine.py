@@ -26,8 +26,8 @@ _LOW = 0.5  # factor on the value of a place that was added only because there w
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` is its
-    row by columns, empty if unreadable."""
+    """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` has
+    the values of its row by column name; it is empty if they cannot be read."""
 
     place_id: int
     problem: str | None
@@ -44,8 +44,9 @@ class Examined:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCheck:
     """The result of checking a map. `places` is the number of readable places. `damaged` has (place id, problem in few
-    words) of each other place. `faults` are SQLite's messages about the file as a whole. `without_checksums` readable
-    places lack a checksum, because another program wrote them: damage to their values cannot be detected."""
+    words) of each other place. `faults` are SQLite's messages about the file as a whole. `without_checksums` is the
+    number of readable places that lack a checksum, because another program wrote them: damage to them would not be
+    detected."""
 
     path: str
     places: int
@@ -100,8 +101,8 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
 
 
 def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
-    """Read and check everything in the map file `path`; `watch` shows progress. Raises MapError for a file that cannot
-    be opened as a map at all."""
+    """Read and check everything in the map file `path`. `watch` wraps the iteration over its places, to show progress.
+    Raises MapError for a file that cannot be opened as a map at all."""
     places = without = 0
     damaged = []
     with PlaceMap.open(path) as place_map:
@@ -152,15 +153,16 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
 
 
 def places_in(file_bytes: int, place_map: PlaceMap) -> int:
-    """Return how many places of a map fit into a file of `file_bytes`, from the mean file size of its places."""
+    """Return how many places of a map fit into a file of `file_bytes`, at most all; computed from the mean size that a
+    place takes in the map's file."""
     places = len(place_map)
     each = (place_map.path.stat().st_size - _EMPTY_BYTES) / max(places, 1)
     return places if each <= 0 else min(places, max(0, int((file_bytes - _EMPTY_BYTES) / each)))
 
 
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
-    """Copy the `count` best places of a map to the new file `out`, by quality and small gaps; return (places copied,
-    readable places of the map).
+    """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
+    `thin`). Returns (number of places copied, number of readable places of the map).
 
     The places keep their ids. Mask hash and calibration are copied; the calibration refers to places by id. Places that
     cannot be read are not copied. Raises MapError if the map cannot be read, or if `out` exists or cannot be written;
@@ -187,7 +189,8 @@ def _worth_of(place: Place) -> float:
 
 
 def _copy(place_map: PlaceMap, out: Path, places: Iterable[Examined]) -> int:
-    """Make the map `out` of the undamaged `places`, with ids, mask and calibration; return their number."""
+    """Make the map `out` from the undamaged ones of `places`, with the same ids, mask hash and calibration; return how
+    many places it has."""
     copied = 0
     with PlaceMap.create(out, place_map.spec) as copy:
         copy.record_mask(place_map.mask_sha256)

@@ -142,7 +142,7 @@ def utc_text(t_utc_s: float | None) -> str | None:
 
 
 def utc_seconds(text: object) -> float | None:
-    """Parse a text of the form of `utc_text` as seconds since 1970; return None for anything else."""
+    """Parse a time as `utc_text` writes it; return seconds since 1970, or None for anything else."""
     try:
         return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if isinstance(text, str) else None
     except (ValueError, OverflowError):

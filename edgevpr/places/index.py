@@ -142,8 +142,8 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> Pla
 
 
 def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> Iterator[int]:
-    """Write `parts`, packed by the technique, to the slots of `index` in blocks, until parts or slots run out. After
-    each block, yield how many slots are written so far: each of them completely."""
+    """Write coarse parts (as `PlaceMap.coarse_parts` yields them), packed by the technique, to the slots of `index` in
+    blocks, until parts or slots run out. After each block, yield how many slots are completely written so far."""
     spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
     filled = 0
@@ -161,7 +161,8 @@ def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -
 
 
 def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: int) -> int:
-    """Return how many places of `place_bytes` fit into the budget, at most `wanted`. Raises MapError if none does."""
+    """Return how many places that take `place_bytes` each fit into the budget, at most `wanted`. Raises MapError if not
+    even one fits."""
     if budget_bytes < place_bytes:
         raise MapError(
             f"{place_map.path}: a place takes {place_bytes} bytes in RAM and the budget is {budget_bytes}: "
@@ -171,7 +172,7 @@ def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: 
 
 
 def _slot_of(ascending: Array, place_id: int) -> int | None:
-    """Return the index of a place in the `ascending` ids; None if it is not there."""
+    """Return the slot of the place `place_id`, where `ascending` are the ids of all slots; None if it has none."""
     at = int(np.searchsorted(ascending, place_id))
     return at if at < len(ascending) and ascending[at] == place_id else None
 
@@ -213,8 +214,9 @@ class GrowingIndex:
 
     def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
         """Add a place that is already in the map file, with an id larger than all ids in the index (position and
-        heading None: unknown). Raises MapError if the file cannot be read: the index then has the places that could be,
-        all packed with the same mean. If only some places are damaged, they are left out without an error."""
+        heading None: unknown). If all places must be packed again with a new mean, they are read from the file, and
+        damaged ones are left out without an error. Raises MapError if the file cannot be read: the index may then have
+        fewer places, all packed with one mean."""
         if self._taken == len(self._slots):
             self._thin()
         point = (position.lat_deg, position.lon_deg) if position else None

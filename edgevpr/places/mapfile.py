@@ -78,7 +78,8 @@ class PlaceMap(MapConnection):
         return int(cursor.lastrowid or 0)
 
     def lay(self, place_id: int, position: Position, pose: Pose | None) -> None:
-        """Set position and pose (None: unknown) of an existing place, inside a `transaction`. Raises sqlite3.Error."""
+        """Replace the position and the pose (None: unknown) of an existing place, inside a `transaction`. Raises
+        sqlite3.Error."""
         geom, content = geopackage.point_blob(position.lat_deg, position.lon_deg), rows.pose_content(pose)
         # The trigger `places_moved` sets columns to NULL when geom changes, so they are written in a second statement.
         self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
@@ -98,7 +99,8 @@ class PlaceMap(MapConnection):
 
     @property
     def calibration(self) -> str | None:
-        """The map's calibration of confidences, as text (see `mapmaking.calibrate`); None: none, or not a text."""
+        """The map's calibration of confidences (see `mapmaking.calibrate`), as the text stored in the file. None if the
+        map was not calibrated, or if the stored value is not a text."""
         return self._text_beside(mapspec.CALIBRATION)
 
     def record_calibration(self, text: str | None) -> None:
@@ -127,7 +129,7 @@ class PlaceMap(MapConnection):
                 yield place_id, point, heading_deg, part
 
     def mean_coarse(self) -> Singles:
-        """Return the mean of all coarse parts that can be read, float32, in the shape of one part."""
+        """Return the mean of all coarse parts that can be read, float32 of the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan("coarse, coarse_crc32"):
             with suppress(Unreadable):
@@ -193,7 +195,7 @@ class PlaceMap(MapConnection):
         self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
 
     def _text_beside(self, key: str) -> str | None:
-        """Return the text stored under `key` in edgevpr_map; None if there is none or it cannot be read."""
+        """Return the text stored under `key` in the table edgevpr_map; None if there is none or it cannot be read."""
         with sentences(self.path):
             try:
                 row = self.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
@@ -211,7 +213,7 @@ class PlaceMap(MapConnection):
 
     @contextmanager
     def _named(self, place_id: int) -> Iterator[None]:
-        """Turn an Unreadable of the body of `with` into a PlaceError with the place's id."""
+        """Turn the exception `Unreadable`, raised in the body of `with`, into a PlaceError with the place's id."""
         try:
             yield
         except Unreadable as error:
@@ -219,7 +221,7 @@ class PlaceMap(MapConnection):
 
     @contextmanager
     def _noted(self, place_id: int) -> Iterator[None]:
-        """Note a place for which the body of `with` raises Unreadable in `left_out`."""
+        """If the body of `with` raises `Unreadable`, enter the place and the reason in `left_out`, and go on."""
         try:
             yield
         except Unreadable as error:

@@ -28,7 +28,8 @@ _ADVICE = {
 
 
 def beside(path: Path) -> list[Path]:
-    """Return the paths at which SQLite may keep files of a map: write-ahead log, index of the log, rollback journal."""
+    """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not: write-ahead log,
+    index of the log, rollback journal."""
     return [path.with_name(path.name + end) for end in _BESIDE]
 
 
@@ -141,15 +142,16 @@ def start_log(db: sqlite3.Connection) -> None:
 
 
 def settle(db: sqlite3.Connection) -> None:
-    """Merge the write-ahead log into the file and remove it. If another program has the map open, the log stays, which
-    does no harm."""
+    """Merge SQLite's write-ahead log into the map file and remove the log. If another program has the map open, the log
+    stays, which does no harm."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
 
 
 def settle_left_log(path: Path) -> None:
-    """Merge the log of a map that was not closed into its file, if file and folder may be written."""
+    """Merge the write-ahead log that a program left, because it ended without closing the map, into the map file; do
+    nothing if file or folder may not be written."""
     if beside(path)[0].exists():
         with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
             settle(db)
@@ -178,7 +180,7 @@ def sentences(path: Path) -> Iterator[None]:
 
 
 def _text(raw: bytes) -> str | bytes:
-    """Decode a text of the file. One that is not UTF-8 is returned as bytes, which the checks of `rows` refuse."""
+    """Decode a text value of the file. If it is not UTF-8, return the bytes, which the checks of `rows` refuse."""
     try:
         return raw.decode()
     except UnicodeDecodeError:

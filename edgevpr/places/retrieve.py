@@ -78,10 +78,12 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Places, best first, as `slots` int (K,) of the index with `scores` float32 (K,). `compared` maps the slot of each
-    place that was compared in full to its match, which has the same score. Places that were compared in part only (see
-    `Technique.glance`) come after them. `unread` int (U,) are slots of unreadable places that the query may show: their
-    scan score is at least that of the best place, or at least the third best of all."""
+    """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
+    (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score.
+    Places compared in part only (see `Technique.glance`) come after those compared in full.
+    `unread` int (U,): slots of places that cannot be read from the file, but that the query may show as well, because
+    the scan scored their row in the index (see `Scan`) at least as high as the best place's, or among the three best.
+    """
 
     slots: Ints
     scores: Singles
@@ -100,7 +102,7 @@ class Ranking:
 
 
 def scan(query: Query) -> Scan:
-    """Score all places of the index by their rows, all at once."""
+    """Scan the index: compare the query with the rows of all places, which are in RAM."""
     technique, index, expected = query.technique, query.index, query.expected
     hint: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
@@ -115,10 +117,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
     If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
     compared: exact, but slow. All hypotheses of the expected height are then tried, if nothing else is expected.
     If all candidates are within `neighbour_m` metres of the best one, the best-scanned places elsewhere are compared as
-    well, for the margin. Without a fine part, the scan scores rank. With `TechniqueSpec.scan_counts`, the score is that
-    of the comparison times the mean of the scan score and 1: for a wrong place the two are nearly independent.
-    If `expected.in_reach` is known, the candidates are places in reach, and five out of reach are compared as well, in
-    case the expectation is false; and at least five places elsewhere, because a margin over fewer means little.
+    well, for the margin. Without a fine part there is nothing to compare, and the scan scores rank the places. With
+    `TechniqueSpec.scan_counts`, the score is that of the comparison times the mean of the scan score and 1: for a wrong
+    place the two are nearly independent. If `expected.in_reach` is known, the candidates are places in reach, and five
+    out of reach are compared as well, in case the expectation is false; and at least five places elsewhere, because a
+    margin over fewer means little.
 
     Raises PlaceError if a place cannot be read, after all candidates have been tried; the place is then left out (see
     the module's docstring). Raises MapError if the file cannot be read.
@@ -156,9 +159,9 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
 
 
 class _Comparison:
-    """The comparisons of one query with places of its map. `scores` has those compared in full by slot, `matches` their
-    matches (none without a fine part), `passed_over` the places compared in part only. `readable` bool (N,) is False
-    for places left out (all True without a fine part)."""
+    """The comparisons of one query with places of its map. `scores` and `matches` have, by slot, the scores and matches
+    of the places compared in full (without a fine part: scan scores, and no matches); `passed_over` has the places
+    compared in part only. `readable` bool (N,) is False for places left out (all True without a fine part)."""
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
@@ -176,8 +179,8 @@ class _Comparison:
         self.passed_over: list[Glance] = []
 
     def best(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
-        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If these have more than `in_full`
-        hypotheses to try, keep the `in_full` places with the best glance (None: all)."""
+        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If they have together more than
+        `in_full` hypotheses to try, keep only the `in_full` places with the best glance (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
             of_slot = self._by_hypothesis
             return [(at, np.flatnonzero(np.isfinite(of_slot[at])).tolist()) for at in np.flatnonzero(among).tolist()]
@@ -189,7 +192,8 @@ class _Comparison:
         return [choice for _, choice in glances[:in_full]]
 
     def next_best(self, among: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more places where `among` is True: from `passed_over`, or if none is in it, by scan."""
+        """Choose up to `count` more places where `among` is True: those of `passed_over`, or if none of them is, those
+        of the best scan scores."""
         more = [choice for _, choice in self.passed_over if among[choice[0]]][:count]
         return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
 
@@ -331,7 +335,8 @@ def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: Lat
 
 
 def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Note unreadable places as left out and return the first error; if they are most `tried`, one of the file."""
+    """Return the error to raise for `unreadable` places, of `tried` that were read. If they are most of these, the file
+    is at fault: return one error about it. Else enter them in `left_out`, and return the error of the first."""
     first = unreadable[0]
     if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
         return MapError(

@@ -55,11 +55,12 @@ Content = Mapping[str, Any]  # such values by column name
 
 
 class Unreadable(ValueError):
-    """A value of a row is missing or invalid; the message says which, in a few words."""
+    """Raised if a value of a row is missing or invalid; the message says which, in a few words."""
 
 
 def content_of(columns: str, row: Values | None) -> Content:
-    """Return the values of a row by the names in `columns`. Raises Unreadable if `row` is None."""
+    """Return the values of a row by column name. `columns` are the names of its columns, with commas between them.
+    Raises Unreadable if `row` is None."""
     if row is None:
         raise Unreadable("its row is gone")
     return dict(zip(columns.split(", "), row, strict=True))
@@ -80,8 +81,8 @@ def point_of(content: Content) -> LatLon | None:
 
 
 def part_of(content: Content, name: str, spec: PartSpec) -> Array:
-    """Decode the part `name` ("coarse", "fine") of a descriptor as a read-only array of `spec`; its checksum counts if
-    it is in `content`. Raises Unreadable."""
+    """Decode the part `name` ("coarse", "fine") of a descriptor as a read-only array of `spec`. Its checksum is checked
+    if it is in `content`. Raises Unreadable."""
     blob = content[name]
     if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
         raise Unreadable(f"its {name} part has a wrong size")
@@ -213,7 +214,8 @@ def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | N
 
 
 def _one_after(db: sqlite3.Connection, columns: str, last: int) -> Values:
-    """Return id and `columns` of the first place after the id `last`; if it cannot be read, the next number alone."""
+    """Return the id and the values of `columns` of the first place after the id `last`. If it cannot be read, return
+    only (`last` + 1,); if there is no more place, only the largest possible id."""
     try:
         return db.execute(f"{_AFTER.format(columns)} LIMIT 1", (last,)).fetchone() or (sys.maxsize,)
     except sqlite3.Error as error:
@@ -233,7 +235,8 @@ def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
 
 
 def _salience_of(values: Sequence[Any]) -> Salience | None:
-    """Make a Salience of the values of `SALIENCE`; None if unknown, and None in place of an invalid score."""
+    """Make a Salience from the values of the columns `SALIENCE`; None if it is unknown. An invalid score becomes
+    None."""
     *scores, is_low = values
     if is_low is None:
         return None

@@ -3,8 +3,9 @@
 This is the trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6), applied to the scores of any
 technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed in places per
 query. It is assumed that places were mapped in the order of the flight, and that the aircraft passes them in the same
-direction, at 0.8 to 1.2 places per query. At other speeds, or backwards, the search would find places that lag behind.
-To keep these from being accepted, other speeds are tried too, and a match must beat their scores (the rivals).
+direction, at 0.8 to 1.2 places per query. If it flies at another speed, or backwards, the search finds places that lag
+behind. To keep these from being accepted, trajectories at other speeds (-2.5 to 3 places per query) are scored as well:
+their scores are the *rivals*, and a place is accepted only if it scores higher than the rivals of places elsewhere.
 """
 
 import zlib
@@ -34,7 +35,8 @@ def length_of(spec: TechniqueSpec, asked: int | None) -> int:
 
 
 def search_of(length: int) -> "SequenceSearch | None":
-    """Make the search over sequences of `length` queries; None for a length of 1: each query is matched alone."""
+    """Make the search over sequences of `length` queries. Returns None for a length of 1: each query is matched
+    alone."""
     return SequenceSearch(length) if length > 1 else None
 
 
@@ -46,9 +48,10 @@ def bytes_beside_place(length: int) -> int:
 class SequenceSearch:
     """The scores of all places for the last `length` queries, and the search for trajectories in them.
 
-    Call `follow` for each query. No place may be accepted before `frames` is `length`. `rivals` float32 (N,) has the
-    best mean score of each place at the other speeds: an accepted place must beat the rivals at places elsewhere. A
-    pause of more than five seconds and more than three times the interval before it begins a new sequence.
+    Call `follow` for each query. No place may be accepted before the number of queries, `frames`, has reached `length`.
+    `rivals` float32 (N,) is for each place the best mean score of a trajectory that ends there at a speed outside 0.8
+    to 1.2: an accepted place must score higher than the rivals of all places elsewhere. A pause of more than five
+    seconds, and more than three times the interval before it, begins a new sequence.
     """
 
     def __init__(self, length: int) -> None:
@@ -135,7 +138,8 @@ class SequenceSearch:
 def trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates.
 
-    Each is a list that says how many slots before the newest query's slot each query was, newest first: [0, 1, 2, ...].
+    Each is a list with one number for each query, the newest first: how many slots before the newest query's slot it
+    was, such as [0, 1, 2, ...] at a velocity of 1.
     """
     # Round halves up, even if the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
