@@ -1,5 +1,6 @@
-"""Calibration of a map: queries with known answers are made from the map's own pictures, and the confidence model (the
-probability that a match is right, from the evidence of the match) is fitted to the results.
+"""Calibration of a map: queries with known answers are made from the map's own pictures, and the confidence model is
+fitted to the results. This model computes the probability that a match is right from the *evidence* of the match:
+measurements by name, such as its score and margin.
 
 Each picture is changed as by another day and season (see `changes`) and then looked for in the map in three ways:
 * THERE: its place is in the map.
@@ -53,9 +54,10 @@ _EVEN = 0.5  # precision for which hardly any match is refused for low confidenc
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapAnswer:
-    """Result of one query: the place of its picture, the `way` in which it was made (THERE, LEFT_OUT, MIRRORED), if the
-    best match is `right`, and the evidence of that match by name (None: the picture holds too little to be looked
-    for). `refused`: the match was refused for another reason than low confidence."""
+    """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
+    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the right place. `evidence`: that of the best match
+    (None: the picture holds too little to be looked for). `refused`: the match was refused for another reason than low
+    confidence."""
 
     place_id: int
     way: str
@@ -120,8 +122,9 @@ def calibrate(
     watch: Watch[Frame],
     preparation: Preparation | None = None,
 ) -> MapCalibration:
-    """Calibrate a map that is open for adding, and store the result in the map. `watch` passes the frames through and
-    shows progress. `preparation` is that with which the map was made (None: no mask and no levelling).
+    """Calibrate a map that is open for adding, and store the result in the map. `pictures` opens the pictures of given
+    names; `watch` wraps the iteration over these frames, to show progress. `preparation` is the preparation of pictures
+    with which the map was made (None: no mask and no levelling).
     Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
     pictures are found. Raises MapError for a file that cannot be read or written.
     """
@@ -159,7 +162,8 @@ def asked_of(technique: Technique) -> int:
 def _as_mapped(
     technique: Technique, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], preparation: Preparation
 ) -> Iterator[tuple[int, Levelled]]:
-    """Yield (a place's number, its prepared picture), without pictures that share only the name with a place's."""
+    """Yield (a place's number, its prepared picture) for a random selection of places. A picture that has the name of a
+    place's picture, but another content, is left out."""
     ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
@@ -174,7 +178,8 @@ def _as_mapped(
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the model of the one of `kinds` of evidence that most answers have, and count what it accepts."""
+    """Choose the one of `kinds` of evidence that most answers have, fit its confidence model to them, and count the
+    answers that it accepts at the `precision` asked for."""
     counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
     kind = max(kinds, key=lambda kind: counts[kind])
     of_kind = [answer for answer in answers if answer.evidence and kind_of(answer.evidence) == kind]
@@ -202,8 +207,8 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
 
 
 def adapted(model: Model, answers: Iterable[MapAnswer], made_of: str) -> Model:
-    """Return a copy of `model` fitted to the answers of a map; those without evidence are ignored. `made_of` is the
-    note in the model on what it was fitted to."""
+    """Return a copy of the confidence model `model`, fitted to the answers of a map. Answers without evidence are
+    ignored. `made_of`: a note, kept in the model, on the data that it was fitted to."""
     known = [answer for answer in answers if answer.evidence]
     right = [answer for answer in known if answer.right]
     nowhere, wrong, left_out = (
@@ -230,8 +235,8 @@ def fitted(start: Logistic, rows: Sequence[Evidence], right: Bools, weights: Dou
     """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
     `weights`, float (N,), are their weights.
 
-    A Gaussian prior holds the regression's scaled weights near those of `start`, with the variance 1 / `pull`; the bias
-    is free. With few rows the result stays close to `start`.
+    A Gaussian prior with the variance 1 / `pull` holds the regression's scaled coefficients near those of `start`; the
+    bias is free. With few rows the result stays close to `start`.
     """
     scales, mine = np.array(start.scales), evidence_matrix(rows, start.names) / np.array(start.scales)
     middle = np.array(start.weights) * scales
@@ -259,7 +264,8 @@ def _mirrored(picture: Levelled) -> Levelled:
 
 
 def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:
-    """Return which of the N places may show ground of the place `slot`, bool (N,). Pictures are `near_m` wide."""
+    """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`. Pictures
+    are `near_m` metres wide."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
     beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
     return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * near_m)

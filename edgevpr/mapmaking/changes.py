@@ -19,7 +19,7 @@ def changed(
     image: Image, rng: np.random.Generator, looks_down: bool, shown: Mask | None = None
 ) -> tuple[Image, Mask | None]:
     """Change a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
-    by any angle. `shown`, bool (H, W), is False where it shows no ground (None: nowhere). Returns
+    by any angle. `shown`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
     * the changed picture, uint8 (H, W) grey, and
     * `shown` for the changed picture."""
     strength = rng.uniform(*_STRENGTH)
@@ -35,7 +35,8 @@ def changed(
 
 
 def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
-    """Return a random homography of pixels, (3, 3), as by another position, height, course and tilt of the camera."""
+    """Return a random homography of pixels, (3, 3), that changes a picture of this `shape` as another position, height,
+    course and tilt of the camera would."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength

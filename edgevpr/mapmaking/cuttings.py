@@ -17,9 +17,9 @@ _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on
 
 
 class OrthophotoSource(RecordingSource):
-    """Gives a frame for each place of `lattice`: a square of ground with sides of `footprint_m`. Places of which more
-    than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the names of the
-    frames to read (None: all)."""
+    """Gives a frame for each place of the grid `lattice`: a square of ground with sides of `footprint_m`. Places of
+    which more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the
+    names of the frames to read (None: all)."""
 
     def __init__(
         self,

@@ -1,10 +1,11 @@
 """The pose graph of a map: solves for the position, direction and footprint of each picture that fit best, by least
 squares, to recorded positions and to ties. A tie is the relative pose of two pictures that show the same ground.
 
-A place has two complex unknowns. Its position p is east + i north, in metres. Its log l has the footprint and the
-direction: exp(l) = footprint_m exp(-i up), a factor that turns an offset in the picture (right + i up, in shares of its
-longest side) into one on the ground. In a tie, `step` is the offset of the middle of picture `query` from the middle of
-picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale of `query` against `place`:
+A place has two complex unknowns. Its position p is east + i north, in metres. Its *log* l is a complex logarithm that
+holds the footprint and the direction: exp(l) = footprint_m exp(-i up), a factor that turns an offset in the picture
+(right + i up, in shares of its longest side) into one on the ground. In a tie, `step` is the offset of the middle of
+picture `query` from the middle of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale of
+`query` against `place`:
 
     (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
 
@@ -39,9 +40,10 @@ _AT_ONCE = 256  # columns of the inverse that are computed together
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
-    """T pairs of pictures of the same ground: `query` and `place`, int (T,), are their numbers. `step` and `turn`,
-    complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are their standard
-    deviations along one axis, up to a common factor, which `solve` estimates (`Solved.times`)."""
+    """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the numbers of the two pictures.
+    `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are the
+    standard deviations of step and turn along one axis, up to a factor that all share; `solve` estimates this factor
+    (`Solved.times`)."""
 
     query: np.ndarray
     place: np.ndarray
@@ -56,11 +58,12 @@ class Ties:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solved:
-    """The solved graph of N places with T ties. `position`, complex (N,), is in metres; for `log`, complex (N,), see
-    the module.
-    `position_var` (m^2) and `log_var`, float (N,), are their variances, summed over both axes.
+    """The solved graph of N places with T ties. `position`, complex (N,): east + i north in metres. `log`, complex
+    (N,): footprint and direction, see the module.
+    `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
     `component`, int (N,): number of the group of places, connected by ties, that each place belongs to.
-    `times`: factor from the given to the real standard deviations of ties. `recorded_sd_m`: that of recorded positions.
+    `times`: factor from the given to the real standard deviations of ties.
+    `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
     `recorded_counts` (N,), `ties_count` (T,): bool, False for positions and ties that contradict the others."""
 
     position: np.ndarray
@@ -75,9 +78,10 @@ class Solved:
 
 
 def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.ndarray | None = None) -> Solved:
-    """Solve the pose graph of N places, `recorded` at complex (N,) metres. `recorded_sd_m`, float (N,), are standard
-    deviations of these positions, where known in advance (NaN: one common value is estimated). `log`, complex (N,), are
-    the known logs (NaN: unknown; None: all are unknown)."""
+    """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
+    north in metres. `recorded_sd_m`, float (N,): standard deviation of each (NaN: not known in advance; one value is
+    then estimated for all of these). `log`, complex (N,): for places whose footprint and direction are known in
+    advance, their log as in the module's docstring (NaN: unknown; None: unknown for all places)."""
     count, own = len(recorded), np.isnan(recorded_sd_m)
     _, component = connected_components(_matrix(ties, count), directed=False)
     graph = _Graph(recorded, np.full(count, np.nan + 0j) if log is None else log, ties, component)
@@ -111,10 +115,12 @@ def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.n
 
 
 class _Graph:
-    """N places with T ties, the recorded positions and known logs, and the `position` and `log` found so far, (N,)."""
+    """The least-squares problem that `solve` solves: N places with T ties, their recorded positions and known logs, and
+    the solution found so far, `position` and `log`, complex (N,) each."""
 
     def __init__(self, recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> None:
-        """Chain each component's places along its most exact ties, and fit it to its recorded positions and logs."""
+        """Make the first solution: place the pictures of each component one after the other along its most exact ties,
+        then fit the component as a whole to its recorded positions and known logs. `known`: complex (N,), or NaN."""
         self._recorded, self._known, self._ties = recorded, known, ties
         count = len(recorded)
         position, log = np.zeros(count, complex), np.zeros(count, complex)
@@ -140,8 +146,9 @@ class _Graph:
         self.position, self.log = position, log
 
     def settle(self, sd_m: np.ndarray, times: float) -> tuple[csc_matrix, np.ndarray]:
-        """Solve for positions and logs with given scatters, by Gauss-Newton steps. Returns the normal matrix (2 N, 2 N)
-        and the robust weight of each tie, float (T,), 0..1."""
+        """Solve for positions and logs by Gauss-Newton steps, with given standard deviations: `sd_m`, float (N,), of
+        the recorded positions, and `times` the given ones of the ties. Returns the normal matrix (2 N, 2 N) and the
+        robust weight of each tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MOVES):
             agree = _agree(self.off_ties() / times)
@@ -158,7 +165,7 @@ class _Graph:
         return normal, agree
 
     def off_ties(self) -> Floats:
-        """Return how far each tie is off, in its standard deviations, float (T,)."""
+        """Return how far each tie differs from the solution, in standard deviations of the tie: float (T,)."""
         steps, turns = self._residuals()
         off: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
         return off
@@ -173,7 +180,8 @@ class _Graph:
     def _linear(
         self, by_step: np.ndarray, by_turn: np.ndarray, by_recorded: np.ndarray
     ) -> tuple[csc_matrix, np.ndarray]:
-        """Return the weighted Jacobian (R, 2 N) and residuals (R,): steps, turns, recorded positions, known logs."""
+        """Return the weighted Jacobian (R, 2 N) and the weighted residuals, complex (R,). The R rows are those of the
+        steps, the turns, the recorded positions and the known logs, in this order; the arguments are the weights."""
         count, many, ties = len(self._recorded), len(self._ties), self._ties
         steps, turns = self._residuals()
         unit = np.exp(-self.log[ties.place])
@@ -200,8 +208,8 @@ def _matrix(ties: Ties, count: int) -> csc_matrix:
 
 
 def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
-    """Return complex `scale` (and rotation) and `offset` so that scale * `shape` + offset fits `recorded`, complex (N,)
-    each. Outliers get little weight. For one point, the scale is 1."""
+    """Return two complex numbers, the factor `scale`, which also rotates, and `offset`, so that scale * `shape` +
+    offset fits `recorded`; both are points, complex (N,). Outliers get little weight. For one point, the scale is 1."""
     weight = np.ones(len(shape))
     scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
     for _ in range(20):

@@ -114,7 +114,8 @@ def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> Doubles:
 
 
 def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m: float) -> Bools:
-    """Return which points of the grid of ascending x and descending y are in the polygons, bool (rows, columns)."""
+    """Return bool (rows, columns), True for the points of a grid, of ascending `x_m` and descending `y_m`, that are
+    inside the polygons."""
     shape = len(y_m), len(x_m)
     if not polygons_m:
         return np.zeros(shape, bool)

@@ -85,7 +85,8 @@ class MapOrder:
     """The map to be made at `path` from `pictures`.
 
     `technique`: its name (None: chosen for `board`, the board that will fly). `parameters`: of the technique, by name.
-    `append`: add places to the map if it exists. `refine`, `calibrate`: do so after the places are made."""
+    `append`: add places to the map if it exists. `refine`, `calibrate`: also refine the map, and calibrate it, after
+    the places are made."""
 
     path: str
     pictures: FlownPictures | Cuttings
@@ -99,10 +100,10 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """Result of `make_map`. `technique`, `cells`: its name and its `TechniqueSpec.cells`. `places`, `with_position`:
-    number of places in the map, and of those that have a position.
-    `result`: counts of the frames read. `refined`, `calibration`: results of these two steps (None: not done).
-    `without_data`: places of an orthophoto that were left out for lack of data (None: not of an orthophoto)."""
+    """Result of `make_map`. `technique`, `cells`: name of the technique, and its `TechniqueSpec.cells`. `places`,
+    `with_position`: number of places in the map, and of those that have a position.
+    `result`: counts of the frames read. `refined`, `calibration`: results of refining and calibrating (None: not done).
+    `without_data`: number of places left out because the orthophoto has no data there (None: made from a flight)."""
 
     technique: str
     cells: int | None
@@ -199,7 +200,8 @@ def calibrate_map(
 
 
 def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None) -> tuple[Source, Technique]:
-    """Open the pictures, and make the technique: the one asked for, that of the map, or the best for the board."""
+    """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
+    map yet), else the best for the board."""
     is_cut, camera, here = isinstance(order.pictures, Cuttings), config.source.camera, load_board("this")
     if is_cut and camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
@@ -225,7 +227,8 @@ def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: 
 
 @contextmanager
 def _if_possible(what: str) -> Iterator[None]:
-    """Log a warning that the map is not `what` if the body of `with`, an optional step, raises EdgevprError."""
+    """Run the body of `with` as an optional step: if it raises EdgevprError, only log a warning that the map is not
+    `what` (such as "refined")."""
     try:
         yield
     except EdgevprError as error:

@@ -33,8 +33,8 @@ Kept = tuple[Recognition, Salience | None]  # event of a frame that becomes a pl
 
 
 class Gaps:
-    """Chooses the frames that become places, see the module. An event is the `Recognition` of one frame. `most_m` None:
-    distances are ignored."""
+    """Chooses the frames that become places, so that no long gaps arise, see the module. An event is the `Recognition`
+    of one frame: the result of its processing. `most_m` None: distances are ignored."""
 
     def __init__(self, most_frames: int = GAP_FRAMES, most_m: float | None = None) -> None:
         self._most_frames, self._most_m = most_frames, most_m
@@ -43,7 +43,8 @@ class Gaps:
         self._has_begun = False
 
     def take(self, event: Recognition) -> Iterator[Kept]:
-        """Process the next event, and yield the events that now become places: of waiting frames, or this one."""
+        """Process the next event. Yield the events that now become places: some of those waiting, then this one if it
+        reaches all thresholds; else it waits. Each comes with its salience (None: there are no criteria)."""
         if event.worth is None:
             yield event, None
             return
@@ -63,7 +64,8 @@ class Gaps:
             yield from self._best_waiting()
 
     def _best_waiting(self) -> Iterator[Kept]:
-        """Yield the best of the waiting events; those after the last of these continue to wait."""
+        """Yield the best of the waiting events, as places of low quality. Of the others, those before the last event
+        yielded are dropped, and those after it continue to wait."""
         waiting = [(event, event.worth) for event in self._waiting if event.worth]
         best = np.flatnonzero(best_of([worth.short_by for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]

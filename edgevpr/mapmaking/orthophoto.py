@@ -61,13 +61,14 @@ class Orthophoto:
         return self._through(columns, rows, crs)
 
     def _through(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
-        """Return x and y in `crs`, float64 (N,) each, of pixels, float (N,) each."""
+        """Convert the pixels at `columns` and `rows`, float (N,) each, to x and y in the coordinate system `crs`,
+        float64 (N,) each."""
         x, y = transform(self._raster.crs, crs, *_moved(self._raster.transform, columns, rows))
         return np.array(x), np.array(y)
 
     def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
-        """Return (column, row), float64 (N, 2), whole numbers at the corners of pixels, of points (N, 2) in metres east
-        and north of `at`."""
+        """Convert points (N, 2), in metres (east, north) of `at`, to pixels (column, row), float64 (N, 2). Whole
+        numbers are the corners of pixels."""
         raster = self._raster
         x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
         if raster.crs.is_geographic:  # a file may have longitudes from 0 to 360 degrees, or cross the date line

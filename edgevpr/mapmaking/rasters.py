@@ -48,8 +48,8 @@ Pixel = tuple[int, int]  # column and row
 
 
 class GeoRaster:
-    """An open file. `crs` is its coordinate system. `transform` converts column and row (whole numbers at the corners
-    of pixels) to coordinates of `crs`. `width` and `height` are in pixels."""
+    """An open georeferenced picture file. `crs` is its coordinate system. `transform` converts column and row (whole
+    numbers at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels."""
 
     def __init__(self, path: Path) -> None:
         """Open a file. Raises SourceError for one that is no picture or has no georeference."""
@@ -91,7 +91,7 @@ class GeoRaster:
         return colours
 
     def _find_tone(self) -> Bytes:
-        """Return the lookup table from 16-bit to 8-bit values, uint8 (65536,)."""
+        """Make the lookup table, uint8 (65536,), by which `read` converts 16-bit values to 8 bits."""
         values = []
         for top in np.linspace(0, max(0, self.height - _WINDOW_PX), _WINDOWS).astype(int):
             for left in np.linspace(0, max(0, self.width - _WINDOW_PX), _WINDOWS).astype(int):

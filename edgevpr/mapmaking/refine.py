@@ -58,9 +58,9 @@ class Refined:
 def refine(
     place_map: PlaceMap, technique: Technique, watch: Watch[tuple[int, int]], images: str | Path | None = None
 ) -> Refined:
-    """Refine a map that is open for adding, in one transaction. `watch` passes the pairs of places through and shows
-    progress. `images` is the folder of the map's pictures (None: not at hand). Raises MapError if the file cannot be
-    read or written.
+    """Refine a map that is open for adding, in one transaction. `watch` wraps the iteration over the pairs of places,
+    to show progress. `images` is the folder of the map's pictures (None: not at hand, so only the landmarks in the map
+    are compared). Raises MapError if the file cannot be read or written.
     """
     places = list(_readable(place_map))
     placed = [place for place in places if place.position]
@@ -112,7 +112,7 @@ def _recorded(place: Place) -> Position:
 
 
 def _is_sure(solved: Solved) -> Bools:
-    """Return which places have enough ties and a sufficiently exact solution to get a pose, bool (N,)."""
+    """Return bool (N,), True for places with enough ties and a sufficiently exact solution to get a pose."""
     members = np.bincount(solved.component)[solved.component]
     is_sure: Bools = (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
     return is_sure
@@ -125,7 +125,8 @@ def _readable(place_map: PlaceMap) -> Iterator[Place]:
 
 
 def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: Solved, sure: Bools) -> None:
-    """Write position and pose of the places that are `sure`, bool (N,); the others become as recorded again."""
+    """Write the solved positions and poses to the map for the places where `sure`, bool (N,), is True. The others get
+    their recorded positions again, and no pose."""
     origin = recorded_at[0]
     with place_map.transaction():
         for at, place in enumerate(placed):

@@ -43,8 +43,10 @@ _KEPT_PICTURES = 4  # descriptors that are cached
 
 
 class Tie(NamedTuple):
-    """Relative pose of picture `query` to picture `place`: complex `step` (right + i up, in shares of the place's
-    longest side) and `turn` (log of the scale + i counter-clockwise rotation), and their standard deviations."""
+    """Relative pose of two pictures, `query` to `place`. `step`: complex offset from the middle of the place's picture
+    to that of the query's (right + i up, in shares of the longest side of the place's picture). `turn`: complex,
+    natural logarithm of the scale + i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations
+    of the two along one axis."""
 
     step: complex
     turn: complex
@@ -65,7 +67,8 @@ def likely_pairs(recorded: Complexes) -> list[Pair]:
 
 
 def overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
-    """Return the pairs that overlap by `position` and `log` of a solved graph, among places where `of` (N,) is True."""
+    """Return the pairs of places that overlap according to a solved graph. `position` and `log` are those of
+    `graph.Solved`; only places where `of`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
     near = _near(position[members], _MOST_OVERLAPPING)
     return sorted(
@@ -78,7 +81,8 @@ def overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pa
 
 
 def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
-    """Yield (number of a place, number of an earlier one, metres apart) for the `most` nearest of each of N places."""
+    """Pair each of N places, at `position`, complex (N,) metres, with the `most` places nearest to it. Yields (number
+    of the later place, number of the earlier one, metres between them) for each pair; some pairs come twice."""
     if len(position) > 1:
         points = np.stack([position.real, position.imag], axis=1)
         away_m, near = cKDTree(points).query(points, k=min(most + 1, len(points)))
@@ -100,8 +104,9 @@ def ties_of(tie_of: dict[Pair, Tie]) -> Ties:
 
 
 def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encoded: Encoded | None) -> Look:
-    """Return the function that compares two of `places`, given by their indices in this list, and returns their tie.
-    `encoded` encodes the places' pictures (None: they are not at hand, so only landmarks are compared)."""
+    """Return the function that compares two of `places`, given by their indices in this list, and returns their tie
+    (None: none is found). `encoded` encodes the places' pictures (None: they are not at hand, so only landmarks are
+    compared)."""
     coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
 
     @lru_cache(_KEPT)
@@ -146,7 +151,8 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
 
 
 def pictures(folder: str | Path, technique: Technique) -> Encoded:
-    """Return the function that encodes the picture of a given name in `folder` (None: missing or cannot be used)."""
+    """Return a function that is given the name of a picture in `folder`, and returns its descriptor (None: the picture
+    is missing or cannot be used)."""
     paths = {decoded_name(path.name): path for path in list_images(folder)}
 
     def encoded(name: str) -> Descriptor | None:
@@ -159,7 +165,8 @@ def pictures(folder: str | Path, technique: Technique) -> Encoded:
 
 
 def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
-    """Return the best rotations of query `asking` for `Technique.match`, by the scores with the coarse part `part`."""
+    """Choose the hypotheses of rotation and height under which `Technique.match` should compare the query `asking` with
+    a place whose coarse part is `part`: the eight with the best scores of coarse parts, as numbers, the best first."""
     _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
     assert by_hypothesis is not None  # set by techniques for a camera that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
