@@ -244,11 +244,13 @@ T = TypeVar("T")
 
 
 class Tape:
-    """Records all values that enter a flight from outside, or plays a recording back. This base class does neither.
-    Values are JSON types or bytes. `kind` is the name of the input, such as "frame"."""
+    """Records all values that enter a flight from outside, or plays a recording back. This base class does neither: it
+    is for flights without a recording, and subclasses override it. Values are JSON types or bytes. `kind` is the name
+    of the input, such as "frame"."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Call `look` and record and return its result; in a replay, return the recorded result instead."""
+        """Return a value of the input `kind`: call `look`, which gets it from outside, and record it; in a replay,
+        return the recorded value instead."""
         return look()
 
     def note(self, kind: str, *values: Any) -> None:

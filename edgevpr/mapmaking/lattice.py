@@ -115,7 +115,7 @@ def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> Doubles:
 
 def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m: float) -> Bools:
     """Return bool (rows, columns), True for the points of a grid, of ascending `x_m` and descending `y_m`, that are
-    inside the polygons."""
+    inside the polygons, each of which is a list of rings (n, 2): its outline, then its holes."""
     shape = len(y_m), len(x_m)
     if not polygons_m:
         return np.zeros(shape, bool)
@@ -126,7 +126,7 @@ def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m:
 
 
 def _add_near(inside: Bools, x_m: Doubles, y_m: Doubles, begin: Doubles, end: Doubles, margin_m: float) -> None:
-    """Set the points of the grid `inside` to True that are within `margin_m` of the line `begin`-`end`, (2,) each."""
+    """Set `inside` to True for the points of its grid within `margin_m` of the line `begin` to `end`, (x, y) each."""
     low, high = np.minimum(begin, end) - margin_m, np.maximum(begin, end) + margin_m
     columns = slice(*np.searchsorted(x_m, (low[0], high[0])))
     rows = slice(*np.searchsorted(-y_m, (-high[1], -low[1])))

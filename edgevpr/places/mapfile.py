@@ -170,8 +170,8 @@ class PlaceMap(MapConnection):
         return ids
 
     def is_of(self, place_id: int, coarse: Array) -> bool:
-        """Return True if a place's coarse part nearly equals `coarse`, so that both are of the same picture; False if
-        the place cannot be read. The last bits may differ between two runs of a program, and so may a few codes."""
+        """Return True if a place's coarse part nearly equals `coarse`, so that both are of one picture; False if the
+        place cannot be read. Between two runs of a program the last bits of numbers may differ, or a few elements."""
         try:
             content = rows.content_of("coarse", self.row(place_id, "coarse"))
             there = rows.part_of(content, "coarse", self.spec.coarse).astype(np.float32)

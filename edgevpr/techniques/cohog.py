@@ -275,7 +275,7 @@ class CoHog:
         return self._comparable(blocks)
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
-        """Return the good regions of a query under a hypothesis. They are cached for the newest query."""
+        """Return the good regions of a query under the hypothesis `number`. They are cached for the newest query."""
         cached = self._views_of(query).cached
         if number not in cached:
             cached[number] = self._views_of(query).regions(*hypothesis(number), self._comparable)

@@ -145,8 +145,7 @@ def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float
 
 @lru_cache
 def _numbers(side: int, wide: int) -> Ints:
-    """Return the numbers that `side` x `side` regions have in the corner of a grid of width `wide`, row by row: int
-    (side * side,)."""
+    """Return the numbers of `side` x `side` regions in the corner of a grid of width `wide`: int (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 

@@ -53,16 +53,16 @@ def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
 
 
 def block_means(per_pixel: Array, cell_px: int) -> Array:
-    """Average a map over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart: float32 (H, W)
-    to (H/cell_px - 1, W/cell_px - 1)."""
+    """Average values of pixels over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart:
+    float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
     cell = _cell_means(per_pixel, cell_px)
     means: Array = (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
     return means
 
 
 def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
-    """Tell which blocks are good (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result
-    equals `block_means(filled_bins(grey), cell_px) >= threshold`, or that of `shannon`, as `which` names.
+    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result equals
+    `block_means(entropy(grey), cell_px) >= threshold`, where `which` names the entropy: "filled_bins" or "shannon".
 
     Cheap bounds of the entropy decide nearly every block, and only the pixels under the others are computed exactly.
     `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1),

@@ -51,8 +51,9 @@ class NetworkVector(VectorTechnique):
 
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make `calc`: the output `descriptor` of the card `model`, a convolutional autoencoder that learned to give the
-    HOG of a picture from a changed copy of it. Vectors are compared by cosine.
+    """Make `calc`: the output `descriptor` of the network with the card `model`, a convolutional autoencoder that
+    learned to give the HOG of a picture from a changed copy of it. Vectors are compared by cosine, and kept in RAM in
+    the `form` "float", "8bit" or "1bit".
 
     Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
     histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.

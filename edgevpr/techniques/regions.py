@@ -64,7 +64,7 @@ class RegionTechnique(VectorTechnique):
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
     """Make `rmac`: each square region of a feature map is described by its largest activations, at three scales.
-    `model` is the card of the network, `form` the form of the vector in RAM, `threads` those of onnxruntime.
+    `model` is the card of the network, `form` the form of the vector in RAM, `threads` the network's number of threads.
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
     the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched
@@ -137,8 +137,8 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe(features: Singles, boxes: Ints) -> Singles:
-    """Describe regions of a feature map: sum the activations `features` (C, H, W) in each of `boxes` int (N, 4), as
-    `find_regions` returns them, by channel, and L2-normalise the sums. Returns float32 (N, C)."""
+    """Describe regions of a feature map `features` (C, H, W): sum the activations in each of `boxes`, int (N, 4) (top,
+    left, bottom, right; see `find_regions`), by channel, and L2-normalise the sums. Returns float32 (N, C)."""
     channels, height, width = features.shape
     sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
     sums[1:, 1:] = features.transpose(1, 2, 0)

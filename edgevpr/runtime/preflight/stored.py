@@ -78,8 +78,8 @@ def gathered(trials: Iterable[Trial], threads: int, score: MachineSpeed) -> Stor
 
 
 def require_room(path: Path) -> None:
-    """Raise UsageError, before the measurement, if `path` is no name of a file of figures in a folder that is there.
-    The folder of `default_path` is made."""
+    """Check, before the measurement, that figures can be stored at `path`: raise UsageError if its name does not end in
+    .json, or its folder does not exist. The folder of `default_path` is made if needed."""
     if path == default_path() and path.is_absolute():
         path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix != ".json":
@@ -130,8 +130,8 @@ def scaled_from(here: Board, board: Board, stored: StoredFigures | None) -> Boar
 
 
 def write_profile(path: Path, board: Board) -> None:
-    """Write a profile to a new file, completely or not at all. Raises UsageError for a name that does not end in .yaml,
-    a folder that is not there, and a file that is."""
+    """Write a board's profile to a new file, completely or not at all. Raises UsageError if the name does not end in
+    .yaml, the folder does not exist, or the file exists already."""
     if path.suffix not in (".yaml", ".yml"):
         raise UsageError(f"{path}: a profile's name ends in .yaml: choose such a name.")
     require_folder(path)
