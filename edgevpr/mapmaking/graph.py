@@ -146,8 +146,8 @@ class _Graph:
         self.position, self.log = position, log
 
     def settle(self, sd_m: np.ndarray, times: float) -> tuple[csc_matrix, np.ndarray]:
-        """Solve for positions and logs by Gauss-Newton steps, with given standard deviations: `sd_m`, float (N,), of
-        the recorded positions, and `times` the given ones of the ties. Returns the normal matrix (2 N, 2 N) and the
+        """Solve for positions and logs by Gauss-Newton steps. The standard deviations of recorded positions are `sd_m`,
+        float (N,), and those of the ties are multiplied by `times`. Returns the normal matrix (2 N, 2 N), and the
         robust weight of each tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MOVES):
@@ -171,7 +171,7 @@ class _Graph:
         return off
 
     def _residuals(self) -> tuple[Complexes, Complexes]:
-        """Return the residuals of steps and turns, complex (T,) each."""
+        """Return how much the solution so far differs from the ties: in steps and in turns, complex (T,) each."""
         position, log, ties = self.position, self.log, self._ties
         steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
         turns = log[ties.query] - log[ties.place] - ties.turn

@@ -60,7 +60,7 @@ Encoded = Callable[[str], Descriptor | None]  # encodes the picture of this name
 
 
 def likely_pairs(recorded: Complexes) -> list[Pair]:
-    """Return the pairs of places that may overlap. `recorded` is their positions, complex (N,) metres, as mapped."""
+    """Return the pairs of places that may overlap. `recorded`: positions, complex (N,) metres, in the order mapped."""
     count = len(recorded)
     pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
     return sorted(pairs | {(at, other) for at, other, _ in _near(recorded, _NEAREST)})
@@ -92,7 +92,7 @@ def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
 
 
 def tied(pairs: Iterable[Pair], look: Look) -> dict[Pair, Tie]:
-    """Compare each pair with `look`; return the ties that were found."""
+    """Compare each pair with `look`; return the ties that were found, by pair."""
     return {pair: tie for pair in pairs if (tie := look(*pair))}
 
 
