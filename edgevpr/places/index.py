@@ -30,8 +30,8 @@ CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `Plac
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
-    """The arrays of N places, all contiguous. A place's index in them is its *slot*; slots follow the order in which
-    the places were mapped.
+    """The part of a map that is held in RAM to be scanned: arrays of N places, all contiguous. A place's number in
+    these arrays is its *slot*; slots follow the order in which the places were mapped.
 
     `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN for a place without a position.
     `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN if unknown. `rows` (N, *row shape) has the
@@ -67,7 +67,8 @@ class PlaceIndex:
         return self.only(slice(count))
 
     def only(self, slots: slice | Array) -> "PlaceIndex":
-        """Return the index of some places: views for a slice, copies for slots or a mask, bool (N,)."""
+        """Return the index of only the places at `slots`. Its arrays are views if `slots` is a slice, and copies if it
+        is an array of slots or a mask, bool (N,)."""
         return replace(self, **{name: array[slots] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
@@ -78,7 +79,8 @@ class PlaceIndex:
         return float(np.median(known)) if len(known) else None
 
     def within(self, position: Position, radius_m: float) -> Bools:
-        """Return True for each place within `radius_m` metres of `position`, bool (N,); False without a position."""
+        """Return bool (N,), True for each place within `radius_m` metres of `position`; False for those without a
+        position."""
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 
@@ -90,13 +92,13 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
 def load_index(
     place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None, beside_bytes: int = 0
 ) -> PlaceIndex:
-    """Load the coarse parts of a map, packed by the technique, into the arrays of `into` (None: into new ones). Return
-    the index of the places that were loaded.
+    """Load the coarse parts of the descriptors in a map, packed by the technique, into the arrays of `into` (None: into
+    new ones). Return the index of the places that were loaded.
 
-    If `budget_bytes` is too small for all places, only the best ones are loaded (see `thin`). Per place, `beside_bytes`
-    of the budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are
-    skipped and noted in `PlaceMap.left_out`. Raises MapError if the map has no places, if none of them can be read, or
-    if the budget is too small for one place.
+    If `budget_bytes` is too small for all places, only the best are loaded: those of high quality that leave no wide
+    gaps (see `thin`). Per place, `beside_bytes` of the budget stay free for other arrays that grow with the index (see
+    `sequence`). Places that cannot be read are skipped and noted in `PlaceMap.left_out`. Raises MapError if the map has
+    no places, if none of them can be read, or if the budget is too small for one place.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
