@@ -112,7 +112,10 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
         None,
     ]
     heard = {"fixes_accepted": 0, "fixes_denied": 0}
-    said = str(DemoSummary(places=2, answers=answers, heard=heard, picture=tmp_path)).split("\n")
+    heard = {"fixes_accepted": 0, "fixes_denied": 0}
+    costs = dict.fromkeys(("cpu_s", "t_encode_s", "t_match_s", "rss_mb"), 0.0)
+    summary = {"costs": costs, "used_mah": 0.0, "marginal_mah": 0.0, "picture": tmp_path}
+    said = str(DemoSummary(places=2, answers=answers, heard=heard, **summary)).split("\n")
     assert [re.findall(r"[\d.]+", line) for line in said[2:7]] == [
         ["3", "2", "1"],  # queries, on the map, beyond it
         ["1", "0.50", "55"],
