@@ -38,7 +38,8 @@ class Inquiry:
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
     - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
-    - `says_version_1`: its last message was MAVLink 1. `round_trips_s`: how long it took to answer each `message`.
+    - `says_version_1`: its last message was MAVLink 1.
+    - `round_trips_s`: seconds from request to answer, one number for each answered call of `message`.
     - `others`: system ids of any other autopilots on the link.
     """
 
@@ -49,8 +50,9 @@ class Inquiry:
         system_id: int | None = None,
         signing: Signing = NOT_SIGNING,
     ) -> None:
-        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first one that is
-        heard). Raises LinkError where the link cannot be opened: see `open_port`, or its other end is missing."""
+        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first autopilot whose
+        heartbeat arrives), and `signing` signs and checks the messages. Raises LinkError if the port cannot be opened
+        (see `open_port`) or its other end is missing."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
         self.signed = 0
@@ -92,7 +94,7 @@ class Inquiry:
         return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
-        """Receive for `wait_s` seconds what comes unasked."""
+        """Receive messages for `wait_s` seconds without asking for any; they are only counted."""
         self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
@@ -194,11 +196,16 @@ class Inquiry:
 class AutopilotReading:
     """All that an autopilot tells about itself; None and empty stand for what it did not answer.
 
-    `firmware` is "ardupilot", "px4" or "other"; `vehicle` is the value of a `Kind`. `heard` are the names of all
-    messages that came. `gps_fix` is the fix type of the first and second receiver. `filter_flags` are those of
-    EKF_STATUS_REPORT or ESTIMATOR_STATUS. `origin` is (latitude, longitude) in degrees. `signs`: its messages are
-    signed; `is_signed_to`: ours are. `answers`: it has answered any question; `says_version_1`: it sends MAVLink 1.
-    `clock_ahead_s` is its UTC less that of this machine.
+    - `firmware`: "ardupilot", "px4" or "other"; `vehicle`: the value of a `Kind`.
+    - `version`: (major, minor, patch) of the firmware; `version_text`: the same as text, such as "4.7.0-dev".
+    - `parameters`: values by name; `heard`: the names of all messages received.
+    - `gps_fix`: GPS_FIX_TYPE of the first and the second receiver.
+    - `filter_flags`: the `flags` field of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
+    - `origin`: of its local frame, (latitude, longitude) in degrees.
+    - `signs`: its messages are signed; `is_signed_to`: ours to it are.
+    - `answers`: it has answered at least one question; `says_version_1`: it sends MAVLink 1.
+    - `other_systems`: system ids of other autopilots on the link; `bad_bytes`: bytes that belong to no valid message.
+    - `round_trip_s`: median time of an answer; `clock_ahead_s`: its UTC minus that of this machine.
     """
 
     system_id: int
@@ -228,8 +235,8 @@ class AutopilotReading:
 
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read all that can be read; return None if no heartbeat comes. `wanted`: names of parameters, by firmware.
-
+    """Read all that an autopilot tells about itself; return None if no heartbeat comes. `wanted` maps a firmware (as in
+    `AutopilotReading`) to the names of the parameters to be read.
     It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
     """
     beat = asking.heartbeat()

@@ -119,14 +119,15 @@ def ardupilot_choice(answers: Answers) -> Choice:
 
 
 def receiver_name(parameters: Mapping[str, float], number: int) -> str:
-    """Return the parameter with the type of GPS receiver `number` (0: the first): GPS1_TYPE, before 4.6 GPS_TYPE."""
+    """Return the name of the parameter that sets the type of GPS receiver `number` (0: the first): GPS1_TYPE, or
+    GPS_TYPE in ArduPilot before 4.6."""
     return _known_name(parameters, _RECEIVERS[number])
 
 
 def px4_choice(answers: Answers) -> Choice:
     """Choose the channel for a PX4: message 296 if its version knows it and its parameter CONTROL lets it fuse
-    positions, else command 43003. It ignores a message 296 without an accuracy, and takes the delay of its position
-    from a parameter of its own."""
+    positions, else command 43003. PX4 ignores a message 296 that has no accuracy, and takes the delay of the position
+    from one of its own parameters."""
     if answers.version and answers.version < _SENSOR_SINCE:
         major, minor = answers.version
         return Choice(Channel.COMMAND, f"command 43003, as version {major}.{minor} knows no message 296 (1.17 does)")
@@ -159,8 +160,9 @@ class Interview:
     """Asks an autopilot for its version and a few parameters, and chooses the channel from the answers.
 
     Missing answers are requested four times, a second apart, since an autopilot is silent about a parameter that it
-    does not have. `choice` is command 43003 until then. The first answer to a question counts even if it comes later;
-    further answers are ignored, so that changing a parameter in flight does not change the channel.
+    does not have. Until the channel is chosen, `choice` is command 43003. The first answer to a question counts, even
+    if it comes after the choice, which is then made again. Further answers to the same question are ignored, so that
+    changing a parameter in flight does not change the channel.
     """
 
     def __init__(self) -> None:
@@ -186,8 +188,8 @@ class Interview:
                     self._parameters[message.param_id] = value
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
-        """Yield the requests to be sent at `now_s` to the autopilot `target_system`. When nothing is missing, or the
-        last request is a second old, choose the channel."""
+        """Yield the requests to be sent at `now_s` to the autopilot `target_system`. When no answer is missing, or a
+        second after the fourth request, choose the channel instead."""
         if self._is_over or now_s - self._ask_s < _ASK_EVERY_S:
             return
         missing = self._missing()

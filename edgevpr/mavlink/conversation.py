@@ -39,8 +39,10 @@ class LinkSettings:
 
     - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
     - `max_fix_age_s`: a fix that has waited longer, in seconds, is never sent.
+    - `clock`: the monotonic clock, in seconds, of all time stamps of the link.
     - `listener`: is called with the reports of the vehicle, and gives the positions of a continuous channel.
     - `tap`: is called with each packet written and each packet received, in the link's thread.
+    - `signing`: signs the packets sent, and checks those received.
     - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never).
     - `tape`: records, or plays back, all that is received and sent.
     """
@@ -120,11 +122,13 @@ class Conversation:
         self._ask_position_s = self._clock()
 
     def offer(self, wishes: Collection[Wish]) -> None:
-        """Set the wishes of the ground station that the flight can fulfil; before the first call there are none."""
+        """Set which requests to the flight (see `Wish`) are accepted from ground stations from now on; the others are
+        refused. Before the first call all are refused."""
         self.requests.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the wishes of the ground station that have arrived since the last call."""
+        """Return the requests to the flight that ground stations have made, and that were accepted, since the last
+        call; each with its sender."""
         return self.requests.take()
 
     def vehicle(self) -> Vehicle | None:
@@ -134,7 +138,8 @@ class Conversation:
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame. Roll
         and pitch are None if no attitude was received within 0.3 s of it. `t_fix_s` is when the newest fix was sent
-        that may be part of the reported position; on a continuous channel it is now. None: as in `vehicle`."""
+        that may be part of the reported position; on a continuous channel it is now. Returns None as `vehicle` does:
+        before the first report, and if the last one had no position."""
         vehicle = self.autopilot.vehicle_at(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
@@ -189,8 +194,9 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Stop waiting for answers that take more than a second. Queue a text for the ground station for each change:
-        autopilot silent or back; fixes unanswered or answered again, refused or accepted again."""
+        """Stop waiting for answers that take more than a second. Queue a text for the ground station about each change
+        since the last call: the autopilot falls silent or is heard again; fixes are no longer answered or are answered
+        again; fixes are refused or accepted again."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)
         if is_there and self._is_there is False:
@@ -204,7 +210,8 @@ class Conversation:
             self.announce(*news)
 
     def break_off(self, lost_fixes: int) -> None:
-        """Forget what the loss of the port ends. `lost_fixes` is the number of fixes thrown away with the port."""
+        """Reset what ends when the port is lost: the wait for answers to fixes, the presence of the autopilot, and
+        incomplete messages. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
         self.autopilot.forget_presence()
         self.reader.forget_partial_message()
@@ -241,7 +248,8 @@ class Conversation:
         return messages.heartbeat(Health.CRITICAL if is_stuck else self._health)
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
-        """Make the next message of a continuous channel. None: it is not due yet, or nothing can be said."""
+        """Make the next message of a continuous channel: a position or, once, the origin of the autopilot's local
+        frame. None: it is not due yet, or the position or the origin is not known."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)

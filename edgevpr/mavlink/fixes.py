@@ -46,7 +46,7 @@ class FixAnswer:
 class Sending:
     """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False with the
     reason in `why`. `t_sent_s` is when the fix was handed to the port, `outcome` the answer of the autopilot; both are
-    None until then. Once the fix is queued, only the link's thread changes these."""
+    None until then. Once the fix is queued, only the link's thread changes these fields."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -200,8 +200,9 @@ class Fixes:
             self._give_up(reason)
 
     def news(self, why_silent: Reason, now_s: float) -> list[News]:
-        """Return the texts for the ground station about what has changed since the last call: sending stops, because no
-        fix is answered (for the reason `why_silent`), or resumes; the answers are others."""
+        """Return the texts for the ground station about what has changed since the last call: the sending of fixes has
+        stopped, because none is answered (for the likely reason `why_silent`), or has resumed; or the autopilot answers
+        fixes in another way than before."""
         self.time_out(now_s)
         is_stopped, news = self._row >= UNANSWERED_MAX, self._news
         self._news = []

@@ -37,10 +37,11 @@ log = logging.getLogger(__name__)
 class LinkStats:
     """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
-    `trouble` is why the link is not open, or last was not; None once data arrives. `foreign_messages` came from another
-    autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or the ground has paused
-    the flight. `refused_why` says why the last refused fix was refused (None: none was). `commands` counts the commands
-    addressed to us on any link, by result, and `ignored_requests` the other messages to us that had no effect.
+    `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
+    from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or because a
+    ground station has paused the flight. `refused_why` says why the last refused fix was refused (None: none was).
+    `commands` counts the commands addressed to us on any link, by result, and `ignored_requests` the other messages to
+    us that had no effect.
     `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason.
     """
 

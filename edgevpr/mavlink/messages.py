@@ -204,8 +204,8 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
-    (511). On many autopilots the companion's port sends none of them unless asked. `firmware` is a MAV_AUTOPILOT; a
-    continuous channel (`is_continuous`) needs more."""
+    (511). Many autopilots send none of these reports to a companion computer unless asked. `firmware` is a
+    MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more reports, at higher rates."""
     rates_hz = _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
@@ -231,8 +231,8 @@ def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> 
 
 
 def named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
-    """Make a NAMED_VALUE_INT (252) for each whole number and a NAMED_VALUE_FLOAT (251) for each other; None: it is not
-    known, and nothing is made. docs/reference/ground-station.md has the names that are sent, of 10 letters at most."""
+    """Make a NAMED_VALUE_INT (252) for each whole number and a NAMED_VALUE_FLOAT (251) for each other number; a value
+    of None is unknown and gets no message. docs/reference/ground-station.md lists the names, of 10 letters at most."""
     boot_ms = _boot_ms(t_mono_s)
     return tuple(
         mavlink.MAVLink_named_value_int_message(boot_ms, name.encode(), value)

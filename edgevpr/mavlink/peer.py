@@ -43,11 +43,12 @@ class Speaker(NamedTuple):
 
 class Identity:
     """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
-    id. Another system id never takes its place. The same one at another address does so after 30 s of silence, with
-    steady heartbeats.
+    id. A sender with another system id never takes its place. A sender with the same system id at another address takes
+    its place once our autopilot has been silent for 30 s, if its own heartbeats have come steadily for 5 s.
 
-    `kept` is our autopilot (None: not heard yet), `news` a short text if it has become so by the last message at
-    another address. `foreign_messages` counts the messages refused since they came from another autopilot or address.
+    `kept` is our autopilot (None: not heard yet). `news` is a short text if the last message has made a sender at
+    another address our autopilot, else None. `foreign_messages` counts the messages that were refused, because they
+    came from another autopilot or address.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -112,9 +113,9 @@ class Identity:
 
 
 class Listener:
-    """Navigates by the reports of the autopilot, and gives the positions that a continuous channel sends; this one does
-    nothing. The methods are called in the link's thread; they never block and never raise. All times are of the
-    monotonic clock, in seconds.
+    """Base class of an object that navigates by the reports of the autopilot, and gives the positions that a continuous
+    channel sends; this one does nothing. The methods are called in the link's thread; they never block and never raise.
+    All times are of the monotonic clock, in seconds.
     """
 
     def hear_autopilot(self, t_s: float) -> None:

@@ -23,9 +23,10 @@ _ASK_AGAIN_S = 10.0
 
 @dataclass(slots=True, kw_only=True)
 class Readiness:
-    """All that the autopilot's messages tell about its readiness; None: unknown. Fields that end in `_s` are the time
-    at which something was last received (-inf: never). `answers_others`: it has answered another command of ours.
-    `asked_s` is when its origin was last requested, `had_origin` what was known of the origin before that."""
+    """All that the autopilot's messages tell about its readiness to accept a fix; None: unknown. Fields that end in
+    `_s` are the time at which something was last received (-inf: never). `answers_others`: it has answered another of
+    our commands than a fix. `asked_s` is when its origin was last requested, `had_origin` the result of `has_origin`
+    just before that."""
 
     is_px4: bool = False
     is_armed: bool | None = None
@@ -103,8 +104,8 @@ class Readiness:
 
 
 class Reason(NamedTuple):
-    """The reason for an answer in two forms: `brief` has at most 26 bytes, to fit a status text; `sentence` is a part
-    of a sentence about the autopilot ("it")."""
+    """The reason for an autopilot's answer, or for its silence, in two forms: `brief` has at most 26 bytes, to fit a
+    status text; `sentence` is a part of a sentence in which "it" is the autopilot."""
 
     brief: str
     sentence: str

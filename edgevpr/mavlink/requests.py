@@ -23,7 +23,7 @@ class Wish(IntEnum):
 
 
 class Wished(NamedTuple):
-    """A wish, and who made it: "system id/component id"."""
+    """A wish, and the sender who made it, as the text "system id/component id"."""
 
     wish: Wish
     sender: str

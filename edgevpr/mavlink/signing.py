@@ -82,8 +82,8 @@ class TimeStamps:
             return min(self._largest, _LATEST)
 
     def refusal(self, stream: Stream, stamp: int) -> str | None:
-        """Return in a few words why a message with this time stamp is refused. Return None if it is admitted, and note
-        the time stamp: so call this only for a message whose signature is right.
+        """Return in a few words why a message of `stream` with the time stamp `stamp` is refused, or None if it is
+        admitted. The time stamp of an admitted message is kept: call this only if the message's signature is right.
 
         Time stamps of a stream must increase. The first of a new stream must be within a minute of the largest, but the
         very first stream may be ahead by any time: so a board without a clock chip learns the time.

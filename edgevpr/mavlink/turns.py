@@ -1,5 +1,6 @@
 """Turns: the lock of a conversation. A turn is the time in which one thread, that of a link or of the flight, uses the
-conversation alone, while its clock stands still. Turns are recorded on the tape, so that a flight can be replayed."""
+conversation alone, while its clock stands still. Turns are recorded on the tape, the record of all that comes into a
+flight (`core.types.Tape`), so that the flight can be replayed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,8 +26,8 @@ class Turns:
 
     @contextmanager
     def taken(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn in the flight's thread. `what` is its name on the tape. Inside another turn this
-        has no effect: it is part of that turn."""
+        """Context manager: take a turn (wait for the lock, then hold it) in the flight's thread. `what` is the name of
+        the turn on the tape. Inside another turn of the same thread this has no effect: it is part of that turn."""
         with self._lock:
             if self._t_s is not None:
                 yield
@@ -48,8 +49,9 @@ class Turns:
 
     @contextmanager
     def of_link(self, name: str) -> Iterator[Callable[..., None]]:
-        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`,
-        which records on the tape an event of this turn."""
+        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`
+        that notes what happens in the turn, such as `step("heard", data)`. At its end, all steps go to the tape as one
+        record; a turn without a step is not recorded."""
         steps: list[tuple[Any, ...]] = []
         with self._lock:
             self._t_s = t_s = self._clock()

@@ -99,7 +99,8 @@ class Heights:
             self._range = (message.current_distance / 100 * max(0.0, lean), now_s) if is_good else None
 
     def now(self, over_takeoff_m: float, now_s: float) -> float:
-        """Return the height in metres: `over_takeoff_m`, that over the take-off point, if nothing better is recent."""
+        """Return the height above the ground in metres, by the best recent source. Without one, return
+        `over_takeoff_m`, the height over the take-off point."""
         for measured, good_for_s in ((self._range, _RANGE_FRESH_S), (self._terrain, _TERRAIN_FRESH_S)):
             if measured and now_s - measured[1] <= good_for_s and math.isfinite(measured[0]):
                 return measured[0]
@@ -107,9 +108,9 @@ class Heights:
 
 
 class Certainty:
-    """The standard deviation of one axis of the autopilot's own position. It is that of its position filter, if
-    reported (PX4). Else it starts from the last known position, by GPS or an accepted fix of ours, and grows by
-    DRIFT_M_S."""
+    """Estimates how accurate the autopilot's own position is, as the standard deviation of one axis: the value that its
+    position filter reports (PX4) or, without one, that of the last known position (by GPS or an accepted fix of ours),
+    which grows by DRIFT_M_S a second."""
 
     def __init__(self) -> None:
         self._known: tuple[float, float] | None = None  # standard deviation, time

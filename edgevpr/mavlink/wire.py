@@ -24,7 +24,7 @@ _SENDERS_MAX = 8  # senders whose incomplete messages are kept; a flood from inv
 
 
 def untapped(packet: bytes) -> None:
-    """Do nothing: the tap of a link without a tlog."""
+    """Do nothing with a packet: the tap of a link without a tlog (a file of all packets)."""
 
 
 class PacketReader:
