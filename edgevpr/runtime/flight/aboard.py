@@ -64,8 +64,8 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
 
 
 def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
-    """Measure how fast the technique is on this board, and have it compare as many candidates as there is time for.
-    Returns the expected performance."""
+    """Measure how fast the technique is on this board, and set the recogniser to compare as many candidates as there is
+    time for. Returns the expected performance (see `Outlook`)."""
     recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
     found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
     recogniser.candidates = found.candidates
@@ -94,8 +94,8 @@ def rate_hz(config: Config, recogniser: Recogniser) -> float:
 
 
 def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
-    """Report which technique flies, warn if fixes would be too late or the board's power is unverified, and return the
-    fields of the first line of the flight log."""
+    """Report, at the start of a flight, the technique that is used; warn if fixes would be too late or the board's
+    power is unverified. Return the fields of the first line of the flight log."""
     board = world.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)

@@ -102,8 +102,9 @@ class ToAutopilot:
                 )
 
     def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Send the messages about an event, and its fix if there is one to send. Return the event with the reports of
-        this fix (`fix`) and of the fix before it (`last_fix`), each None if there is none.
+        """Tell the autopilot and the ground station about an event: send its fix, if there is one to send, and its
+        figures. Return the event with the reports of this fix (`fix`) and of the fix before it (`last_fix`), each None
+        if there is none.
 
         `used_mah` is the charge that the board has drawn so far.
         """
@@ -133,15 +134,15 @@ class ToAutopilot:
             self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
     def compare_gps(self, off_m: float, is_wrong: bool) -> None:
-        """Send the distance `off_m` (metres) from the GPS position to a match. The navigator does not use GPS while it
-        `is_wrong`."""
+        """Send the distance `off_m` (metres) from the GPS position to a match. `is_wrong` is the judgement that GPS
+        contradicts the map: while it is True, the navigator does not use GPS."""
         with self._link.turn("gps"):
             self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong)
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Send the state of this companion computer (temperature None: unknown), and ask the autopilot for another
-        source set if that is wanted (see `SourceSets`). Call it once a second."""
+        """Send the health, load and temperature (None: unknown) of this companion computer, and ask the autopilot for
+        another source set if that is wanted (see `SourceSets`). Call it once a second."""
         with self._link.turn("report"):
             self._link.set_health(health)
             self._ask_for_sources()
@@ -174,8 +175,8 @@ class ToAutopilot:
         return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
-        """Count a fix that is held back because of `objection` (None: it is not), and report when holding back begins
-        and ends."""
+        """Count the fix if it is held back because of `objection` (None: it is not held back). Report the first fix of
+        a row that is held back, and the first one after it that is not."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:

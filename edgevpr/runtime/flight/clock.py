@@ -23,7 +23,8 @@ class Clock:
 
 
 def taped(clock: Clock, tape: Tape) -> Clock:
-    """Return clocks whose every reading is recorded on the `tape`, or played back from it; `sleep` stays as it is."""
+    """Return the same clocks with each reading recorded on the `tape` (the record of a flight's input) or played back
+    from it; `sleep` stays as it is."""
     names = [each.name for each in fields(clock) if each.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 

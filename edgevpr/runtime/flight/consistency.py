@@ -29,9 +29,9 @@ class Consistency:
         self._held: ComparedFix | None = None
 
     def weighed(self, fix: ComparedFix, has_gps: bool) -> tuple[str | None, bool]:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Returns
-        - why the fix is not believed (None: it is);
-        - whether it contradicts the expected position, and is believed because an earlier fix agrees with it."""
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Returns two values:
+        - the reason why the fix is not believed (None: it is believed);
+        - True if the fix contradicts the expected position, but is believed because an earlier fix agrees with it."""
         step_m = fix.off_m - fix.expected_m
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS:
             self._held = None

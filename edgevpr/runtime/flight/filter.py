@@ -20,7 +20,8 @@ _EYE = np.eye(2)
 class Drift:
     """Size of the errors of a path. `velocity_sd` (m/s) and `acceleration_sd` (m/s2) are the standard deviations, of
     one axis, for a path that nothing corrects. `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise`
-    (m/s2) are those of the random change of each error in one second."""
+    (m/s2) are the standard deviations of the random change of the error of position, velocity and acceleration in one
+    second."""
 
     velocity_sd: float
     acceleration_sd: float
@@ -41,8 +42,8 @@ INERTIAL = Drift(
 
 
 class DriftFilter:
-    """Estimate of the errors of one path. `map_sd_m` is the standard deviation, of one axis, of the error that all
-    fixes share."""
+    """Kalman filter that estimates the errors of one path. `drift` is the size of these errors, `map_sd_m` the standard
+    deviation, of one axis, of the error that all fixes share."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift, self._map_sd_m = drift, map_sd_m

@@ -56,7 +56,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 class Flight:
-    """A flight for which everything is open. Close it after `run`."""
+    """A flight whose map, log, links and source of frames are open. `open` makes it; close it after `run`."""
 
     def __init__(self, config: Config, crew: Crew) -> None:
         self._config, self._crew, self._opened = config, crew, ExitStack()
@@ -150,9 +150,9 @@ class Flight:
 
     def totals(self) -> dict[str, Any]:
         """Return the counts and costs of the flight so far: those of `FlightMeter.totals`; `queries`; `dropped`,
-        pictures not read in time (None: the source is a recording); `refused`, pictures that were not new and whole, by
-        reason; `latency_s`, age of the newest picture when it could be read, seconds (None: unknown); `left_out`,
-        places of the map that cannot be read."""
+        pictures not read in time (None: the source is a recording); `refused`, the number of pictures that were not new
+        and whole, by reason; `latency_s`, age of the newest picture when it could be read, seconds (None: unknown);
+        `left_out`, the number of places of the map that cannot be read."""
         source = self._crew.source
         return {
             "queries": self._tally.queries,
@@ -237,7 +237,8 @@ class Flight:
         )
 
     def _learn(self, event: Recognition) -> None:
-        """Add the frame to the map as a new place, if it is worth it; later frames may be recognised as that place."""
+        """Add the frame of an event to the map as a new place, if `Learner` finds it worth remembering; later frames
+        may be recognised as that place."""
         learner = self._crew.learner
         if learner is None:
             return

@@ -40,8 +40,8 @@ class FlightLog:
     `path` is the log of the newest flight. Before the first line of this flight, the file of an earlier flight is set
     aside, that is renamed to the next number (see `core.appending`). A file that reaches a quarter of `max_mb` (None:
     no limit) is set aside too. The numbered files share the other three quarters: the oldest are deleted. Each further
-    file of a flight begins with a copy of the start line, with `repeated` and with `part`, the number of the file
-    within the flight. If another process writes `path`, this flight writes numbered files only.
+    file of a flight begins with a copy of the start line, to which two fields are added: `repeated` (true) and `part`,
+    the number of the file within the flight. If another process writes `path`, this flight writes numbered files only.
 
     Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
     are synced to the disk (fdatasync) by the first line written a second or more after the last sync, or by the next
@@ -157,7 +157,8 @@ class FlightLog:
         self._file = None
 
     def _writable(self, more_bytes: int) -> FileIO:
-        """Return the open file, with room for `more_bytes`; a full file is set aside first. Raises OSError."""
+        """Return the file to be written, open and with room for `more_bytes`; a full file, or one of an earlier flight,
+        is set aside first. Raises OSError."""
         file = self._file or self._open()
         size, is_ours = _size_of(file), _identity(file) == self._ours
         if not size or (is_ours and size + more_bytes <= self._part_bytes) or not self._is_set_aside():

@@ -30,8 +30,8 @@ _OF_CANDIDATES = 0.6  # share of a query's time for comparing candidates, in a l
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Settings of recognition: queries per second, places compared per query, and the form of the index in RAM, which
-    never changes (None: the technique has no forms)."""
+    """Settings of recognition: `rate_hz`, queries per second; `candidates`, places compared per query; and `form`, what
+    a number of a descriptor takes in RAM (see the glossary), which never changes (None: the technique has no forms)."""
 
     rate_hz: float
     candidates: int
@@ -50,8 +50,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from one setting to another, and the reason. `back`: it goes up, towards the setting asked for. If nothing
-    is left to lower, both settings are the same."""
+    """Change from the setting `before` to the setting `after`, and the reason `why`. `back`: it is a change up, towards
+    the setting asked for. If a limit is exceeded and nothing is left to lower, both settings are the same."""
 
     before: Setting
     after: Setting
@@ -61,8 +61,8 @@ class Change:
 
 def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
     """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to each number
-    in `fewer`, largest first; those are known to accept no wrong place. Then the rate is halved, down to an eighth.
-    `keeps_rate`, for sequences, which need queries as often as the map was made, leaves the rate as it is."""
+    in `fewer`, numbers that are known to accept no wrong place, largest first. Then the rate is halved, down to an
+    eighth. With `keeps_rate` the rate stays as it is: a sequence needs queries as often as the map was made."""
     found = [asked]
     found += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
     while not keeps_rate and found[-1].rate_hz > asked.rate_hz / _SLOWEST:
@@ -80,7 +80,8 @@ def lowered(setting: Setting, asked: Setting) -> str:
 
 
 class Governor:
-    """Decides which of the `settings` (from `steps`, highest first) is in force."""
+    """Decides which of the `settings` (from `steps`, highest first) is in force, from measurements of the load: it goes
+    down one setting when one of the `limits` is exceeded, and up when there is room again."""
 
     def __init__(self, limits: Limits, settings: Sequence[Setting]) -> None:
         self._limits, self._settings, self._at = limits, list(settings), 0
@@ -126,7 +127,8 @@ class Governor:
         return None
 
     def _held_s(self, what: str, now_s: float, holds: bool) -> float:
-        """Return for how many seconds a condition has held without a break, 0 if it does not hold now."""
+        """Note whether the condition `what` holds now. Return for how many seconds it has held without a break, 0 if it
+        does not hold now."""
         if not holds:
             self._since_s.pop(what, None)
             return 0.0
@@ -140,8 +142,8 @@ class Governor:
         return next(iter(slower if hot and slower else below), None)
 
     def _load(self, reading: LoadReading) -> tuple[bool, str | None]:
-        """Return (whether the board is too hot, the limit that is exceeded, in words). None: no limit is, memory not
-        counted."""
+        """Judge a measurement, except its memory. Returns two values: True if the board is too hot; a few words about
+        the limit that is exceeded (None: none is)."""
         limits, temperature_c = self._limits, reading.temperature_c
         if temperature_c is not None and temperature_c >= limits.temperature_c:
             return True, f"{temperature_c:.0f} degrees, and {limits.temperature_c:.0f} are the limit"
@@ -167,8 +169,8 @@ class Governor:
         )
 
     def _nothing_left(self, what: str, why: str) -> Change | None:
-        """Return a change that changes nothing, to report that a limit is exceeded and no setting can be lowered. None:
-        that has been reported for `what` already."""
+        """Return a change between equal settings, which reports that a limit is exceeded and no setting can be lowered.
+        `what` is the limit ("memory" or "load"); None if this has been reported for it already."""
         if what in self._told:
             return None
         self._told.add(what)

@@ -42,15 +42,15 @@ class Herald:
         topic: str | None = None,
         **fields: Any,
     ) -> None:
-        """Report to all three at once: write a line of `kind`, with its fields, to the flight log, and `say` the text.
-        Without a `topic`, the kind is its topic."""
+        """Report to flight log, journal and ground station: write a line of `kind` with `fields` to the flight log, and
+        `say` the text to the other two. Without a `topic`, the kind is the topic of the text."""
         self.note(kind, **fields)
         self.say(severity, text, ground=ground, topic=topic or kind)
 
 
 class Trouble:
-    """A condition that begins and ends. The text `begun` is reported once when it begins, the text `over` once when it
-    ends. `is_so`: it has begun and has not ended."""
+    """Reports a bad condition once when it begins, with the text `begun`, and once when it ends, with the text `over`.
+    `kind` is that of its lines in the flight log. `is_so`: the condition has begun and has not ended."""
 
     def __init__(self, herald: Herald, kind: str, begun: str, over: str) -> None:
         self.is_so = False

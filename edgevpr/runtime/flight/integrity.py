@@ -25,10 +25,10 @@ _ATTITUDE_SD = math.tan(math.radians(1.0))
 
 
 class Integrity:
-    """Compares every accepted match with the GPS receiver. GPS `is_wrong` after three matches in a row, of different
-    places, with about the same offset from GPS; it is right again after three that agree with it. `map_sd_m` is the
-    standard deviation of the error that all matches share. `off_m` is the distance of the last match from GPS, metres
-    (None: there is no receiver)."""
+    """Compares every accepted match with the GPS receiver. GPS `is_wrong` after three matches in a row that contradict
+    it, of different places and with about the same offset from GPS; it is right again after three matches in a row that
+    agree with it. `map_sd_m` is the standard deviation of the error that all matches share. `off_m` is the distance of
+    the last match from GPS, metres (None: it could not be compared)."""
 
     def __init__(self, map_sd_m: float) -> None:
         self._map_sd_m = map_sd_m

@@ -17,10 +17,10 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
-    """One measurement for the governor. Since the last one, `cpu_share` is the share of all cores that this process
-    used (0..1), and `late_share` the share of the time that queries took (0 if nothing kept them waiting). `rss_mb` is
-    the memory of this process now; temperature (degrees Celsius) and `throttled` are those of the board (None:
-    unknown)."""
+    """One measurement for the governor. `cpu_share` (0..1) is the share of all cores that this process has used since
+    the last measurement, `late_share` the share of that time that queries took (0 if nothing kept them waiting).
+    `rss_mb` is the memory of this process now. `temperature_c` is that of the board in degrees Celsius, and `throttled`
+    says that the board slows itself down (None: unknown)."""
 
     cpu_share: float
     late_share: float
@@ -30,9 +30,10 @@ class LoadReading:
 
 
 class FlightMeter:
-    """Meter of a flight, which starts when it is made. `energy` sums up the stages of queries, `load` the work of the
-    loop. `thermal` is the newest measurement of the board's heat, `limit_c` the temperature at which the board slows
-    itself down, `queries_throttled` the number of queries while it did. All is recorded on the `tape`."""
+    """Meter of the charge, CPU time, memory and heat of a flight; it starts when it is made. `energy` sums up the costs
+    of queries, `load` the time for which the loop is busy. `thermal` is the newest measurement of the board's heat,
+    `limit_c` the temperature at which the board slows itself down, `queries_throttled` the number of queries while it
+    did. All measurements are recorded on the `tape`."""
 
     def __init__(
         self,
@@ -63,7 +64,8 @@ class FlightMeter:
         return self.totals()["used_mah"]
 
     def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
-        """Measure a block of code: its time, and the CPU time of all threads or of the calling one only."""
+        """Return a context manager that measures the code inside it: its time, and the CPU time of all threads or,
+        with `thread_only`, of the calling one."""
         return stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
     def count(self, event: Recognition) -> None:
@@ -74,9 +76,10 @@ class FlightMeter:
     def totals(self) -> dict[str, float]:
         """Return the totals since the start:
         - `used_mah`: charge drawn from the pack by the idle board and by this process (other programs are not counted)
-        - `process_mah`: the part of it that this process added; `process_cpu_s`: its CPU-seconds
-        - `marginal_mah`: the part of that which the stages of queries added; `stages_cpu_s`: their CPU-seconds
-        - `elapsed_s`: time since the start; `queries_throttled`: a count.
+        - `process_mah`: the part of `used_mah` that this process added to the idle board; `process_cpu_s`: its CPU time
+        - `marginal_mah`: the part of `process_mah` that queries added (reading a frame, recognising it, reporting the
+          result); `stages_cpu_s`: their CPU time
+        - `elapsed_s`: time since the start; `queries_throttled`: number of queries while the board slowed itself down.
         """
         process, board = self.energy.process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)

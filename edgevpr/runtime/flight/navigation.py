@@ -50,9 +50,9 @@ class PositionedMatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedFix:
-    """The fix of a match, and its prediction, in metres east and north. `path_m` (2,): point of the path when the frame
-    was taken; `off_m`, `expected_m` (2,): the offset of the fix from that point, and the predicted one;
-    `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
+    """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
+    the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
+    predicted offset; `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
 
     seen: PositionedMatch
     path_m: Doubles
@@ -62,9 +62,10 @@ class ComparedFix:
 
 
 class Navigation:
-    """Position from the autopilot's motion and our fixes. `drift` says what the path is summed up from: the autopilot's
-    velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard deviation, of one axis, of the
-    error that all fixes share. `has_gps`: at its last report, the autopilot had a GPS that is believed."""
+    """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
+    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard
+    deviation, of one axis, of the error that all fixes share. `has_gps`: at its last report, the autopilot had a GPS
+    that is believed."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -124,16 +125,17 @@ class Navigation:
         )
 
     def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
-        """Correct our position by a fix. `is_against`: it contradicts the expected position, and is believed all the
-        same."""
+        """Correct our position by a fix. `is_against`: the fix contradicts the expected position, and is believed all
+        the same (see `Consistency`)."""
         if self._path:
             hear = self._filter.trust_fix if is_against else self._filter.hear_fix
             hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
-        """Begin the path at a fix of a frame taken at `t_s`, when neither position nor velocity is known. Does nothing
-        for a path of velocities (`RECKONED`), which begins with a report of the autopilot."""
+        """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
+        frame was taken at `t_s`; `sd_m` is its standard deviation. Does nothing for a path of velocities (`RECKONED`),
+        which begins with a report of the autopilot."""
         if self._drift is INERTIAL:
             sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)

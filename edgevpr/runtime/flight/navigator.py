@@ -91,7 +91,7 @@ class Navigator(Listener):
             self._channel = channel
 
     def hear_autopilot(self, t_s: float) -> None:
-        """Note at `t_s` that an autopilot has appeared, or another one than before."""
+        """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
         with self._lock:
             self._appeared_s, self._vehicle = t_s, None
 
@@ -184,7 +184,7 @@ class Navigator(Listener):
         return estimate
 
     def _improved(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
-        """Advise what to send to an autopilot with a position of its own: only what makes that better."""
+        """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
@@ -229,8 +229,8 @@ class Slew:
         self._said = None
 
     def followed(self, estimate: Whereabouts) -> tuple[float, float, float]:
-        """Follow an estimate, later than the last one. Returns latitude, longitude, and the remaining distance to the
-        estimate in metres."""
+        """Move towards an estimate that is later than the last one. Returns latitude and longitude in degrees, and the
+        remaining distance to the estimate in metres."""
         here = estimate.position
         if self._said is None:
             self._said, self._at = estimate, (here.lat_deg, here.lon_deg)

@@ -60,7 +60,8 @@ class Path:
         return step_s
 
     def accelerate(self, t_s: float, acceleration_m_s2: Doubles) -> float:
-        """Add a point at `t_s`, reached with a mean acceleration (2,) over the ground; return the seconds as `fly`."""
+        """Add a point at `t_s`, reached with this mean acceleration (2,) over the ground, and return the seconds since
+        the last point, as `fly` does."""
         last = self._points[-1]
         return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
 

@@ -1,5 +1,5 @@
-"""The recording of a flight: its tape and its frames, with which `review` can fly it again on the ground.
-
+"""The recording of a flight: its tape (the record of all that comes in from outside) and its frames, with which
+`review` can fly it again on the ground.
 Each flight has a folder: `tape.jsonl`, one line for each input, and `frames/`, the pictures as JPEG. If the flight
 learns, `map.gpkg` is the map as it was at the start.
 
@@ -39,8 +39,8 @@ _log = logging.getLogger(__name__)
 
 
 class Recording(Tape):
-    """An open recording, which is also the flight's tape. `path` is its folder. `state` is None while it goes on, else
-    a sentence that says why it has ended. Close it (it is a context manager)."""
+    """An open recording: the `Tape` to which a flight writes all its input, and its frames. `path` is its folder.
+    `state` is None while it goes on, else a sentence that says why it has ended. Close it (it is a context manager)."""
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
         """Make a folder for this flight in `folder`. The oldest recordings there are deleted until they take at most
@@ -185,7 +185,8 @@ def recording_of(said: str | None, log: str | Path) -> Path | None:
 
 
 def frames_of(folder: Path) -> dict[str, Path]:
-    """Return the picture files of a recording, by the names of the frames in the flight log."""
+    """Return the picture files of the recording in `folder`, as a dict whose keys are the frames' names in the flight
+    log."""
     found = {}
     with open(folder / TAPE, "rb") as tape:
         for line in tape:

@@ -17,10 +17,11 @@ _MODE = 0o660  # positions are private, but the flight's group may read them
 
 
 class StatusFile:
-    """Writes the status to a file. Close it (it is a context manager), which removes the file."""
+    """Writes the status of a flight (a dict, see `Vitals._status`) to a file as JSON. Close it (it is a context
+    manager), which removes the file."""
 
     def __init__(self, path: str | Path) -> None:
-        """Try to write in the folder of `path`. Raises EdgevprError if no file can be made there."""
+        """Check that the file `path` can be written; `tell` writes it. Raises EdgevprError if it cannot be made."""
         self._path, self._new = Path(path), Path(f"{path}.new")
         try:
             if self._path.exists() and not self._path.is_file():

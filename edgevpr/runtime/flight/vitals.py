@@ -25,10 +25,10 @@ _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAG
 
 
 class Vitals:
-    """Pings the watchdog of systemd, and reports once a second how the flight goes: to systemd, to the status file, and
-    the state of this computer to the autopilot. It reports once, through the herald, when the camera is lost, frozen,
-    damaged or shows nothing, when nothing can be recognised any more, and when each of these is over. `remarks` are
-    functions that return a sentence for the status, or None."""
+    """Pings the watchdog of systemd, and reports once a second how the flight goes to systemd and to the status file,
+    and the state of this computer to the autopilot. It reports once, through the herald, when the camera is lost,
+    frozen, damaged or shows nothing, when nothing can be recognised any more, and when each of these is over. `remarks`
+    are functions that return a sentence for the status, or None."""
 
     def __init__(
         self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Sequence[Callable[[], str | None]]
@@ -46,7 +46,8 @@ class Vitals:
         self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
 
     def tell(self, event: Recognition) -> None:
-        """Take the newest query, and the newest match, from an event."""
+        """Keep an event, if it is a query, as the newest query and, if it was accepted, as the newest match, for the
+        status."""
         if event.frame and event.is_query:
             self._newest = {"t_frame_s": event.frame.t_mono_s, **_seen(event)}
             self._match = self._newest if event.accepted else self._match
@@ -159,7 +160,8 @@ class Vitals:
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
 
     def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
-        """Return (queries per second, cores kept busy) since the oldest measurement kept; None: there is no other."""
+        """Add a measurement, and return (queries per second, cores kept busy) since the oldest one kept; both are None
+        if there is no older one. `elapsed_s` and `cpu_s` are the time and the CPU time since the start."""
         self._looks.append((elapsed_s, self._tally.queries, cpu_s))
         begin_s, queries, begin_cpu_s = self._looks[0]
         span_s = elapsed_s - begin_s
@@ -169,7 +171,7 @@ class Vitals:
 
 
 def _seen(event: Recognition) -> dict[str, Any]:
-    """Return what the status says of a query. Null: not known; there is a position only of an accepted match."""
+    """Return the fields of the status about a query. None: unknown; only an accepted match has a position."""
     best, here = event.best, event.position
     return {
         "query": event.name,

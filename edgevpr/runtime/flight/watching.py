@@ -23,9 +23,9 @@ _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts the events of a flight: `queries`; those `accepted`; `unusable` frames, which could not become a query;
-    `failed` queries; `failed_in_a_row`, the failed events since the last good one; and `nothing_in_a_row`, the pictures
-    in a row that hold too little to be recognised."""
+    """Counts the events of a flight: `queries`; `accepted` queries; `unusable` frames, which could not become a query;
+    `failed` queries; `failed_in_a_row`, the failed events since the last good one; and `nothing_in_a_row`, the last
+    pictures in a row that hold too little to be recognised."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
@@ -47,11 +47,9 @@ class Tally:
 
 
 class MapWatch:
-    """Watches the map. Each place that is left out because it cannot be read gets a log line of kind "left out"; the
-    ground station is told of the first. When the whole file cannot be read, and when it can be again, that is reported
-    as "map".
-
-    `left_out` is the number of places left out.
+    """Watches the map for damage. Each place that is left out because it cannot be read gets a log line of kind "left
+    out"; only the first is reported to the ground station. When the whole file cannot be read, and when it can be read
+    again, that is reported with the kind "map". `left_out` is the number of places left out.
     """
 
     def __init__(self, herald: Herald) -> None:
@@ -83,11 +81,11 @@ class MapWatch:
 
 
 class Sight:
-    """Reports once when the aircraft leaves the map and when the map is found again, and when the camera is tilted too
-    far and when no longer.
+    """Reports once when the aircraft leaves the map, once when the map is found again, once when the camera is tilted
+    too far, and once when it no longer is.
 
-    A picture that shows nothing, is not worth a search, could not be used or is tilted too far does not count as a
-    miss.
+    The map counts as left after many queries in a row that are not accepted. A picture that shows nothing, is not worth
+    a search, could not be used or is tilted too far is not counted among them.
     """
 
     def __init__(self, herald: Herald) -> None:

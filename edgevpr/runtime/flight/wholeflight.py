@@ -16,9 +16,10 @@ Line = dict[str, Any]
 
 @dataclass(slots=True, kw_only=True)
 class Stretch:
-    """The lines of one flight in one file, from byte `begin` to byte `end`. `flight` identifies the flight: the time
-    of its start line on both clocks (None: it has none). `first` and `last` are the numbers of the first and the last
-    of the flight's parts that begin here."""
+    """The lines of one flight in one file, from byte `begin` to before byte `end`. `flight` identifies the flight by
+    its start line: (time in UTC, time on the monotonic clock), None without a start line. A flight is split into
+    numbered parts, each with a start line of its own: `first` and `last` are the numbers of the first and the last part
+    in this file."""
 
     path: Path
     begin: int

@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 
 
 class StopNow(BaseException):
-    """Raised to end a flight at once."""
+    """Raised by a signal to end a flight at once; a BaseException, so that no handler of errors catches it."""
 
 
 class Stop:
@@ -52,8 +52,8 @@ class Stop:
 
     @contextmanager
     def beginning(self) -> Iterator[None]:
-        """Let a signal end the flight at once inside this context, even one that came before it. This is not recorded:
-        nothing has been flown that could be replayed."""
+        """Context manager for the start of a flight: a signal raises StopNow inside it, also a signal that came before
+        it. This is not recorded, since nothing has been flown that could be replayed."""
         self._begins = True
         try:
             if self._asked:
@@ -64,7 +64,7 @@ class Stop:
 
     @contextmanager
     def breaks_off(self) -> Iterator[None]:
-        """Let a signal interrupt the work inside this context by StopNow."""
+        """Context manager: a signal interrupts the work inside it by StopNow."""
         self._breakable = True
         try:
             yield
@@ -75,9 +75,9 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """External parts of a flight, which a test or a replay replaces.
+    """External parts of a flight: all that it reads from and writes to. A test or a replay replaces them.
     - `place_map`: path of the map (None: none is configured); `log`: settings of the flight log
-    - `tape`: records or plays back all input; `clock`: the clocks
+    - `tape`: records all input of the flight, or plays it back (see `Tape`); `clock`: the clocks
     - `open_source`: opens the source of frames, given the seconds between two frames
     - `link`, `ground`: classes of the links to the autopilot and to the ground station
     - `signing`: of their packets; `tap`: is called with each packet sent or received
@@ -123,7 +123,8 @@ class Crew:
 
 @contextmanager
 def signals(stop: Stop) -> Iterator[None]:
-    """Let SIGTERM and SIGINT call `stop` inside this context; SIGHUP is ignored: a closed terminal ends no flight."""
+    """Context manager: SIGTERM and SIGINT call `stop` inside it. SIGHUP is ignored: a closed terminal ends no
+    flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
     handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
