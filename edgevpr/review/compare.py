@@ -26,9 +26,9 @@ PROGRAM = "version", "machine", "python", "libraries"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """A line that differs: its kind, its time and the name of its query (None: it is about no query). `fields` has the
-    fields that differ, by dotted name (like "fix.sent"). `only_in` is "flight" or "replay" if the other log has no such
-    line (None: both have)."""
+    """A log line that differs between flight and replay: its kind, its time and the name of its query (None: it is
+    about no query). `fields` has the fields that differ, by dotted name (like "fix.sent"). `only_in` is "flight" or
+    "replay" if the other log has no such line (None: both have)."""
 
     kind: str
     t_mono_s: float
@@ -39,8 +39,9 @@ class Difference:
 
 @dataclass(slots=True)
 class Lines:
-    """Comparison of two logs: how many lines are `alike`, the `others`, which differ, and how many lines of the flight
-    come `after` the end of the replay. `program` has the fields of `PROGRAM` that differ."""
+    """Comparison of the logs of flight and replay: the number of lines that are `alike`, the `others`, which differ,
+    and the number of lines of the flight that come `after` the end of the replay. `program` has those fields of the
+    first line that describe the program (see `PROGRAM`) and differ."""
 
     alike: int = 0
     others: list[Difference] = field(default_factory=list)
@@ -76,7 +77,8 @@ def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
 
 
 def _keyed(lines: Iterable[Line]) -> dict[tuple[Any, ...], Line]:
-    """Return the lines by their keys: kind, time and query, and the number among the lines in which these are equal."""
+    """Return the lines as a dict. A key is (kind, time, query, number): lines with equal kind, time and query are
+    numbered from 0."""
     seen: Counter[tuple[Any, ...]] = Counter()
     keyed = {}
     for line in lines:
@@ -137,8 +139,12 @@ def _unnumbered(packet: bytes) -> bytes:
 
 
 def beside(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:
-    """Put the queries of a flight and of its replay with another configuration side by side: those that end otherwise,
-    that is with another place accepted, a summary of both, and how far apart (metres) their positions are at most."""
+    """Put the queries of a flight (the lines `then`) and of its replay with another configuration (`now`) side by side.
+    Returns a dict:
+    - `queries`: those that end otherwise (another place accepted, or none), each with `query`, `then` and `now`
+    - `summary`: by name, a figure of the flight and that of the replay; `alike`: number of queries that end alike
+    - `apart_at_most_m`: largest distance between the two positions of a query (None: no query has two).
+    """
     flown, again = ({each.name: each for each in read_lines(lines, Path()).queries} for lines in (then, now))
     pairs = [(name, flown.get(name), again.get(name)) for name in flown | again]
     placed = [(one.at, other.at) for _, one, other in pairs if one and other and one.at and other.at]

@@ -2,7 +2,8 @@
 the reports of flights (`review.page`) and of evaluations (`lab.evaluate.page`).
 
 Charts follow the width of the page, while their lines and dots keep their thickness. Their text is HTML beside the SVG,
-so that it is readable on a phone. A `colour` is a CSS class that sets the colour.
+so that it is readable on a phone. A `colour` is a CSS class that sets the colour. Functions that return a str return
+HTML, unless they say otherwise.
 """
 
 import base64
@@ -139,8 +140,8 @@ def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: floa
 
 
 def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
-    """Return a chart of points as HTML, "" without points. Each is (x, value, short text, colour), with values from 0
-    to `top`. Texts that would lie over each other are moved to the right."""
+    """Return a chart of `points` as HTML, "" without points. Each point is (x, value, short text, colour), with values
+    from 0 to `top`. Texts that would lie over each other are moved to the right."""
     taken: list[tuple[float, float]] = []
     marks = tags = ""
     for x, value, text, colour in points:
@@ -228,7 +229,7 @@ def times(span_s: float) -> Axis:
 
 
 def _known_parts(points: Points) -> Iterator[Points]:
-    """Split a line wherever points are missing for an unusual time, and yield its parts."""
+    """Split a line wherever the step in x between two points is unusually long (see `_GAP`), and yield its parts."""
     steps = [after[0] - before[0] for before, after in pairwise(points)]
     most = max(_LEAST_GAP, _GAP * sorted(steps)[len(steps) // 2]) if steps else 0.0
     breaks = [at for at, step in enumerate(steps, start=1) if step > most]

@@ -46,8 +46,8 @@ class LoggedQuery:
     `at` is the position of an accepted match, `place_at` that of the place found. `autopilot_at` and `gps_at` are the
     aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the distance from the match to
     `autopilot_at` if the autopilot has GPS, else to `gps_at`. `wall_ms` is the time of encoding and matching,
-    `latency_ms` the age of the newest picture, `cores` how many cores the process kept busy since the query before, and
-    `has_link` says whether the autopilot was heard."""
+    `latency_ms` the age of the newest picture when it could be read, `cores` the number of cores that the process kept
+    busy since the query before. `has_link`: the autopilot was heard."""
 
     name: str
     t_s: float
@@ -110,7 +110,8 @@ class LoggedFlight:
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
-    """Read the last flight of a log. `wholeflight.flight_of` explains this, and what is raised."""
+    """Read the last flight of the log `path`. Raises UsageError if there is no such file, and EdgevprError if it has no
+    line of a flight (see `wholeflight.flight_of`)."""
     lines = flight_of(path)
     flight = read_lines(lines, lines.path)
     flight.missing = lines.missing
@@ -150,7 +151,7 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
 
 
 def _take_answer(query: LoggedQuery | None, line: dict[str, Any]) -> None:
-    """Note in the fix of a query what became of it."""
+    """Set outcome, reason and latency in the fix of a query from a log line of kind "answer". None: no such query."""
     if query and query.fix:
         query.fix.outcome = _outcome(line, line.get("result"))
         query.fix.why = text(line, "why") or query.fix.why

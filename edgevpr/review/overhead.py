@@ -32,8 +32,8 @@ _FIXES = (
 @dataclass(frozen=True, slots=True)
 class MapGround:
     """The places of a map that can be drawn: `at` has (position; pose of the picture, None if unknown) for each place
-    with a position. `places` counts all, also those without. `trouble` is a sentence on why places are missing (None:
-    none are)."""
+    with a position. `places` is the number of all places, also of those without a position. `trouble` is a sentence on
+    why places could not be read (None: all could)."""
 
     at: Sequence[tuple[Point, Pose | None]] = ()
     places: int = 0

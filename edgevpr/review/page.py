@@ -90,9 +90,9 @@ _WORST: tuple[tuple[int | None, Callable[[LoggedQuery], float | None], str], ...
 
 
 class Album:
-    """Finds pictures by the names that the log gives them: in `recorded`, the frames of a recording by name, else as
-    files in `folders`. The flight and the map have an album each, since their pictures often have equal names. Raises
-    UsageError for a folder that does not exist."""
+    """Finds pictures by the names that the log gives them: in `recorded` (files of a recording by the names of their
+    frames) or else as files in `folders`. The flight and the map have an album each, since their pictures often have
+    equal names. Raises UsageError for a folder that does not exist."""
 
     def __init__(self, folders: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
         self._recorded = recorded
@@ -238,8 +238,8 @@ def _all(queries: Sequence[LoggedQuery], field: str) -> list[float]:
 
 
 def worst(queries: Sequence[LoggedQuery]) -> list[Moment]:
-    """Return the worst moments, at most `_MOST`, each a query and why it is shown. Those that could have been dangerous
-    come first, and of each kind the worst."""
+    """Return the worst moments, at most `_MOST`, each (query, sentence on why it is shown). The kinds that could have
+    been dangerous come first, and of each kind the worst moments."""
     kinds = []
     for first, badness, why in _WORST:
         bad = [(known, query) for query in queries if (known := badness(query)) is not None]
@@ -255,7 +255,7 @@ def worst(queries: Sequence[LoggedQuery]) -> list[Moment]:
 
 
 def _silences(queries: Sequence[LoggedQuery]) -> list[Moment]:
-    """Return the middles of the times without an accepted match, the longest first."""
+    """Return a moment in the middle of each long time without an accepted match, the longest time first."""
     moments = []
     runs = [list(several) for accepted, several in groupby(queries, lambda each: each.accepted) if not accepted]
     for run in sorted(runs, key=lambda run: run[0].t_s - run[-1].t_s):

@@ -42,8 +42,9 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Result of a replay: the lines of its log, the comparison of its packets with those of the flight, why it ended
-    before the flight did (None: it did not), and how many answers it had to guess (see `Playback`)."""
+    """Result of a replay: the `lines` of its log; the comparison of its `packets` with those of the flight;
+    `why_ended`, the reason why it ended before the flight did (None: it did not); and `guessed`, the number of answers
+    that were not on the tape where they were asked for (see `Playback`)."""
 
     lines: list[Line]
     packets: Packets
@@ -118,7 +119,8 @@ def _picture(folder: Path, say: Say, number: int) -> Image:
 
 
 def _map_of(folder: Path, temporary: Path, config: Config, map_path: str | None) -> str | None:
-    """Return the path of the map (None: none); of a flight that learnt, that of a copy of the map as it began."""
+    """Return the path of the map to fly with (None: the flight had none). For a flight that learnt, it is that of a
+    copy, in `temporary`, of the map as it was at the start."""
     if config.mapping.learn:
         copy = temporary / MAP
         if (folder / MAP).is_file():

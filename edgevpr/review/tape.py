@@ -52,8 +52,8 @@ class TapeEnded(BaseException):
 
 
 class ReplayedLink(Link):
-    """A link without a port and a thread, whose turns come from the tape, a `Playback`. The method `_NAME` repeats the
-    step NAME of a turn."""
+    """A link without a port and a thread, whose turns come from the tape, a `Playback`. Each step of a turn, such as
+    "heard", is repeated by the method of that name, such as `_heard`."""
 
     def start(self) -> None:
         """Let the playback perform the link's turns from now on."""
@@ -117,7 +117,8 @@ class ReplayedGround(GroundLink, ReplayedLink):
 
 
 class SupposedLink(ReplayedLink):
-    """A link on which the autopilot sends what it sent in the flight. A packet to it counts as sent at once."""
+    """The link of a "what if" (see `Supposed`): it receives what the autopilot sent in the flight, and a packet to the
+    autopilot counts as sent at once."""
 
     def _said(self, then: str | None) -> None:
         while chosen := self._conversation.next_packet():
@@ -163,9 +164,9 @@ class ReplayedSigning(Signing):
 
 
 class Playback(Tape):
-    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns, given their
-    time and steps; they are performed in the order of the tape. `packets` compares the packets sent. `link` and
-    `ground` are the classes of the links that a replay uses.
+    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns, given the
+    time and the steps of a turn; turns are performed in the order of the tape. `packets` compares the packets sent with
+    those of the flight. `link` and `ground` are the classes of the links that a replay uses.
 
     Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
     the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
@@ -228,8 +229,8 @@ class Playback(Tape):
         return self._notes[self._at] if self._at < len(self._notes) else None
 
     def _comes(self, kind: str) -> bool:
-        """Tell whether an answer of `kind`, or the end, comes before the next frame. No answers are skipped to read a
-        clock: False for it."""
+        """Return True if an answer of `kind`, or the end of the flight, comes before the next frame. For a clock return
+        False, since no answers are skipped to read one."""
         for at in range(self._at, len(self._notes)) if kind not in _CLOCKS else ():
             if self._notes[at][0] in (kind, "stopped"):
                 return True
@@ -248,9 +249,9 @@ class Playback(Tape):
 
 
 class Supposed(Playback):
-    """Playback for a "what if": a flight with another configuration, which may ask for and send other things than it
-    did. Its time is that of the tape and goes on from frame to frame; computing takes no time. Questions about the
-    machine get the newest answer on the tape."""
+    """Playback for a "what if": the flight with another configuration, which may ask for and send other things than the
+    recorded flight did. Its time is that of the tape and goes on from frame to frame; computing takes no time.
+    Questions about the machine get the newest answer on the tape."""
 
     link, ground = SupposedLink, SupposedGround
     _has_ended = False

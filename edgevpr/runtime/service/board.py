@@ -21,8 +21,9 @@ LOG_ROOM_MB = 10  # some hours of queries
 
 
 def board_findings(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check this machine for a flight with `config` over the link `address` (None: no link). `root` is the root of the
-    file system with /proc, /sys and /dev. Raises ConfigError if the board is unknown."""
+    """Check this machine for a flight with `config` over the link `address` (None: no link), and yield a finding for
+    each check. `root` is the root of the file system with /proc, /sys and /dev. Raises ConfigError if the board is
+    unknown."""
     yield _memory(load_board(config.board).memory_max_mb, root)
     yield fine("cores", f"{machine.cores(root):g} for this process")
     if address and address.kind == "serial":

@@ -1,5 +1,6 @@
 """`edgevpr check`: checks whether a configuration is ready to fly. It opens everything that `edgevpr run` opens, and
-closes it again. This file also learns the mask of what the camera shows besides the ground."""
+closes it again. This file also learns the mask: the parts of the frames that never show ground, such as a display that
+is drawn over them."""
 
 import os
 import time
@@ -42,10 +43,11 @@ _LEARNT_FROM, _APART_S = 3 * FEWEST_FRAMES, 0.5
 def check(
     config_path: str | Path, *, offline: bool = False, say: Callable[[str], None] = lambda text: None
 ) -> list[Finding]:
-    """Check everything that a flight needs. An error that the user can correct becomes a finding and is never raised.
+    """Check everything that a flight needs, and return a finding for each part. An error that the user can correct
+    becomes a finding and is never raised.
 
-    A frame of the source and a heartbeat of the autopilot are waited for, unless `offline`: then it is enough that
-    source and link can be opened. `say` is called with a short text about what is waited for, and with "" after it.
+    The check waits for a frame of the source and a heartbeat of the autopilot, unless `offline`: then it is enough that
+    source and link can be opened. `say` is called with a short text while the check waits, and with "" after it.
     """
     try:
         config = load_config(config_path)

@@ -42,7 +42,7 @@ class Diagnosis:
 def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
     """Check the autopilot at the other end of the link `address`, and this machine (its files below `root`).
 
-    `say` is called with a short text about what is waited for, and with "" after it. Raises LinkAddressError for an
+    `say` is called with a short text while answers are awaited, and with "" after that. Raises LinkAddressError for an
     address that is wrong, and ConfigError for a board that is unknown or a signing key that cannot be used.
     """
     settings = config.mavlink
@@ -66,13 +66,15 @@ def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], roo
 
 
 def intent_of(config: Config) -> FlightIntent:
-    """Return what a flight with this configuration will do. Raises ConfigError if the board is unknown."""
+    """Return what a flight with this configuration intends, as far as the checks of the autopilot depend on it. Raises
+    ConfigError if the board is unknown."""
     return FlightIntent(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
 
 
 def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int]) -> Finding:
-    """Return the finding that explains why no heartbeat was received, by what else arrived: `bad_bytes` that are no
-    MAVLink, autopilots of the system ids `others`, messages `refused` by the check of signatures, counted by reason."""
+    """Return the finding that explains why no heartbeat was received, from what else has arrived: `bad_bytes` is the
+    number of bytes that are no MAVLink, `others` are the system ids of other autopilots, and `refused` has the number
+    of messages that the check of signatures refused, by reason."""
     if refused:
         why = max(refused, key=lambda reason: refused[reason])
         return wrong("link", f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")
@@ -92,8 +94,8 @@ def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Map
 
 
 def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: FlightIntent) -> Iterator[Finding]:
-    """Check what was read from the autopilot against what the flight will do: some findings hold for every autopilot,
-    others follow the rules of its firmware."""
+    """Check what was read from the autopilot against what the flight will do, and yield a finding for each check: those
+    for every autopilot, and those of the rules of its firmware."""
     yield _link(reading, address)
     yield _signing(reading)
     if reading.other_systems:

@@ -8,7 +8,8 @@ from edgevpr.core.errors import EdgevprError
 
 @dataclass(frozen=True, slots=True)
 class FlightIntent:
-    """Intent of a flight: whether it sends fixes (else it is a dry run), and the seconds between two queries."""
+    """Intent of a flight, against which an autopilot is checked: `sends_fixes` (False: a dry run, which sends none) and
+    `every_s`, the seconds between two queries."""
 
     sends_fixes: bool
     every_s: float
@@ -36,7 +37,8 @@ def wrong(what: str, message: str, *changes: str) -> Finding:
 
 
 def judged(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
-    """Return the finding that is `good` or, with the changes that put it right, `bad`."""
+    """Return a fine finding with the text `good` if `ok`, else a wrong one with the text `bad` and the `changes` that
+    put it right."""
     return fine(what, good) if ok else wrong(what, bad, *changes)
 
 

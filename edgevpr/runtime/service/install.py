@@ -39,8 +39,9 @@ log: {path: /var/log/edgevpr/flight.jsonl}
 def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
     """Install the service on this machine. Raises EdgevprError, one sentence, if a step fails.
 
-    `config` becomes its configuration (None: an existing one stays, else a first one is written). With `dry_run`
-    nothing is changed. `say` is called with a line about each step. `root` is the folder that holds the system.
+    The file `config` is copied and becomes the configuration of the service (None: an existing one stays; without one,
+    a first one is written). With `dry_run` nothing is changed. `say` is called with a line about each step. `root` is
+    the root of the file system, another folder in tests.
     """
     if not dry_run:
         _require_right_to_change(root)
@@ -91,7 +92,8 @@ def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/"))
 
 
 def _walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> None:
-    """Say each step, and take it unless `dry_run`. Raises EdgevprError for the first one that fails."""
+    """Carry out the steps in order, or none with `dry_run`; `say` gets a line about each. Raises EdgevprError for the
+    first step that fails."""
     before = os.umask(0o022)  # the service's user is to read what root writes
     try:
         for what, take in steps:

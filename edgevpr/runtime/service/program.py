@@ -1,5 +1,6 @@
-"""The program of the service: a virtual environment with a copy of the running edgevpr and the packages that it needs.
-`install` makes it. Each step may be repeated, so that a run after an interrupted one continues where that stopped."""
+"""The program of the service: a virtual environment (`venv`) with a copy of the running edgevpr and the packages that
+it needs. The functions are steps of `install`. Each may be repeated, so that a run after an interrupted one completes
+the work."""
 
 import os
 import shutil
@@ -21,8 +22,8 @@ _SCRIPT = "#!{python}\nimport sys\n\nfrom edgevpr.cli.main import program\n\nsys
 
 
 def command(*words: str | Path, **environment: str) -> None:
-    """Run a program with `environment` added to ours. If it fails, raise EdgevprError with the last line of its
-    output."""
+    """Run a program, `words` being its name and arguments, with `environment` added to our variables. If it fails,
+    raise EdgevprError with the last line of its output."""
     path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
     name, variables = Path(words[0]).name, {**os.environ, "PATH": path, **environment}
     try:
@@ -61,7 +62,8 @@ def make_environment(venv: Path) -> None:
 
 
 def install_packages(venv: Path) -> None:
-    """Install the packages that edgevpr needs, by their hashes. Without a network this succeeds if all are there."""
+    """Install the packages that edgevpr needs, and check them by their hashes. Without a network this succeeds if all
+    are installed already."""
     pip = (venv / "bin" / "python", "-I", "-m", "pip", "--disable-pip-version-check", "--no-input", "install")
     lock = shipped("deploy") / "requirements.lock"
     (venv / _UNFINISHED).touch()

@@ -42,8 +42,9 @@ SILENT_S = 5.0  # aux_global_position.cpp: after so long without message 296, PX
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirmwareRules:
     """Rules of one firmware. `knows_fixes`: first version (major, minor) that takes position fixes. `parameters`: names
-    of those to read. `findings` checks the answers of an autopilot for a flight. `port_changes` returns the settings
-    that the autopilot's serial port needs at a baud rate (`SERIALn`: n is the number of the port)."""
+    of the parameters to be read. `findings` checks the answers of an autopilot for a flight. `port_changes` takes a
+    baud rate and returns the parameters that the autopilot's serial port needs for it, each as a text such as
+    "SERIALn_PROTOCOL=2" (n: the number of the port)."""
 
     name: str
     knows_fixes: tuple[int, int]
