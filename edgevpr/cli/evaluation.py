@@ -210,7 +210,7 @@ def _rows(args: Namespace) -> "dict[str, RowPlan]":
 
 
 def _say_cameras(plan: "EvaluationPlan") -> None:
-    """Print a note for each set whose camera is taken to look ahead because no flag or file says where it looks."""
+    """Print a note for each set whose camera is assumed to look ahead because no flag or file says where it looks."""
     from edgevpr import techniques
 
     for name, of in plan.sets.items():

@@ -129,7 +129,8 @@ def run_flight(args: Namespace) -> int:
 
 
 def run_check(args: Namespace) -> int:
-    """Run `check`: try whether a flight can start with a configuration, and print what was found; or learn a mask."""
+    """Run `check`: check whether a flight can start with a configuration, and print the findings; or, with
+    --learn-mask, learn a mask."""
     from edgevpr.runtime.service.check import check, learn_mask
     from edgevpr.runtime.service.finding import lines
 

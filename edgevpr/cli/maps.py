@@ -168,7 +168,7 @@ def map_calibrate(args: Namespace) -> int:
 
 
 def map_info(args: Namespace) -> int:
-    """Run `map info`: print what a map holds."""
+    """Run `map info`: print what a map holds, and what it takes on disk and in RAM."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of

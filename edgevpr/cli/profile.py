@@ -90,7 +90,8 @@ def profile(args: Namespace) -> int:
 
 
 def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, str | None, tuple[Trial, ...]]":
-    """Return, from the flags, the plan of the flight, the technique of --map, and what to try, in all its forms."""
+    """Make three things from the flags: the plan of the flight; the technique of --map (None: there is no --map); and
+    the techniques to try, each in all its forms."""
     from edgevpr import techniques
     from edgevpr.core.config import load_config
     from edgevpr.places.mapfile import PlaceMap
@@ -138,7 +139,8 @@ def _detect(args: Namespace) -> int:
 
 
 def _measure(args: Namespace, quiet: bool) -> None:
-    """Measure this machine, and store the figures. `quiet`: an estimate follows, which prints the JSON."""
+    """Measure this machine, and store and print the results. With `quiet` and --json nothing is printed: an estimate
+    follows, which prints JSON of its own."""
     from edgevpr import techniques
     from edgevpr.power.boards import load_board
     from edgevpr.power.speed import micro_benchmark

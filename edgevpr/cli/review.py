@@ -87,7 +87,8 @@ def _read(log: str) -> "LoggedFlight":
 
 
 def _ground(path: str | None, must_exist: bool) -> "MapGround":
-    """Read the places of the map at `path`. One that the log names may be missing here: the result then says so."""
+    """Read the places of the map at `path` (None: the log names no map). If it cannot be read, raise MapError or
+    UsageError with `must_exist`, else return a result without places that says why."""
     from edgevpr.review.overhead import MapGround, read_ground
 
     if path is None:

@@ -73,7 +73,7 @@ def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -
 
 
 def add_keys(parser: ArgumentParser, *names: str) -> None:
-    """Add the flags of the configuration keys `names` (none: of all keys), such as "source.mask"."""
+    """Add the flags of the configuration keys `names`, such as "source.mask"; without names, those of all keys."""
     for key in keys_of():
         if not key.flags or (names and key.name not in names):
             continue
@@ -89,8 +89,8 @@ def value_of(args: Namespace, name: str) -> Any:
 
 
 def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config:
-    """Make the configuration from the file `path` (None: the defaults). Flags override it; `others`, by key, override
-    both."""
+    """Make the configuration from the file `path` (None: the defaults). Flags override the file, and the values
+    `others`, by configuration key, override both."""
     said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
     return load_config(path, said | others)
 
@@ -109,7 +109,7 @@ def path_of(text: str | None) -> Path | None:
 
 
 def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
-    """Report that an image cannot be used, and add the error to `unusable`."""
+    """Report that an image cannot be used, and add the error to the list `unusable`; the command goes on without it."""
     report(str(error))
     unusable.append(error)
 
@@ -179,8 +179,8 @@ def count(text: str) -> int:
 
 
 def write_out(target: str, source: str, write: Callable[[TextIO], T]) -> T:
-    """Write the file `target`, whole or not at all, by calling `write` with it as an open text file, and return what
-    that returns. Raises UsageError if it is the file `source`, which was read, or has no folder."""
+    """Write the file `target`, whole or not at all: call `write` with the open text file, and return its result. Raises
+    UsageError if `target` is the file `source`, which was read, or if its folder does not exist."""
     from edgevpr.core.files import require_folder, write_whole
 
     path = Path(target)

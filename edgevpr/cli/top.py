@@ -51,7 +51,7 @@ def run_top(args: Namespace) -> int:
 
 
 def lines_of(status: dict[str, Any]) -> list[str]:
-    """Return the status for people, as lines of a label and a text."""
+    """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
     latency, throttled = _known(", {:.2f} s old", status["latency_s"]), ", the board slows itself down"
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [

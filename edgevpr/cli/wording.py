@@ -45,7 +45,8 @@ def of_made(path: str, made: "MadeMap") -> Iterator[str]:
 
 
 def of_refined(path: str, refined: "Refined") -> Iterator[str]:
-    """Yield where the pictures of a map were found to lie."""
+    """Yield the result of `map refine`: how many pictures were corrected, by how much, and which contradict the
+    others."""
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return
@@ -65,7 +66,8 @@ def of_refined(path: str, refined: "Refined") -> Iterator[str]:
 
 
 def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
-    """Yield what a map holds. `confidence` says how sure its matches can be (None: they are judged by fixed limits)."""
+    """Yield what a map holds. `confidence` is a sentence on how sure its matches can be (None: they are judged by fixed
+    limits), `ram_mb` the memory that the map takes in a flight."""
     spec = info.spec
     settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
     yield f"{info.path}: {info.places} places, {info.with_position} with a position"
@@ -88,7 +90,7 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
 
 
 def of_check(found: "MapCheck") -> Iterator[str]:
-    """Yield what is damaged in a map."""
+    """Yield the result of `map check`: the places that can be read, and what is damaged."""
     yield f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read"
     yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
@@ -126,7 +128,8 @@ def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator
 
 
 def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
-    """Yield how a flight ends with another configuration. `found` is the result of `beside`."""
+    """Yield how the queries of a flight end with another configuration. `found` is the result of
+    `review.compare.beside`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
     others = found["queries"]
     yield from _first([f"{each['query']}: {_said(each['then'])}; what if: {_said(each['now'])}" for each in others])
     values = [["-" if each is None else str(each) for each in both] for both in found["summary"].values()]
