@@ -109,7 +109,7 @@ $(VENV)/clients/installed: $(VENV)/installed
 # Flights with a real ArduPilot in its own simulator, whose built source EDGEVPR_ARDUPILOT names, into
 # benchmarks/results/: two and a half hours.
 rig: $(VENV)/installed
-	$(BIN)/python benchmarks/rig/rig.py --all
+	$(BIN)/python benchmarks/rig/rig.py
 
 # The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
 # qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.

@@ -24,7 +24,7 @@ PICTURES_HZ = 5.0
 _LEAD_S = 0.08  # rendering takes 20 to 60 ms
 _UNIT = Fraction(1, 10_000)  # of the time stamps, in seconds
 _BEYOND_DEG = 60.0  # a picture that is tilted farther shows the sky
-COLUMNS = ("t_s", "late_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
+COLUMNS = ("t_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +40,12 @@ class Camera:
     """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
     file. `is_level`: on a gimbal; else fixed to the airframe. `is_stamped`: the pictures have their times."""
 
-    def __init__(
-        self, truth: Truth, lit_ground: np.ndarray, *, is_level: bool, is_stamped: bool, port: int, log: Path
-    ) -> None:
+    def __init__(self, truth: Truth, lit_ground: np.ndarray, log: Path, is_level: bool, is_stamped: bool) -> None:
         self._truth, self._ground, self._is_level, self.is_stamped = truth, lit_ground, is_level, is_stamped
         self._log, self._rng = log, np.random.default_rng(ground.SEED + 1)
         self._picture: Picture | None = None
         self._is_on, self._changed = True, threading.Condition()
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), _Viewer)
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), _Viewer)
         self._server.daemon_threads = True
         self._server.camera = self
         self.uri = f"http://127.0.0.1:{self._server.server_port}/"
@@ -84,13 +82,12 @@ class Camera:
                     continue
                 jpeg = self._rendered(pose)
                 time.sleep(max(0.0, due_s - time.monotonic()))
-                late_s = time.monotonic() - due_s
                 number += 1
                 with self._changed:
                     self._picture = Picture(number, due_s, jpeg)
                     self._changed.notify_all()
                 where = (pose.east_m, pose.north_m, pose.height_m, pose.heading_deg, pose.roll_deg, pose.pitch_deg)
-                log.write(",".join((f"{due_s:.4f}", f"{late_s:.4f}", *(f"{each:.3f}" for each in where))) + "\n")
+                log.write(",".join((f"{due_s:.4f}", *(f"{each:.3f}" for each in where))) + "\n")
         with self._changed:
             self._changed.notify_all()
 
@@ -130,12 +127,8 @@ class _Viewer(BaseHTTPRequestHandler):
         with av.open(_Sink(self.wfile), "w", format="nut", options=options, buffer_size=4096) as container:
             stream = container.add_stream("mjpeg", rate=int(PICTURES_HZ))
             camera = ground.CAMERAS["later"]
-            stream.width, stream.height, stream.pix_fmt, stream.time_base = (
-                camera.width,
-                camera.height,
-                "yuvj420p",
-                _UNIT,
-            )
+            stream.width, stream.height = camera.width, camera.height
+            stream.pix_fmt, stream.time_base = "yuvj420p", _UNIT
             picture, began_s = self.server.camera.next(0), None
             while picture:
                 began_s = began_s or picture.t_mono_s

@@ -1,6 +1,5 @@
 """The figures of a run, from the files in its folder: the autopilot's estimate, edgevpr's fixes, what was answered."""
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -32,8 +31,10 @@ def spread(values: np.ndarray) -> Row:
 
 
 def read_table(path: Path) -> np.ndarray:
-    """Return a file of comma-separated values, its columns by name."""
-    return np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
+    """Return a file of comma-separated values, its columns by name; all are numbers but `kind`."""
+    names = path.read_text("utf-8").partition("\n")[0].split(",")
+    columns = [(name, "U32" if name == "kind" else float) for name in names]
+    return np.atleast_1d(np.genfromtxt(path, columns, delimiter=",", skip_header=1, encoding="utf-8"))
 
 
 def figures_of(folder: Path) -> Row:
@@ -41,26 +42,24 @@ def figures_of(folder: Path) -> Row:
     run = json.loads((folder / "run.json").read_text())
     track, loss_s = read_table(folder / "track.csv"), run["marks_s"]["loss"]
     log = list(read_log(folder / "flight.jsonl")) if (folder / "flight.jsonl").exists() else []
-    found: Row = {key: run.get(key) for key in ("commit", "scenario", "is_control", "rate_hz", "words", "edgevpr_exit")}
-    found["estimate"] = _estimate(track, loss_s)
-    found["modes"] = _modes(track, loss_s)
+    found: Row = {"commit": run["commit"], "estimate": _estimate(track, loss_s), "modes": _modes(track, loss_s)}
     found["alarms"] = [
         [round(t_s - loss_s, 1), text]
         for t_s, sender, text in run["texts"]
         if sender == 1 and any(word in text.lower() for word in _ALARMS)
     ]
-    found["said"] = [[round(t_s - loss_s, 1), text] for t_s, sender, text in run["texts"] if sender != 1]
     if log:
-        found["fixes"] = _fixes(_fix_rows(folder, log))
-        found["sent"] = _sent(folder, loss_s)
-        found["wire_ms"] = _wire_ms(folder, log)
-        found["answers"] = dict(log[-1].get("mavlink", {}).get("acks", {}))
+        pictures, sent = read_table(folder / "pictures.csv"), read_table(folder / "sent.csv")
         queries = [line for line in log if line["kind"] == "query"]
+        found["fixes"] = _fixes(pictures, queries)
+        found["sent"] = _sent(sent[sent["t_s"] >= loss_s])
+        found["wire_ms"] = _wire_ms(sent, queries)
+        found["answers"] = dict(log[-1].get("mavlink", {}).get("acks", {}))
         found["queries"] = len(queries)
         found["accepted"] = sum(line["accepted"] for line in queries)
         ages_s = np.array([line["t_mono_s"] - line["t_frame_s"] for line in queries])
         found["query_ms"] = [round(1e3 * float(each)) for each in np.quantile(ages_s, (0.5, 0.99))] if queries else None
-        found["learnt"] = _learnt(folder, log, loss_s)
+        found["learnt"] = _learnt(pictures, log, loss_s)
         found["gps_alarms_s"] = [
             round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
         ]
@@ -90,8 +89,7 @@ def _estimate(track: np.ndarray, loss_s: float) -> Row:
     after_s, error_m = track["t_s"] - loss_s, track["error_m"]
     over_s = after_s[-1] + 0.5
     at = {str(each): round(float(np.interp(each, after_s, error_m)), 1) for each in AFTER_S if each <= over_s}
-    after = error_m[after_s >= 0]
-    return {"before": spread(error_m[after_s < 0]), "after": spread(after), "at_s": at}
+    return {"after": spread(error_m[after_s >= 0]), "at_s": at}
 
 
 def _modes(track: np.ndarray, loss_s: float) -> list[list[float]]:
@@ -101,103 +99,71 @@ def _modes(track: np.ndarray, loss_s: float) -> list[list[float]]:
     return [[round(float(after["t_s"][each] - loss_s), 1), int(after["mode"][each])] for each in changes]
 
 
-def _fix_rows(folder: Path, log: list[Row]) -> list[Row]:
-    """Return every accepted match with its error east and north, against the true place of its own picture."""
-    pictures, rows = read_table(folder / "pictures.csv"), []
-    for line in log:
-        if line["kind"] != "query" or not line["accepted"] or not line["located"]:
-            continue
+def _fixes(pictures: np.ndarray, queries: list[Row]) -> Row:
+    """Return how well the accepted matches are met by the true places of their own pictures."""
+    off_m, roll_deg, claimed_m = [], [], []
+    for line in queries:
         of = pictures[np.argmin(abs(pictures["t_s"] - line["t_frame_s"]))]
-        if abs(of["t_s"] - line["t_frame_s"]) > _TAKEN_WITHIN_S:
+        if not line["accepted"] or not line["located"] or abs(of["t_s"] - line["t_frame_s"]) > _TAKEN_WITHIN_S:
             continue
         east_m, north_m = to_metres(line["located"]["lat_deg"], line["located"]["lon_deg"])
-        var_east_m2, _, var_north_m2 = line["located"]["covariance_m2"]
-        rows.append(
-            {
-                "east_m": east_m - of["east_m"],
-                "north_m": north_m - of["north_m"],
-                "roll_deg": abs(of["roll_deg"]),
-                "claimed_m": line["accuracy_m"],
-                "sd_m": (math.sqrt(var_east_m2), math.sqrt(var_north_m2)),
-            }
-        )
-    return rows
-
-
-def _fixes(rows: list[Row]) -> Row:
-    if not rows:
+        off_m.append((east_m - of["east_m"], north_m - of["north_m"]))
+        roll_deg.append(abs(of["roll_deg"]))
+        claimed_m.append(line["accuracy_m"])
+    if not off_m:
         return {"error": spread(np.array([]))}
-    off_m = np.array([(row["east_m"], row["north_m"]) for row in rows])
-    roll_deg, claimed_m = (np.array([row[key] for row in rows]) for key in ("roll_deg", "claimed_m"))
-    error_m, sd_m = np.hypot(*off_m.T), np.array([row["sd_m"] for row in rows])
-    by_roll = {f"{low}-{high}": spread(error_m[(roll_deg >= low) & (roll_deg < high)]) for low, high in ROLL_DEG}
-    return {
-        "error": spread(error_m),
-        "by_roll_deg": by_roll,
-        "claimed_m": round(float(np.median(claimed_m)), 2),
-        "within": _within(abs(off_m) / claimed_m[:, None]),
-        "within_covariance": _within(abs(off_m) / sd_m),
-    }
+    error_m, rolls_deg = np.hypot(*np.transpose(off_m)), np.array(roll_deg)
+    by_roll = {f"{low}-{high}": spread(error_m[(rolls_deg >= low) & (rolls_deg < high)]) for low, high in ROLL_DEG}
+    return {"error": spread(error_m), "by_roll_deg": by_roll, **_claims(np.array(off_m), np.array(claimed_m))}
 
 
-def _within(sigmas: np.ndarray) -> list[float]:
-    """Return the shares of errors, axis by axis, within one and two standard deviations."""
-    return [round(float((sigmas <= limit).mean()), 2) for limit in (1, 2)]
+def _claims(off_m: np.ndarray, claimed_m: np.ndarray) -> Row:
+    """Return the median of the accuracies claimed, and the shares of errors, axis by axis, within one and two sigma of
+    them."""
+    sigmas = abs(off_m) / np.maximum(claimed_m, 1e-3)[:, None]
+    within = [round(float((sigmas <= limit).mean()), 2) for limit in (1, 2)]
+    return {"claimed_m": round(float(np.median(claimed_m)), 2), "within": within}
 
 
-def _sent(folder: Path, loss_s: float) -> Row:
-    """Return, by the name of the message, how well the positions that were sent after the loss are met by the true
-    ones of their times."""
-    sent, found = _sent_table(folder), {}
+def _sent(sent: np.ndarray) -> Row:
+    """Return, by the name of the message, how well the positions that were sent are met by the true ones of their
+    times."""
+    found = {}
     for kind in np.unique(sent["kind"]):
-        is_of = (sent["kind"] == kind) & (sent["t_s"] >= loss_s)
-        if is_of.sum() < 2:
+        rows = sent[sent["kind"] == kind]
+        if len(rows) < 2:
             continue
-        rows = {name: column[is_of] for name, column in sent.items()}
         off_m = np.stack((rows["east_m"] - rows["true_east_m"], rows["north_m"] - rows["true_north_m"]), axis=1)
-        found[str(kind)] = {
-            "rate_hz": round(len(off_m) / float(np.ptp(rows["t_s"])), 1),
-            "error": spread(np.hypot(*off_m.T)),
-            "claimed_m": round(float(np.median(rows["accuracy_m"])), 2),
-            "within": _within(abs(off_m) / np.maximum(rows["accuracy_m"], 1e-3)[:, None]),
-        }
+        rate_hz = round(len(rows) / float(np.ptp(rows["t_s"])), 1)
+        claims = _claims(off_m, rows["accuracy_m"])
+        found[str(kind)] = {"rate_hz": rate_hz, "error": spread(np.hypot(*off_m.T)), **claims}
     return found
 
 
-def _wire_ms(folder: Path, log: list[Row]) -> list[float] | None:
+def _wire_ms(sent: np.ndarray, queries: list[Row]) -> list[float] | None:
     """Return how long it takes from a picture to the bytes of its fix on the wire, median and 99 %."""
-    sent = _sent_table(folder)
     sent_s = sent["t_s"][sent["kind"] == "COMMAND_INT"]
-    queries = [(line["t_frame_s"], line["t_mono_s"]) for line in log if line["kind"] == "query"]
     took_ms = [
-        1e3 * float(each - taken_s)
-        for taken_s, logged_s in queries
-        for each in sent_s[(sent_s > taken_s) & (sent_s <= logged_s)]
+        1e3 * float(each - line["t_frame_s"])
+        for line in queries
+        for each in sent_s[(sent_s > line["t_frame_s"]) & (sent_s <= line["t_mono_s"])]
     ]
     return [round(float(each), 1) for each in np.quantile(took_ms, (0.5, 0.99))] if took_ms else None
 
 
-def _sent_table(folder: Path) -> dict[str, np.ndarray]:
-    with open(folder / "sent.csv", encoding="utf-8", newline="") as handle:
-        lines = list(csv.DictReader(handle))
-    columns = ("t_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
-    numbers = {name: np.array([float(line[name]) for line in lines]) for name in columns}
-    return {"kind": np.array([line["kind"] for line in lines], str), **numbers}
-
-
-def _learnt(folder: Path, log: list[Row], loss_s: float) -> Row | None:
+def _learnt(pictures: np.ndarray, log: list[Row], loss_s: float) -> Row | None:
     """Return the errors of the places learnt in flight, against the ground in the middle of their pictures, and how
     many were learnt after the loss."""
     taken_s = {line["query"]: line["t_frame_s"] for line in log if line["kind"] == "query"}
     places = [line for line in log if line["kind"] == "learnt" and line["query"] in taken_s]
     if not places:
         return None
-    pictures, errors_m, after = read_table(folder / "pictures.csv"), [], 0
+    errors_m, after = [], 0
     for line in places:
         at_s = taken_s[line["query"]]
-        seen_east_m, seen_north_m = _looked_at(pictures[np.argmin(abs(pictures["t_s"] - at_s))])
+        seen_m = _looked_at(pictures[np.argmin(abs(pictures["t_s"] - at_s))])
         east_m, north_m = to_metres(line["position"]["lat_deg"], line["position"]["lon_deg"])
-        errors_m.append(math.hypot(east_m - seen_east_m, north_m - seen_north_m))
+        errors_m.append(math.dist((east_m, north_m), seen_m))
         after += at_s > loss_s
     return {"error": spread(np.array(errors_m)), "after_the_loss": after}
 

@@ -1,10 +1,12 @@
 """The MAVLink connection of the rig's own ground station to the autopilot."""
 
 import contextlib
+import math
 import socket
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
@@ -54,25 +56,22 @@ class Link:
     def wait_for(self, name: str, condition: Callable[[Message], bool], patience_s: float) -> Message | None:
         """Return the first message of a name, of those that come from now on, that fulfils a condition; None where none
         comes in time."""
-        asked_s = time.monotonic()
-        while time.monotonic() - asked_s < patience_s:
-            message = self.last.get(name)
-            if message is not None and self.came_s[name] >= asked_s and condition(message):
-                return message
+        return self._first(name, condition, time.monotonic(), patience_s)
+
+    def _first(self, name: str, condition: Callable, since_s: float, patience_s: float) -> Message | None:
+        while time.monotonic() - since_s < patience_s:
+            if self.came_s.get(name, 0.0) >= since_s and condition(self.last[name]):
+                return self.last[name]
             time.sleep(0.01)
         return None
 
-    def command(self, number: int, *values: float, patience_s: float = 4.0) -> int | None:
+    def command(self, number: int, *values: float) -> int | None:
         """Send a COMMAND_LONG; return the result of its COMMAND_ACK, None where none comes."""
         seven = [*values, *[0.0] * (7 - len(values))]
         asked_s = time.monotonic()
         self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT, number, 0, *seven))
-        while time.monotonic() - asked_s < patience_s:
-            answer = self.last.get(f"COMMAND_ACK {number}")
-            if answer is not None and self.came_s[f"COMMAND_ACK {number}"] >= asked_s:
-                return answer.result
-            time.sleep(0.01)
-        return None
+        answer = self._first(f"COMMAND_ACK {number}", lambda _: True, asked_s, 4.0)
+        return answer and answer.result
 
     def put_parameter(self, name: str, value: float) -> None:
         """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
@@ -81,9 +80,10 @@ class Link:
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
+        near = partial(math.isclose, rel_tol=1e-5, abs_tol=1e-6)  # a parameter is a float of 32 bits
         for _ in range(4):
             self.put_parameter(name, value)
-            if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and _near(told.param_value, value), 1.5):
+            if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and near(told.param_value, value), 1.5):
                 return
         raise RuntimeError(f"the autopilot does not take {name} {value}")
 
@@ -121,15 +121,13 @@ class Link:
             for message in receiver.feed(data):
                 name, sender = message.get_type(), message.get_srcComponent()
                 if sender != AUTOPILOT[1]:
-                    self._note(f"{name} of {sender}", message, now_s)
-                else:
-                    self._note(f"{name} {message.command}" if name == "COMMAND_ACK" else name, message, now_s)
+                    name = f"{name} of {sender}"
+                elif name == "COMMAND_ACK":
+                    name = f"{name} {message.command}"
+                self.last[name] = message
+                self.came_s[name] = now_s  # written last: who sees the time finds the message
                 for listener in self._listeners:
                     listener(message, now_s)
-
-    def _note(self, name: str, message: Message, now_s: float) -> None:
-        self.last[name] = message
-        self.came_s[name] = now_s  # written last: who sees the time finds the message
 
     def _beat(self) -> None:
         kind, autopilot = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
@@ -147,7 +145,3 @@ def _connected(port: int) -> socket.socket:
             if time.monotonic() > give_up_s:
                 raise RuntimeError(f"no simulator answers at port {port}") from None
             time.sleep(0.1)
-
-
-def _near(value: float, wanted: float) -> bool:
-    return abs(value - wanted) <= 1e-6 + 1e-5 * abs(wanted)  # a parameter is a float of 32 bits

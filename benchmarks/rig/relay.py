@@ -19,14 +19,12 @@ class Relay:
     """Hands on what edgevpr and the autopilot say to each other over TCP, from the begin of the `with` block to its
     end. `origin_m` is where the autopilot's local frame begins, metres east and north."""
 
-    def __init__(
-        self, truth: Truth, log: Path, *, autopilot_port: int, port: int, origin_m: tuple[float, float]
-    ) -> None:
+    def __init__(self, truth: Truth, log: Path, autopilot_port: int, origin_m: tuple[float, float]) -> None:
         self._truth, self._autopilot_port, self._origin_m = truth, autopilot_port, origin_m
         self._log = open(log, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 (closed at the end of the block)
         self._log.write(",".join(COLUMNS) + "\n")
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self.port = port
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
         self._is_open = True
         self._thread = threading.Thread(target=self._serve)
 

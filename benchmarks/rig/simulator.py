@@ -1,9 +1,5 @@
-"""ArduPilot's simulator as a process of its own, and what a scenario asks of it.
+"""ArduPilot's simulator as a process of its own, and what a scenario asks of it."""
 
-Instance N listens on the ports 5760 + 10N, which is the rig's, and 5762 + 10N, which is edgevpr's.
-"""
-
-import atexit
 import contextlib
 import os
 import socket
@@ -20,6 +16,7 @@ from edgevpr.lab.simulate.generated import to_position
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_ARDUPILOT"
+OWN_PORT, COMPANION_PORT, LAST_PORT = 5760, 5762, 5763  # the rig's, edgevpr's, and one that is left open
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +54,9 @@ class Simulator:
     north; `listeners` hear every message."""
 
     def __init__(
-        self,
-        vehicle: str,
-        folder: Path,
-        *,
-        instance: int,
-        home_m: tuple[float, float],
-        parameters: dict[str, float],
-        listeners: list[Listener],
+        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
     ) -> None:
-        self.vehicle, self.instance = VEHICLES[vehicle], instance
+        self.vehicle = VEHICLES[vehicle]
         self._folder, self._parameters, self._listeners = folder, parameters, listeners
         self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
         self._process: subprocess.Popen | None = None
@@ -74,8 +64,10 @@ class Simulator:
 
     def __enter__(self) -> "Simulator":
         self._folder.mkdir(parents=True)
-        self._say_where_taken()
-        atexit.register(self.kill)
+        try:
+            socket.create_server(("", LAST_PORT)).close()
+        except OSError:
+            raise RuntimeError("another simulator runs on this machine: end it first") from None
         try:
             self.start(wipe=True)
         except BaseException:
@@ -85,12 +77,6 @@ class Simulator:
 
     def __exit__(self, *_: object) -> None:
         self.kill()
-        atexit.unregister(self.kill)
-
-    @property
-    def companion_port(self) -> int:
-        """Port that is left for edgevpr."""
-        return 5762 + 10 * self.instance
 
     def start(self, *, wipe: bool) -> None:
         """Start the process, with the parameters of old unless they are wiped, and connect to it."""
@@ -99,18 +85,12 @@ class Simulator:
         folder = tree()
         defaults = folder / "Tools/autotest" / self.vehicle.defaults
         command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
-        command += ["--home", self._home, f"-I{self.instance}", "--sim-address", "127.0.0.1"]
+        command += ["--home", self._home, "--sim-address", "127.0.0.1"]
         command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
         with open(self._folder / "simulator.txt", "ab") as said:
-            self._process = subprocess.Popen(
-                [str(word) for word in command],
-                cwd=self._folder,
-                stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
-                start_new_session=True,
-            )
-        self.link = Link(5760 + 10 * self.instance, self._listeners)
+            streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
+            self._process = subprocess.Popen([*map(str, command)], cwd=self._folder, start_new_session=True, **streams)
+        self.link = Link(OWN_PORT, self._listeners)
         if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
             raise RuntimeError(f"the simulator says nothing: see {self._folder}/simulator.txt")
         for number, rate_hz in STREAMS_HZ.items():
@@ -125,15 +105,6 @@ class Simulator:
                 self._process.kill()
             self._process.wait()
         self.link = self._process = None
-
-    def _say_where_taken(self) -> None:
-        """Raise RuntimeError where another simulator of this instance runs: its last port is left open."""
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("", self.companion_port + 1))
-            except OSError:
-                raise RuntimeError(f"instance {self.instance} of the simulator is in use: give another") from None
 
     def wait_ready(self) -> None:
         """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""
@@ -173,11 +144,7 @@ class Simulator:
 
 def mission(home_m: tuple[float, float], climb_m: tuple[float, float], circuit_m, height_m: float) -> list[Message]:
     """Make the mission of a plane: take off, then round and round the corners of a circuit, (east, north) each."""
-    takeoff, waypoint, jump = (
-        mavlink.MAV_CMD_NAV_TAKEOFF,
-        mavlink.MAV_CMD_NAV_WAYPOINT,
-        mavlink.MAV_CMD_DO_JUMP,
-    )
+    takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
     rows = [(waypoint, 0, home_m, 0.0), (takeoff, 12, climb_m, 0.6 * height_m)]
     rows += [(waypoint, 0, corner_m, height_m) for corner_m in circuit_m]
     rows += [(jump, 2, None, -1)]
@@ -185,10 +152,6 @@ def mission(home_m: tuple[float, float], climb_m: tuple[float, float], circuit_m
     for number, (command, first, at_m, height) in enumerate(rows):
         lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)
         second, up_m = (height, 0.0) if command == jump else (0.0, height)
-        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
-        items.append(
-            mavlink.MAVLink_mission_item_int_message(
-                1, 1, number, frame, command, 0, 1, first, second, 0.0, 0.0, lat, lon, up_m
-            )
-        )
+        values = (mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, command, 0, 1, first, second, 0.0, 0.0, lat, lon, up_m)
+        items.append(mavlink.MAVLink_mission_item_int_message(1, 1, number, *values))
     return items

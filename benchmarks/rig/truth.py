@@ -3,7 +3,6 @@
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from ground import GROUND_ALT_M
@@ -16,41 +15,19 @@ _KEPT = 240  # states, six seconds: a fix is 5 s old at the most
 _AHEAD_S = 0.3  # the farthest that a state is carried on
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class State:
-    """The true state: metres east, north and up, their rates (m/s), the attitude and its rates (radians)."""
-
-    place_m: np.ndarray
-    velocity_m_s: np.ndarray
-    angles: np.ndarray  # roll, pitch, yaw
-    rates: np.ndarray
-
-    def after(self, seconds: float) -> CameraPose:
-        """Return the pose so many seconds later, with steady rates."""
-        east_m, north_m, up_m = self.place_m + self.velocity_m_s * seconds
-        roll_deg, pitch_deg, yaw_deg = np.degrees(self.angles + self.rates * seconds)
-        return CameraPose(
-            east_m=float(east_m),
-            north_m=float(north_m),
-            height_m=float(up_m),
-            heading_deg=float(yaw_deg % 360),
-            roll_deg=float(roll_deg),
-            pitch_deg=float(pitch_deg),
-        )
-
-
 class Truth:
-    """Listens for SIM_STATE, and tells the pose `at` a time: the state before it, carried on."""
+    """Listens for SIM_STATE, and tells the pose `at` a time: the state before it, carried on at steady rates. Kept of a
+    state are metres east, north and up, and roll, pitch and yaw (radians); then the rates of these six a second."""
 
     def __init__(self) -> None:
-        self._states: deque[tuple[float, State]] = deque(maxlen=_KEPT)
+        self._states: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=_KEPT)
         self._lock = threading.Lock()
 
     def listen(self, message: Message, now_s: float) -> None:
         """Take note of a message."""
         if message.get_type() == "SIM_STATE":
             with self._lock:
-                self._states.append((now_s, _state(message)))
+                self._states.append((now_s, *_state(message)))
 
     def at(self, t_mono_s: float) -> CameraPose | None:
         """Return the true pose at a time; None where nothing is known of it."""
@@ -58,23 +35,20 @@ class Truth:
             before = next((each for each in reversed(self._states) if each[0] <= t_mono_s), None)
         if before is None or t_mono_s - before[0] > _AHEAD_S:
             return None
-        return before[1].after(t_mono_s - before[0])
+        then_s, state, rates = before
+        east_m, north_m, height_m, *angles = (state + rates * (t_mono_s - then_s)).tolist()
+        roll_deg, pitch_deg, yaw_deg = map(math.degrees, angles)
+        attitude = {"heading_deg": yaw_deg % 360, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+        return CameraPose(east_m=east_m, north_m=north_m, height_m=height_m, **attitude)
 
 
-def _state(message: Message) -> State:
+def _state(message: Message) -> tuple[np.ndarray, np.ndarray]:
     east_m, north_m = to_metres(message.lat_int / 1e7, message.lon_int / 1e7)
     roll, pitch = message.roll, message.pitch
     p, q, r = message.xgyro, message.ygyro, message.zgyro
     about_down = q * math.sin(roll) + r * math.cos(roll)  # what turns the nose sideways, seen by a level observer
     cos_pitch = max(math.cos(pitch), 0.1)
-    rates = (
-        p + about_down * math.sin(pitch) / cos_pitch,
-        q * math.cos(roll) - r * math.sin(roll),
-        about_down / cos_pitch,
-    )
-    return State(
-        place_m=np.array((east_m, north_m, message.alt - GROUND_ALT_M)),
-        velocity_m_s=np.array((message.ve, message.vn, -message.vd)),
-        angles=np.array((roll, pitch, message.yaw)),
-        rates=np.array(rates),
-    )
+    roll_rate = p + about_down * math.sin(pitch) / cos_pitch
+    pitch_rate, yaw_rate = q * math.cos(roll) - r * math.sin(roll), about_down / cos_pitch
+    state = (east_m, north_m, message.alt - GROUND_ALT_M, roll, pitch, message.yaw)
+    return np.array(state), np.array((message.ve, message.vn, -message.vd, roll_rate, pitch_rate, yaw_rate))

@@ -66,18 +66,18 @@ def test_the_truth_of_a_turn_between_two_states():
 
 def test_the_figures_of_a_run(tmp_path):
     """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the pictures were taken at the truth."""
-    columns = "t_s,east_m,north_m,height_m,roll_deg,pitch_deg,est_east_m,est_north_m,error_m,mode,ekf_flags,gps_fix"
-    lines = [f"{t:.1f},500,300,100,0,0,500,300,{2 * max(t - 100, 0):.2f},10,831,6" for t in np.arange(95, 110.05, 0.1)]
+    columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode"
+    lines = [f"{t:.1f},500,300,500,300,{2 * max(t - 100, 0):.2f},10" for t in np.arange(95, 110.05, 0.1)]
     (tmp_path / "track.csv").write_text("\n".join([columns, *lines]) + "\n")
-    poses = "t_s,late_s,east_m,north_m,height_m,heading_deg,roll_deg,pitch_deg"
-    pictures = [f"{t},0,500,300,100,0,{30 if t > 104 else 0},0" for t in range(95, 110)]
+    poses = "t_s,east_m,north_m,height_m,heading_deg,roll_deg,pitch_deg"
+    pictures = [f"{t},500,300,100,0,{30 if t > 104 else 0},0" for t in range(95, 110)]
     (tmp_path / "pictures.csv").write_text("\n".join([poses, *pictures]) + "\n")
     (tmp_path / "sent.csv").write_text(
         "t_s,kind,age_s,east_m,north_m,accuracy_m,true_east_m,true_north_m\n"
         "99,COMMAND_INT,0.1,999,300,1,500,300\n"
         "104.1,COMMAND_INT,0.1,503,300,2,500,300\n106.1,COMMAND_INT,0.1,501,300,2,500,300\n"
     )
-    located = [(104, 503.0, 4.0), (106, 501.0, 4.0)]
+    located = [(104, 503.0), (106, 501.0)]
     log = [
         {
             "kind": "query",
@@ -86,33 +86,23 @@ def test_the_figures_of_a_run(tmp_path):
             "t_mono_s": t + 0.2,
             "accepted": True,
             "accuracy_m": 2.0,
-            "located": dict(zip(("lat_deg", "lon_deg"), degrees(east, 300.0), strict=True))
-            | {"covariance_m2": [var, 0.0, var]},
+            "located": dict(zip(("lat_deg", "lon_deg"), degrees(east, 300.0), strict=True)),
         }
-        for t, east, var in located
+        for t, east in located
     ]
     log.append({"kind": "gps", "t_mono_s": 107.0, "is_wrong": True})
     log.append({"kind": "end", "mavlink": {"acks": {"ACCEPTED": 2}}})
     (tmp_path / "flight.jsonl").write_text("".join(json.dumps(line) + "\n" for line in log))
-    run = {
-        "scenario": "plane_wind",
-        "is_control": False,
-        "rate_hz": 1.0,
-        "words": [],
-        "edgevpr_exit": 0,
-        "marks_s": {"loss": 100.0},
-        "texts": [[103.0, 1, "EKF Failsafe"], [104.0, 197, "edgevpr: map left"]],
-    }
+    texts = [[103.0, 1, "EKF Failsafe"], [104.0, 197, "edgevpr: map left"]]
+    run = {"commit": "abc", "marks_s": {"loss": 100.0}, "texts": texts}
     (tmp_path / "run.json").write_text(json.dumps(run))
 
     found = figures.figures_of(tmp_path)
 
-    assert found["estimate"]["before"]["max"] == 0.0
     assert found["estimate"]["after"]["median"] == pytest.approx(10.0, abs=0.2)
     assert found["estimate"]["at_s"] == {"10": 20.0}
     assert found["modes"] == [[0.0, 10]]
     assert found["alarms"] == [[3.0, "EKF Failsafe"]]
-    assert found["said"] == [[4.0, "edgevpr: map left"]]
     assert found["fixes"]["error"] == {"n": 2, "median": 2.0, "p90": 2.8, "max": 3.0}
     assert found["fixes"]["by_roll_deg"]["20-90"]["max"] == 1.0
     assert found["fixes"]["within"] == [0.75, 1.0]
