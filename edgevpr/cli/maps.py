@@ -257,7 +257,8 @@ def map_shrink(args: Namespace) -> int:
 
 
 def run_salience(args: Namespace) -> int:
-    """Run `salience`: print the salience scores of a picture (see the glossary), and draw the maps of them (--out)."""
+    """Run `salience`: print the salience scores of a picture (see the glossary); with --out, also draw the picture with
+    a map of each score over its parts."""
     from edgevpr.core.files import require_folder, write_whole
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import gate_of

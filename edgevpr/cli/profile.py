@@ -46,7 +46,8 @@ def _add_plan(parser: ArgumentParser) -> None:
 
 
 def profile(args: Namespace) -> int:
-    """Run `profile`: estimate what each technique costs in a flight, or list, detect or measure boards."""
+    """Run `profile`: estimate what each technique costs in a flight; or list the boards that have a profile, say which
+    board this is, or measure it."""
     from edgevpr.power.boards import board_names, load_board
     from edgevpr.runtime.preflight.choose import preferred
     from edgevpr.runtime.preflight.estimate import estimate

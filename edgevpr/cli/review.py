@@ -129,7 +129,8 @@ def _say(done: int, total: int) -> None:
 
 @contextmanager
 def _unheard(debug: bool) -> Iterator[None]:
-    """Context manager: print only errors of the replayed flight (all with `debug`); its messages are in its journal."""
+    """Context manager: of the log messages of the replayed flight, print errors only, or all with `debug`. The flight
+    itself has printed them once."""
     log = logging.getLogger("edgevpr")
     before = log.level
     if not debug:

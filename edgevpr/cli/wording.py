@@ -45,8 +45,8 @@ def of_made(path: str, made: "MadeMap") -> Iterator[str]:
 
 
 def of_refined(path: str, refined: "Refined") -> Iterator[str]:
-    """Yield the result of `map refine`: how many pictures were corrected, by how much, and which contradict the
-    others."""
+    """Yield the result of refining a map: how many pictures were moved to where they really lie, by how much, and which
+    were recorded far from there."""
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return
@@ -113,7 +113,7 @@ def of_networks(found: Sequence["Listed"], folders: list[str]) -> Iterator[str]:
 
 
 def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
-    """Yield how a replay differs from its flight."""
+    """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
     yield from _first([*(text for each in lines.others for text in _of_line(each)), *packets.others])
     for name, (then, now) in lines.program.items():
         yield f"The program differs: {name} was {then}, is {now}"

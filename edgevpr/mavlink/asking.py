@@ -237,6 +237,7 @@ class AutopilotReading:
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
     """Read all that an autopilot tells about itself; return None if no heartbeat comes. `wanted` maps a firmware (as in
     `AutopilotReading`) to the names of the parameters to be read.
+
     It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
     """
     beat = asking.heartbeat()

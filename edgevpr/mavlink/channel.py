@@ -76,8 +76,8 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """Answers of an autopilot on which the choice of a channel depends. `version`: of its firmware, major and minor
-    (None: unknown). `parameters`: values by name, without those that it does not have."""
+    """Answers of an autopilot on which the choice of a channel depends. `version`: of its firmware, (major, minor)
+    (None: unknown). `parameters`: values by name; parameters that the autopilot does not have are left out."""
 
     kind: Kind
     version: tuple[int, int] | None

@@ -22,9 +22,9 @@ SILENT_AFTER_S = 5.0
 
 
 class GroundLink(Link):
-    """The link to the ground station, beside the link `flight` to the flight controller. It has the same identity and
-    health as `flight`. It has its own thread and port, so that a lost ground station delays no fix, but shares the
-    turns of `flight` (see `turns`)."""
+    """The link to the ground station, beside the link `flight` to the flight controller. It sends the system id,
+    component id and health that `flight` sends. It has its own thread and port, so that a lost ground station delays no
+    fix, but shares the turns of `flight` (see `turns`)."""
 
     name = "ground"
 

@@ -50,7 +50,8 @@ log = logging.getLogger(__name__)
 
 
 class TimeStamps:
-    """The largest time stamp ever sent or received, and the last one of every stream. Any thread may call it.
+    """The largest time stamp ever sent or received, and the last one of every stream (the messages of one sender with
+    one link id). Any thread may call it.
 
     The largest is kept in the file `path`, since a board without a clock chip starts with an old time. It is written at
     the start, which raises ConfigError if the file is damaged or cannot be made, and from then on every half minute.
@@ -217,8 +218,8 @@ def read_key(path: str) -> bytes:
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Return True if the file is a credential that systemd gives to this service alone: its mode shows a right of the
-    group to read, which is an access list for the user of the service."""
+    """Return True if the file is a credential that systemd gives to this service alone. It is readable by an access
+    list for the service's user, which its mode shows as a right of the group to read."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 

@@ -15,11 +15,12 @@ log = logging.getLogger(__name__)
 
 
 class Texts:
-    """The texts that wait to be sent, one in five seconds, warnings before notes. Use it inside turns only (see
-    `turns`).
+    """The texts that wait to be sent, one in five seconds, warnings before notes (texts of severity INFO). Use it
+    inside turns only (see `turns`).
 
-    Texts of one `topic` are about the same subject, and the newest counts. It replaces a waiting text of its topic, and
-    is dropped if it equals the last text sent of its topic. A note does not replace a waiting warning: it follows it.
+    Texts of one `topic` are about the same subject, and the newest counts: a new text replaces a waiting one of its
+    topic, and is dropped if it equals the last text sent of its topic. A note does not replace a waiting warning, but
+    is sent after it.
     """
 
     def __init__(self) -> None:

@@ -117,7 +117,7 @@ class Certainty:
         self._own: tuple[float, float] | None = None  # standard deviation that the filter reports, time
 
     def hear(self, message: Message, now_s: float) -> None:
-        """Process one of the `FILTER_REPORTS`."""
+        """Process a report of the autopilot's position filter, one of the `FILTER_REPORTS`."""
         if message.flags & mavlink.EKF_CONST_POS_MODE or not message.flags & _HAS_POSITION:
             self._known = self._own = None  # the position is still reported, but is an old one
         elif message.get_type() == "ESTIMATOR_STATUS":

@@ -142,7 +142,7 @@ def beside(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:
     """Put the queries of a flight (the lines `then`) and of its replay with another configuration (`now`) side by side.
     Returns a dict:
     - `queries`: those that end otherwise (another place accepted, or none), each with `query`, `then` and `now`
-    - `summary`: by name, a figure of the flight and that of the replay; `alike`: number of queries that end alike
+    - `summary`: by name, [a figure of the flight, that of the replay]; `alike`: number of queries that end alike
     - `apart_at_most_m`: largest distance between the two positions of a query (None: no query has two).
     """
     flown, again = ({each.name: each for each in read_lines(lines, Path()).queries} for lines in (then, now))

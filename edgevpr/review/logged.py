@@ -102,7 +102,8 @@ class LoggedFlight:
     span_s: float = 0.0
 
     def since_start(self, t_mono_s: float | None) -> float:
-        """Return the seconds from the start to `t_mono_s`; None stands for the latest time so far."""
+        """Return the seconds from the start of the flight to `t_mono_s` (None: to the latest time read so far). The
+        first time that is given counts as the start."""
         if t_mono_s is None:
             return self.span_s
         self.start_s = t_mono_s if self.start_s is None else self.start_s

@@ -43,7 +43,7 @@ class MapGround:
 @dataclass(frozen=True, slots=True)
 class Layer:
     """Layer of the drawing, which the reader can hide: its name, the CSS class that colours it, and its `ways`, each a
-    sequence of points. With `are_dots` the points are drawn as dots, else each way is a line."""
+    sequence of positions. With `are_dots` the positions are drawn as dots, else each way is drawn as a line."""
 
     name: str
     colour: str
@@ -147,13 +147,14 @@ class _View:
         return self._drawn(self._metres(points))
 
     def square(self, at: Point, pose: Pose) -> str:
-        """Return SVG path data of the ground that a picture shows, drawn as a square with its longest side."""
+        """Return SVG path data of the ground that a picture shows, drawn as a square whose side is as long as the
+        longest side of the picture on the ground."""
         corners = axes_of(pose.up_deg) @ np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * pose.footprint_m / 2
         return "M" + "L".join(f"{x:.0f} {y:.0f}" for x, y in self._drawn(self._metres([at]) + corners)) + "z"
 
     def ruler(self) -> tuple[float, float]:
-        """Return two parts: a round length in metres, at most a quarter of the drawing's width;
-        its share of that width, 0..1."""
+        """Choose the length of the drawing's scale bar. Returns two values: a round length in metres, at most a quarter
+        of the drawing's width; and its share of that width, 0..1."""
         wide_m = _WIDE / self._scale
         power = 10.0 ** math.floor(math.log10(wide_m / 4))
         length_m = max(each * power for each in (1, 2, 5) if each * power <= wide_m / 4)

@@ -61,9 +61,12 @@ class ToAutopilot:
         return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the link for the status: `trouble`, why it is not open (None: it is); `autopilot`, system
-        id of the one heard (None: none is); `channel`, how positions are sent; `answers` to fixes, counted by result;
-        `unanswered` fixes; `accuracy_m`, how well the position is known (one axis, 1 sigma; None: it is not)."""
+        """Return the state of the link for the status, a dict:
+        - `connected`: the port is open; `trouble`: the reason why it is not (None: it is)
+        - `autopilot`: system id of the one heard (None: none is); `channel`: name of the `Channel` of positions
+        - `fixes`: see `summary`; `answers`: the answers to fixes, counted by result; `unanswered`: number of fixes
+        - `accuracy_m`: how well our position is known, standard deviation of one axis (None: it is not known).
+        """
         with self._link.turn("state"):
             stats = self._link.stats()
             return {

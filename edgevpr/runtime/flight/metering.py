@@ -18,9 +18,9 @@ from edgevpr.runtime.recognise.recognition import Recognition
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
     """One measurement for the governor. `cpu_share` (0..1) is the share of all cores that this process has used since
-    the last measurement, `late_share` the share of that time that queries took (0 if nothing kept them waiting).
-    `rss_mb` is the memory of this process now. `temperature_c` is that of the board in degrees Celsius, and `throttled`
-    says that the board slows itself down (None: unknown)."""
+    the last measurement. `late_share` (0..1) is the share of that time that queries took, if other programs or the disk
+    kept them waiting, else 0. `rss_mb` is the memory of this process now. `temperature_c` is that of the board in
+    degrees Celsius, and `throttled` says that the board slows itself down (None: unknown)."""
 
     cpu_share: float
     late_share: float

@@ -20,7 +20,8 @@ _LONGEST_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A point of a path: time in seconds; metres from its origin, and m/s, each (2,) east and north."""
+    """A point of a path: `t_s`, time in seconds; `at_m` (2,), metres east and north of the path's origin;
+    `velocity_m_s` (2,), m/s east and north."""
 
     t_s: float
     at_m: Doubles

@@ -1,5 +1,6 @@
 """The recording of a flight: its tape (the record of all that comes in from outside) and its frames, with which
 `review` can fly it again on the ground.
+
 Each flight has a folder: `tape.jsonl`, one line for each input, and `frames/`, the pictures as JPEG. If the flight
 learns, `map.gpkg` is the map as it was at the start.
 

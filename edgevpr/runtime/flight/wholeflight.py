@@ -31,9 +31,9 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLines:
-    """The lines of one flight; iterate over them as often as needed. It is flight `number` of the `flights` in the file
-    `path`, and is read from `stretches` of files, in order. `missing` is a sentence about files that are missing (None:
-    none are)."""
+    """The lines of one flight; iterate over them as often as needed. It is flight `number` (1, 2, ...) of the `flights`
+    (their count) in the file `path`, and is read from the `stretches` of files, in order. `missing` is a sentence about
+    files that are missing (None: none are)."""
 
     path: Path
     number: int
@@ -90,7 +90,8 @@ def _earlier(last: Stretch) -> list[Stretch]:
 
 
 def _stretches(path: Path) -> list[Stretch]:
-    """Find the flights in a file. Lines before the first start line count as a flight too. Raises OSError."""
+    """Return the stretch of each flight in a file, in order. Lines before the first start line count as a flight too.
+    Raises OSError."""
     found: list[Stretch] = []
     end = 0
     with open(path, "rb") as handle:
