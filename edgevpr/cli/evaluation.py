@@ -1,6 +1,6 @@
 """`edgevpr eval`: measure techniques, or stored similarities, on data sets with ground truth.
 
-A set is a data set; a row is a technique with its settings, which is a row of the tables that are printed.
+Here a set is a data set, and a row is a technique with its settings, which has one row in the printed tables.
 """
 
 import os

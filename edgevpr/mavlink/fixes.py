@@ -72,8 +72,9 @@ class Sending:
 
 
 class Fixes:
-    """The fixes of one link. It counts the fixes `dropped` because they were too old, `withheld` because of `why_not`
-    or a pause, and `unanswered`. `refusal` is the reason for the last refusal (None: there was none)."""
+    """Holds the fixes of one link: those that wait to be sent, and those sent whose answers are awaited. It counts the
+    fixes `dropped` because they were too old or too many, `withheld` because of `why_not` or a pause, and `unanswered`.
+    `refusal` is the reason for the last refusal by the autopilot (None: there was none)."""
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S) -> None:
         self.dropped = self.withheld = self.unanswered = 0

@@ -42,7 +42,8 @@ class LinkStats:
     ground station has paused the flight. `refused_why` says why the last refused fix was refused (None: none was).
     `commands` counts the commands addressed to us on any link, by result, and `ignored_requests` the other messages to
     us that had no effect.
-    `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason.
+    `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason. `reopened` is how many
+    times the port was opened again, `bad_bytes` the number of received bytes that belong to no valid message.
     """
 
     connected: bool

@@ -18,7 +18,8 @@ _LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, 
 
 
 class FixOutcome(Enum):
-    """Outcome of a fix, in the words of the report. KEPT: it was not sent, see its `why`."""
+    """Outcome of a fix, in the words of the report. CONTINUOUS: the fix became part of the position that is sent many
+    times a second, and is not answered. KEPT: it was not sent, see its `why`."""
 
     TAKEN = "fix taken"
     REFUSED = "fix refused"

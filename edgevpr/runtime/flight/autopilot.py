@@ -62,7 +62,7 @@ class ToAutopilot:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the link for the status, a dict:
-        - `connected`: the port is open; `trouble`: the reason why it is not (None: it is)
+        - `connected`: packets can be sent; `trouble`: why the port could not be opened or was lost (None: data arrives)
         - `autopilot`: system id of the one heard (None: none is); `channel`: name of the `Channel` of positions
         - `fixes`: see `summary`; `answers`: the answers to fixes, counted by result; `unanswered`: number of fixes
         - `accuracy_m`: how well our position is known, standard deviation of one axis (None: it is not known).

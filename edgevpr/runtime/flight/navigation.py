@@ -79,8 +79,9 @@ class Navigation:
         return max(self._fixed_s, self._gps_s)
 
     def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
-        """Process a report of the autopilot: its velocity continues a path of velocities and, if it has GPS and
-        `believes_gps`, its position and velocity correct ours. A report without velocity is ignored."""
+        """Process a report of the autopilot. A path of velocities (`RECKONED`) goes on with the reported velocity. If
+        the autopilot has GPS, and `believes_gps`, the reported position and velocity correct ours. A report without
+        velocity is ignored."""
         if vehicle.velocity_m_s is None:
             return
         had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
@@ -176,7 +177,7 @@ class Navigation:
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:
-    """Tell whether a reported position rests on GPS: a receiver has a fix near it that is still new."""
+    """Tell whether a reported position rests on GPS: a receiver has a fix near that position, at most 0.7 s old."""
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S
 
 

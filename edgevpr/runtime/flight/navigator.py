@@ -58,8 +58,9 @@ class Advice:
 
 
 class Navigator(Listener):
-    """Navigates for one autopilot. `map_sd_m` is the standard deviation of the error that all fixes share, `every_s`
-    the time between two queries. `is_muted`, in a dry run: no continuous position is given."""
+    """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
+    standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
+    dry run, no continuous position is given."""
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False) -> None:
         self._is_muted = is_muted

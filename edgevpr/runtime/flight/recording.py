@@ -83,7 +83,7 @@ class Recording(Tape):
             self._waiting.append(without_passwords(json.dumps([kind, *values], default=_encoded)).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
-        """Record a picture, and return its number."""
+        """Record a picture, and return its number in this recording (1, 2, ...), by which `frame_path` finds it."""
         self._frames += 1
         if self.state is None:
             self._bytes_put += len(jpeg)

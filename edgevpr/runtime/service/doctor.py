@@ -29,7 +29,7 @@ _WHERE_SILENT = {
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Result of `doctor`: all findings, and what was read from the autopilot (None: nothing could be read)."""
+    """Result of `doctor`: all `findings`, and what was read from the autopilot (None: nothing could be read)."""
 
     findings: list[Finding]
     reading: AutopilotReading | None
