@@ -12,7 +12,6 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import base
@@ -21,7 +20,7 @@ import detectors
 import numpy as np
 import walks
 from base import DATA, Row, camera_of
-from matchability import NOT_LEARNT, compared, fit, label_site, site_of, write_network
+from matchability import NOT_LEARNT, fit, label_site, leave_one_out, site_of, write_network
 
 from edgevpr.core.text import progress
 from edgevpr.core.types import Salience
@@ -45,17 +44,8 @@ FIVE_PLACES = ("grief_michigan_monthly", "grief_stromovka_monthly")
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
 DETECTOR = "yolox_nano"
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """The answers of a technique on a set: for each query the slots of the places, best first, their scores, and which
-    slots are right or to be ignored."""
-
-    slots: list[np.ndarray]
-    scores: list[np.ndarray]
-    right: list[np.ndarray]
-    ignored: list[np.ndarray]
+# The answer to a query: the slots of the places, best first, their scores, and which slots are right or to be ignored.
+Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def main() -> None:
@@ -88,19 +78,15 @@ def main() -> None:
     base.write("salience", found, page(found))
 
 
-def fit_each(names: list[str], models: Path) -> dict[str, dict[str, dict[str, float | None]]]:
-    """For every set fit the better kind of network to all other sites, and write it with its card; return how both
-    kinds do on sites that they have not seen, on generated changes and on real queries."""
-    sites = []
-    for folder in base.find_sets():
-        if folder.name not in NOT_LEARNT:
-            labelled = label_site(folder, camera_of(folder.name) == "nadir", _SEED, progress)
-            sites.append(site_of(folder.name, labelled))
-    kind, unseen = compared(sites, _SEED)
+def fit_each(names: list[str], models: Path) -> dict[str, dict[str, float | None]]:
+    """For every set fit a network to all other sites, and write it with its card; return how it does on sites that it
+    has not seen, on generated changes and on real queries."""
+    learnt = [folder for folder in base.find_sets() if folder.name not in NOT_LEARNT]
+    sites = [site_of(each.name, label_site(each, camera_of(each.name) == "nadir", _SEED)) for each in learnt]
     for name in names:
-        network = fit(kind, [site for site in sites if site.name not in (name, SAME_SITE.get(name))], _SEED)
+        network = fit([site for site in sites if site.name not in (name, SAME_SITE.get(name))], _SEED)
         write_network(network, models / f"without_{name}.onnx", f"without {name}", "a benchmark", sites[0])
-    return {each: asdict(found) for each, found in unseen.items()}
+    return leave_one_out(sites, _SEED)
 
 
 def speeds(network: str, there: list[str]) -> dict[str, float]:
@@ -125,24 +111,22 @@ def speeds(network: str, there: list[str]) -> dict[str, float]:
     return {name: float(np.median(each[1:])) for name, each in times_ms.items()}
 
 
-def ask(name: str, dataset: Dataset) -> Asked:
+def ask(name: str, dataset: Dataset) -> list[Answer]:
     """Map the references and ask all queries."""
-    site = dataset.ref_dir.parent.name
-    slots, scores, right, ignored = [], [], [], []
+    site, asked = dataset.ref_dir.parent.name, []
     with walks.walk_over(list_images(dataset.ref_dir), name, camera_of(site) == "nadir") as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
             ranking = walk.step(walks.frame(query.path)).ranking
-            slots.append(np.empty(0, int) if ranking is None else ranking.slots)
-            scores.append(np.empty(0) if ranking is None else ranking.scores)
-            right.append(np.array([each in query.right for each in dataset.references]))
-            ignored.append(np.array([each in query.ignored for each in dataset.references]))
-    return Asked(slots, scores, right, ignored)
+            found = (np.empty(0, int), np.empty(0)) if ranking is None else (ranking.slots, ranking.scores)
+            of = [np.isin(dataset.references, list(names)) for names in (query.right, query.ignored)]
+            asked.append((*found, *of))
+    return asked
 
 
-def answers(asked: Asked, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def answers(asked: list[Answer], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Answer every query from the places that are kept, bool (N,): (score of the best, is it right)."""
     best, found = [], []
-    for slots, scores, right, ignored in zip(asked.slots, asked.scores, asked.right, asked.ignored, strict=True):
+    for slots, scores, right, ignored in asked:
         counts = places[slots] & ~ignored[slots]
         best.append(float(scores[counts][0]) if counts.any() else 0.0)
         found.append(bool(right[slots[counts][0]]) if counts.any() else False)
@@ -150,13 +134,13 @@ def answers(asked: Asked, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gated(
-    name: str, technique: str, asked: Asked, seen: list[dict[str, Salience]], kept: dict[str, np.ndarray]
+    name: str, technique: str, asked: list[Answer], seen: list[dict[str, Salience]], kept: dict[str, np.ndarray]
 ) -> Iterable[Row]:
     """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
     stay, as in the thesis. `auc` is that of the thesis's count (a query that is discarded is a true negative),
     `recall_strict` counts it as missed. `true_discarded` of the `queries` were matched rightly without the gate,
     `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
-    score, found = answers(asked, np.ones(len(asked.right[0]), bool))
+    score, found = answers(asked, np.ones(len(asked[0][2]), bool))
     for gate, thresholds in GATES.items():
         passes = np.array([worth_of(each[gate], thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
@@ -207,14 +191,8 @@ _GATE = {
 def page(found: Row) -> str:
     """Return the page for people."""
     rows = found["gate"]
-    told = [
-        {"network": kind, "pictures": of, **by_site}
-        for kind, unseen in found["unseen"].items()
-        for of, by_site in unseen.items()
-    ]
-    columns = {"network": "{network}", "pictures": "{pictures}"} | {
-        name: f"{{{name}:.2f}}" for name in list(told[0])[2:]
-    }
+    told = [{"pictures": of, **by_site} for of, by_site in found["unseen"].items()]
+    columns = {"pictures": "{pictures}", **{name: f"{{{name}:.2f}}" for name in list(told[0])[1:]}}
     discards = {(row["set"], row["technique"]) for row in rows if row["true_discarded"] or row["false_discarded"]}
     sets = list(dict.fromkeys(row["set"] for row in rows))
     unchanged = [name for name in sets if not any(each == name for each, _ in discards)]

@@ -21,7 +21,6 @@ import numpy as np
 import rasterio
 from base import Row
 from rasterio.warp import transform
-from run_sets import spread
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.images import read_image
@@ -157,6 +156,7 @@ def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> R
         return float(distance_m(*truth[match["query"]], match[where]["lat_deg"], match[where]["lon_deg"]))
 
     errors_m = [off_m(match, "located") for match in known if match["accepted"]]
+    median_m, p90_m = np.percentile(errors_m, (50, 90)).tolist()
     return {
         "set": folder.name,
         "use": base.use_of(folder.name),
@@ -167,7 +167,7 @@ def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> R
         "right": sum(off_m(match, "position") < footprint_m / 2 for match in known),
         "accepted": len(errors_m),
         "accepted_wrong": sum(error_m > footprint_m / 4 for error_m in errors_m),
-        "error": spread(errors_m),
+        "error": {"median_m": round(median_m, 1), "p90_m": round(p90_m, 1)},
     }
 
 

@@ -7,17 +7,15 @@ since they show the same ground. A label belongs to the changed picture: that is
 set has queries with a ground truth, these are asked as they are.
 
 The network sees one of 5x5 crops at a time, as the network of the thesis does (3.2.1), and a frame's score is the mean
-over its crops; so the labels of frames teach what a crop is worth. Two kinds compete: a logistic regression on eight
-statistics of a crop, and a convolutional network of 6,000 weights. The better one is kept, judged on sites that it has
-not seen.
+over its crops; so the labels of frames teach what a crop is worth. It is a logistic regression on eight statistics of a
+crop: a convolutional network of 6,000 weights was worse at the changed pictures of every site
+that it had not seen.
 """
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import base
 import numpy as np
@@ -43,7 +41,6 @@ TURNS = ("cohog",)  # techniques that know a picture under every heading, where 
 CHANGES = 3  # of each place
 MATCHED = 0.5  # a picture is matched if so many of the techniques know it
 _NEIGHBOURS = 3  # before and after a place, in the order of the frames
-Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +60,13 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """Answers to a question: `found` is the share of the techniques that answered it rightly; `alike` is how much
-    the picture looks like the place elsewhere that it resembles most, as a share of how much it looks like its own, the
-    mean over the techniques."""
+    """Answers to a question: `found` is the share of the techniques that answered it rightly."""
 
     question: Question
     found: float
-    alike: float
 
 
-def label_site(folder: Path, looks_down: bool, seed: int, progress: Progress) -> list[Labelled]:
+def label_site(folder: Path, looks_down: bool, seed: int) -> list[Labelled]:
     """Label changed copies of the references of one data set, and its queries by its ground truth where it has one.
 
     `folder` has ref/ and may have query/ and ground_truth.csv. Raises SourceError or ImageError for images that cannot
@@ -86,8 +80,7 @@ def label_site(folder: Path, looks_down: bool, seed: int, progress: Progress) ->
         with walks.walk_over(places, name, looks_down) as walk:
             asked = progress(questions, len(questions), f"{folder.name}, {name}")
             answers.append([_answer(walk, question, turns) for question in asked])
-    means = np.mean(answers, axis=0).tolist()
-    return [Labelled(question, *mean) for question, mean in zip(questions, means, strict=True)]
+    return list(map(Labelled, questions, np.mean(answers, axis=0).tolist()))
 
 
 def changed(picture: Image, rng: np.random.Generator, turns: bool) -> Image:
@@ -121,15 +114,15 @@ def _questions(folder: Path, places: list[Path], seed: int) -> list[Question]:
     return asked
 
 
-def _answer(walk: Recogniser, question: Question, turns: bool) -> tuple[bool, float]:
+def _answer(walk: Recogniser, question: Question, turns: bool) -> bool:
+    """Tell whether a right place scores higher than all others."""
     ranking = walk.step(walks.frame(question.picture(turns))).ranking
     if ranking is None:
-        return False, 1.0
+        return False
     scores = dict(zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True))
     own = max((score for slot, score in scores.items() if slot in question.right), default=0.0)
     others = (score for slot, score in scores.items() if slot not in question.right | question.ignored)
-    other = max(others, default=0.0)
-    return own > other, 1.0 if own <= 0 else min(1.0, other / own)
+    return own > max(others, default=0.0)
 
 
 HEIGHT, WIDTH = 48, 64  # of a crop
@@ -177,27 +170,6 @@ class Statistics(nn.Module):
         return torch.sigmoid(self.linear(self.norm(torch.cat(said, 1).flatten(1))))
 
 
-class Convolutions(nn.Module):
-    """Four convolutions and the mean of what they find."""
-
-    RATE, STEPS = 0.003, 600
-
-    def __init__(self) -> None:
-        super().__init__()
-        widths = (1, 8, 16, 24, 24)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += [nn.Conv2d(before, after, 3, 2, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU()]
-        self.layers = nn.Sequential(*layers)
-        self.linear = nn.Linear(widths[-1], 1)
-
-    def forward(self, crops: torch.Tensor) -> torch.Tensor:
-        return torch.sigmoid(self.linear(self.layers(crops).mean((2, 3))))
-
-
-KINDS: dict[str, type[Statistics | Convolutions]] = {"statistics": Statistics, "convolutions": Convolutions}
-
-
 @dataclass(frozen=True, slots=True)
 class TrainingSite:
     """The pictures of one site: `crops` uint8 (N, 25, 1, 48, 64), the share of the techniques that knew each rightly,
@@ -221,14 +193,14 @@ def site_of(name: str, labelled: Sequence[Labelled]) -> TrainingSite:
     return TrainingSite(name, crops, found, np.array([label.question.change is None for label in labelled]))
 
 
-def fit(kind: str, sites: Sequence[TrainingSite], seed: int) -> nn.Module:
-    """Fit a network of this kind to the frames of all sites, each site as often as any other."""
+def fit(sites: Sequence[TrainingSite], seed: int) -> nn.Module:
+    """Fit a network to the frames of all sites, each site as often as any other."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    network = KINDS[kind]().train()
-    optimiser = torch.optim.AdamW(network.parameters(), KINDS[kind].RATE, weight_decay=0.01)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, KINDS[kind].STEPS)
-    for _ in range(KINDS[kind].STEPS):
+    network = Statistics().train()
+    optimiser = torch.optim.AdamW(network.parameters(), Statistics.RATE, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, Statistics.STEPS)
+    for _ in range(Statistics.STEPS):
         chosen = [sites[number] for number in rng.integers(len(sites), size=_BATCH)]
         frames = [rng.integers(len(site.found)) for site in chosen]
         crops = torch.stack([site.inputs(frame) for site, frame in zip(chosen, frames, strict=True)])
@@ -249,37 +221,16 @@ def scores(network: nn.Module, site: TrainingSite) -> Singles:
     return np.array(said, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class Unseen:
-    """Result of a kind on sites that it has not seen. By site, the share of pairs of pictures, one known by most
+def leave_one_out(sites: Sequence[TrainingSite], seed: int) -> dict[str, dict[str, float | None]]:
+    """Judge a network on each site that it has not seen. By site, the share of pairs of pictures, one known by most
     techniques and one not, that it puts in the right order: of `generated` changes, and of `real` queries. .5 is
     chance; None: all pictures are alike, or there are none."""
-
-    generated: dict[str, float | None]
-    real: dict[str, float | None]
-
-    @property
-    def mean(self) -> float:
-        """The mean over the sites, of generated changes."""
-        known = [value for value in self.generated.values() if value is not None]
-        return float(np.mean(known)) if known else 0.5
-
-
-def leave_one_out(kind: str, sites: Sequence[TrainingSite], seed: int) -> Unseen:
-    """Fit a kind as often as there are sites, each time without one of them, and judge it on that one."""
-    unseen = Unseen({}, {})
+    unseen: dict[str, dict[str, float | None]] = {"generated": {}, "real": {}}
     for site in sites:
-        network = fit(kind, [other for other in sites if other is not site], seed)
-        said, matched = scores(network, site), site.found >= MATCHED
-        for judged, of in ((unseen.generated, ~site.is_real), (unseen.real, site.is_real)):
-            judged[site.name] = roc_auc(said[of], matched[of])
+        said = scores(fit([other for other in sites if other is not site], seed), site)
+        for judged, of in (("generated", ~site.is_real), ("real", site.is_real)):
+            unseen[judged][site.name] = roc_auc(said[of], site.found[of] >= MATCHED)
     return unseen
-
-
-def compared(sites: Sequence[TrainingSite], seed: int) -> tuple[str, dict[str, Unseen]]:
-    """Judge every kind on sites that it has not seen; return the better one, and what each does."""
-    unseen = {kind: leave_one_out(kind, sites, seed) for kind in progress(KINDS, len(KINDS), "fitting")}
-    return max(unseen, key=lambda kind: unseen[kind].mean), unseen
 
 
 def write_network(
@@ -293,19 +244,19 @@ def write_network(
 
 
 def main() -> None:
-    """Fit the better kind of network to all sets that it may learn from."""
+    """Fit a network to all sets that it may learn from."""
     labelled = {
-        folder.name: label_site(folder, base.camera_of(folder.name) == "nadir", 1, progress)
+        folder.name: label_site(folder, base.camera_of(folder.name) == "nadir", 1)
         for folder in base.find_sets()
         if folder.name not in NOT_LEARNT
     }
     sites = [site_of(name, labels) for name, labels in labelled.items()]
-    kind, unseen = compared(sites, 1)
+    unseen = [each for each in leave_one_out(sites, 1)["generated"].values() if each is not None]
     source = (
-        f"benchmarks/matchability.py; {kind}; {sum(map(len, labelled.values()))} pictures of {', '.join(labelled)}; on "
-        f"a site left out {unseen[kind].mean:.2f} of pairs of changed pictures in the right order"
+        f"benchmarks/matchability.py; {sum(map(len, labelled.values()))} pictures of {', '.join(labelled)}; on "
+        f"a site left out {np.mean(unseen):.2f} of pairs of changed pictures in the right order"
     )
-    write_network(fit(kind, sites, 1), Path(sys.argv[1]), "Matchability, trained by edgevpr", source, sites[0])
+    write_network(fit(sites, 1), Path(sys.argv[1]), "Matchability, trained by edgevpr", source, sites[0])
 
 
 if __name__ == "__main__":

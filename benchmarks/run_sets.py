@@ -9,8 +9,6 @@ import argparse
 import csv
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -40,33 +38,16 @@ LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FI
 NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights")
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
 _POINTS = 100  # of a curve that is kept
-_RAM = """
-import json, sys
-import cv2, numpy
-from edgevpr import techniques
-def peak_mb():
-    line = next(line for line in open("/proc/self/status") if line.startswith("VmHWM:"))
-    return int(line.split()[1]) * 1024 / 1e6
-picture = cv2.GaussianBlur(numpy.random.default_rng(0).integers(0, 256, (480, 640, 3), numpy.uint8), (0, 0), 3)
-before_mb = peak_mb()
-techniques.create(sys.argv[1], json.loads(sys.argv[2])).encode(picture)
-print(f"{peak_mb() - before_mb:.1f}")
-"""
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the tables: a technique, how it is set, how many queries are matched together and how many places are
-    compared (None: its own numbers), whether all places are compared in full, and whether the queries are followed as
-    those of a flight."""
+    """One row of the tables: a technique, how it is set, and how it is asked."""
 
     label: str
     technique: str
     settings: dict[str, str] = field(default_factory=dict)
-    sequence: int | None = None
-    candidates: int | None = None
-    exact: bool = False
-    follow: bool = False
+    options: MatchOptions = field(default_factory=MatchOptions)
 
 
 ORIGINAL_CALC = Variant("calc, original weights", "calc", {"model": "calc_original"})
@@ -74,14 +55,14 @@ NETWORKS = ("alexnet", "amosnet", "hybridnet", "netvlad", "rmac", "region_vlad",
 VECTORS = ("hog", "calc", *NETWORKS)
 VARIANTS = (
     Variant("cohog", "cohog"),
-    Variant("cohog, exact", "cohog", exact=True),
-    Variant("cohog, thesis", "cohog", {"matching": "thesis"}, exact=True),
-    Variant("cohog, followed", "cohog", follow=True),
-    Variant("cohog, sequence 10", "cohog", sequence=10),
-    *(Variant(f"cohog, {count} candidates", "cohog", candidates=count) for count in (20, 10)),
+    Variant("cohog, exact", "cohog", options=MatchOptions(exact=True)),
+    Variant("cohog, thesis", "cohog", {"matching": "thesis"}, MatchOptions(exact=True)),
+    Variant("cohog, followed", "cohog", options=MatchOptions(follow=True)),
+    Variant("cohog, sequence 10", "cohog", options=MatchOptions(sequence=10)),
+    *(Variant(f"cohog, {n} candidates", "cohog", options=MatchOptions(candidates=n)) for n in (20, 10)),
     Variant("hog", "hog"),
     Variant("seqslam", "seqslam"),
-    Variant("seqslam, one frame", "seqslam", sequence=1),
+    Variant("seqslam, one frame", "seqslam", options=MatchOptions(sequence=1)),
     Variant("calc", "calc"),
     ORIGINAL_CALC,
     *(Variant(name, name) for name in NETWORKS),
@@ -159,21 +140,15 @@ def write_original_calc(cards: Path, weights: Path) -> None:
 def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
-    before = json.loads(path.read_text()) if path.exists() else {}
-    rows: dict[str, Any] = before.get("techniques", {})
+    rows: dict[str, Any] = base.read(path.stem, path.parent).get("techniques", {})
     for variant in wanted:
 
         def shown(items, total, label, variant=variant):
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
-        chosen = settings(variant, folder)
-        options = MatchOptions(
-            candidates=variant.candidates, sequence=variant.sequence, exact=variant.exact, follow=variant.follow
-        )
-        result = evaluate(variant.technique, dataset, chosen, options, shown)
+        result = evaluate(variant.technique, dataset, settings(variant, folder), variant.options, shown)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
             "precision_recall": thinned(result.precision_recall),
-            "encode_ram_mb": encode_ram_mb(variant.technique, chosen),
             "commit": base.commit(),
             "cpu": provenance.cpu_model(),
         }
@@ -183,10 +158,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     made = base.made_by()
     content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
     content["techniques"] = {row["technique"]: row for row in in_order}
-    if (folder / "positions.csv").is_file():
-        flown = [name for name in ("hog", "cohog") if any(variant.label == name for variant in wanted)]
-        content["positions"] = before.get("positions", {}) | {name: position_errors(folder, name) for name in flown}
-    path.write_text(json.dumps(base.rounded(content), indent=1) + "\n")
+    base.write_json(path.stem, content, path.parent)
 
 
 def thinned(curve: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -198,37 +170,6 @@ def settings(variant: Variant, folder: Path) -> dict[str, str]:
     """Return how a variant is used on a set: `cohog` looks down in those from the air; the thesis's has no camera."""
     looks_down = variant.technique == "cohog" and "matching" not in variant.settings
     return variant.settings | ({"camera": "nadir"} if looks_down and base.camera_of(folder.name) == "nadir" else {})
-
-
-def encode_ram_mb(technique: str, chosen: dict[str, str]) -> float:
-    """Return what a technique adds to the resident memory of a process that has NumPy and OpenCV, until it has encoded
-    one picture of 640x480: its libraries, its weights, and the work itself at its highest."""
-    words = [sys.executable, "-c", _RAM, technique, json.dumps(chosen)]
-    return float(subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True).stdout)
-
-
-def position_errors(folder: Path, technique: str) -> dict[str, Any]:
-    """Map the references and match all queries, scored or not, by the commands that a user has."""
-    with tempfile.TemporaryDirectory(prefix="edgevpr-sets-") as temporary:
-        place_map = f"{temporary}/{folder.name}.gpkg"
-        flags = [f"--param={key}={value}" for key, value in settings(Variant(technique, technique), folder).items()]
-        base.edgevpr("map", "build", place_map, "--images", folder / "ref", "--technique", technique, *flags)
-        placed = [
-            match for match in base.edgevpr("match", place_map, "--images", folder / "query") if "error_m" in match
-        ]
-    return {
-        "queries": len(placed),
-        "best_match": spread([match["error_m"] for match in placed]),
-        "accepted": spread([match["error_m"] for match in placed if match["accepted"]]),
-    }
-
-
-def spread(errors_m: list[float]) -> dict[str, float | int | None]:
-    """Return how many errors, their median, the one that 90 % stay below, and the worst."""
-    if not errors_m:
-        return {"count": 0, "median_m": None, "p90_m": None, "worst_m": None}
-    median_m, p90_m, worst_m = (round(float(np.percentile(errors_m, share)), 1) for share in (50, 90, 100))
-    return {"count": len(errors_m), "median_m": median_m, "p90_m": p90_m, "worst_m": worst_m}
 
 
 def write_accuracy(contents: list[dict[str, Any]]) -> None:

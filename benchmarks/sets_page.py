@@ -87,7 +87,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
     machine = contents[0]["machine"]
     reached = [[name, each.technique, *tables.quality(each)] for name, rows in results.items() for each in rows]
     paid = [
-        [content["set"], label, *tables.costs(result(row)), f"{row['encode_ram_mb']:.0f}", row["cpu"]]
+        [content["set"], label, *tables.costs(result(row)), row["cpu"]]
         for content in contents
         for label, row in content["techniques"].items()
     ]
@@ -124,48 +124,10 @@ Weights in use:
 
 ## Costs
 
-{markdown(("set", "technique", *tables.COSTS, "encode RAM MB", "machine"), paid)}
+{markdown(("set", "technique", *tables.COSTS, "machine"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores.
-* encode RAM: what the technique adds to a process that has NumPy and OpenCV, until it has encoded one 640x480 picture:
-  its libraries, its weights and the work itself at its highest.
 * mAh: {assumed}.
-"""
-    if any("positions" in content for content in contents):
-        away = [
-            [
-                content["set"],
-                technique,
-                str(errors["queries"]),
-                *(_metres(errors[of]) for of in ("best_match", "accepted")),
-            ]
-            for content in contents
-            for technique, errors in content.get("positions", {}).items()
-        ]
-        page += f"""
-## Errors in metres
-
-{markdown(("set", "technique", "queries", "best match", "accepted"), away)}
-
-Distance of the query's GPS position from the fix of an accepted match, and from the place of one that is not:
-median / 90 % / worst (how many). All queries with a position are in it, those too that show nothing of the map. GPS on
-these cameras is noisy: 10 to 20 m off (caliterra), tens of metres (swindale). [where.md](where.md) holds fixes against
-better truths.
-"""
-    corridor = next((content["techniques"] for content in contents if content["set"] == "corridor"), {})
-    beside = [
-        [name, f"{theirs:.3f}", f"{ours:.3f}", f"{ours - theirs:+.3f}", different]
-        for name, (theirs, different) in PUBLISHED.items()
-        if (ours := corridor.get(name, {}).get("recall_at_1")) is not None
-    ]
-    if beside:
-        page += f"""
-## Beside the published figures
-
-Recall@1 on corridor; published: computed from the similarity matrices that the thesis's authors gave out with their
-benchmark (VPR-Bench), each technique with its paper's weights.
-
-{markdown(("technique", "published", "here", "difference", "what is different here"), beside)}
 """
     if left_out:
         page += "\n## Left out\n\n"
@@ -188,9 +150,3 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
 
 def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
     return list(content["techniques"].values())
-
-
-def _metres(errors: dict[str, Any]) -> str:
-    if not errors["count"]:
-        return "none"
-    return f"{errors['median_m']:.0f} / {errors['p90_m']:.0f} / {errors['worst_m']:.0f} ({errors['count']})"

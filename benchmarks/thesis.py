@@ -1,7 +1,7 @@
 """Hold this project against the tables and figures of the thesis: `make thesis`.
 
 Measures what no other benchmark does (the similarity matrices that the thesis's author published) into
-benchmarks/results/thesis.json, draws the pictures beside it, and writes docs/thesis.md from that and the results of the
+benchmarks/results/thesis.json, draws the curves beside it, and writes docs/thesis.md from that and the results of the
 other benchmarks. The values of the thesis stand in thesis.yaml, each with its source.
 """
 
@@ -12,9 +12,8 @@ from pathlib import Path
 
 import base
 import thesis_page
-import thesis_pictures
 from base import DATA, REPOSITORY, RESULTS
-from thesis_values import read_results
+from thesis_values import MATRICES, Results, measured_rows, read_results
 
 from edgevpr.lab.evaluate.dataset import read_truth
 from edgevpr.lab.evaluate.similarity import measure, read_similarities
@@ -24,12 +23,12 @@ SET = "corridor"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--page", action="store_true", help="measure nothing: page and pictures of what is there")
+    parser.add_argument("--page", action="store_true", help="measure nothing: page and curves of what is there")
     if not parser.parse_args().page:
         found = matrices(DATA / "vprbench_precomputed", DATA / SET)
         base.write_json("thesis", {**base.made_by(), "matrices": found})
     results = read_results(RESULTS)
-    thesis_pictures.draw(results, RESULTS)
+    curves(results, RESULTS / "thesis_curves.png")
     (REPOSITORY / "docs" / "thesis.md").write_text(thesis_page.page(results), encoding="utf-8")
 
 
@@ -45,6 +44,23 @@ def matrices(folder: Path, images: Path) -> dict[str, dict]:
         published = {key: float(times[name][key]) for key in ("t_encode_s", "t_match_per_ref_s")}
         found[name] = {**asdict(measure(name, read_similarities(path), truth)), **published}
     return found
+
+
+def curves(results: Results, path: Path) -> None:
+    """Draw the PR curves of the author's matrices of corridor, and those of the techniques here."""
+    theirs = {name: results.thesis["matrices"][of] for name, of in MATRICES.items()}
+    ours = measured_rows(results, "corridor")
+    colours = {name: f"C{number}" for number, name in enumerate(ours)}
+    drawn, axes = base.panels(11, 5.2, 2, sharey=True)
+    for axis, title, rows in zip(axes, ("the author's matrices", "here"), (theirs, ours), strict=True):
+        for name, row in sorted(rows.items(), key=lambda each: -each[1]["auc"]):
+            precision, recall = zip(*row["precision_recall"], strict=True)
+            style = {"color": "k", "lw": 2} if name not in theirs and "cohog" in name else {"color": colours[name]}
+            axis.plot(recall, precision, label=f"{name} {row['auc']:.2f}", **style)
+        axis.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", title=f"corridor: {title}")
+        axis.legend(title="AUC (2.3)", fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
+    axes[0].set_ylabel("precision")
+    base.save(drawn, path)
 
 
 if __name__ == "__main__":

@@ -42,34 +42,6 @@ so it is here.
 """
 
 
-def charge_here(results: Results) -> str:
-    """Table 5.2 with the costs that were measured here."""
-    table = THESIS["table_5_2"]
-    rows = []
-    machine = results.sets["corridor"]["machine"]
-    for name, label in ROWS.items():
-        row = results.sets["corridor"]["techniques"][label]
-        share = machine["cores"] / table["cores"]
-        t_match_s = row["t_match_per_ref_s"] * table["references"]
-        ours = total_ah(row["u_encode"] * share, row["u_match"] * share, row["t_encode_s"], t_match_s)
-        theirs = float(table["techniques"][name][-1]) if name in table["techniques"] else None
-        rows.append([name, _digits(theirs, ".4f"), f"{ours:.4f}", three(theirs, 1 / ours)])
-    (flown,) = (row for row in results.bench["two_stage"] if row["camera"] == "forward")
-    one_core = 1 / table["cores"]
-    encode_s, query_s = flown["encode_ms"] / 1000, flown["two_stage_ms"] / 1000
-    ours = total_ah(one_core, one_core, encode_s, query_s - encode_s)
-    rows.append(["cohog, as it flies (10 000 places)", "-", f"{ours:.4f}", "-"])
-    return f"""### With the costs measured here
-
-The same equations for {table["queries"]} queries and {table["references"]} references, with the CPU time that a
-technique took here on corridor (its matching time a reference times {table["references"]}), on a machine of
-{table["cores"]} cores as fast as one here. The networks here are small ones in the place of large ones, so the charge
-of encoding says nothing of the papers' networks; what is alike is the model, the vectors and the way to compare them.
-
-{markdown(("technique", "thesis, Ah", "here, Ah", "thesis / here"), rows)}
-"""
-
-
 def times(results: Results) -> str:
     """t_e and t_m: tables 5.2 and 6.1, the text of 6.3.2, the author's times on corridor, and those here."""
     published = results.thesis["matrices"]
@@ -159,8 +131,6 @@ CoHOG has the best PCU on all five sets holds. On Cross-Seasons CoHOG's own best
 author's later matrices and times of corridor {leader} has the most, {published[leader]:.2f}, and CoHOG
 {published["CoHOG"]:.2f}: it takes {1e3 * results.thesis["matrices"]["CoHOG"]["t_encode_s"]:.0f} ms to encode there, and
 not {1e3 * float(THESIS["cohog"]["t_encode_s"]):.0f}.
-
-![PCU of table 6.1, and here](../benchmarks/results/thesis_pcu.png)
 """
 
 
@@ -187,23 +157,6 @@ Cross-Region-BoW keeps its words, and its regions on disk; Region-VLAD keeps hal
 map has fewer channels.
 
 {markdown(heads, rows)}
-"""
-
-
-def encode_ram(results: Results) -> str:
-    """Table 6.1: RAM of encoding one query."""
-    rows = []
-    for name, label in ROWS.items():
-        theirs = float(THESIS["table_6_1"]["techniques"][name][-1])
-        row = results.sets["corridor"]["techniques"][label]
-        rows.append([name, f"{theirs:g}", f"{row['encode_ram_mb']:.1f}", f"{row['encode_ram_mb'] - theirs:+.1f}"])
-    return f"""## Table 6.1: RAM of encoding a query
-
-Page 103. Here: what a technique adds to a process that has NumPy and OpenCV, until it has encoded one picture of
-640x480: libraries, weights, and the work at its highest. The thesis cannot mean that: a VGG-16 alone has 14.7
-million weights in its convolutions. Its 0.06 MB for CoHOG are 961 x 32 numbers of 2 bytes.
-
-{markdown(("technique", "thesis, MB", "here, MB", "difference"), rows)}
 """
 
 

@@ -24,7 +24,7 @@ def answers(results: Results) -> list[list[str]]:
     return [
         ["table 5.2", "from its own inputs", f"Ah_t within {worst:.2%}", "ampere-hours"],
         ["figure 6.6", "from table 6.1; run on corridor", leads, "PCU"],
-        ["table 6.1", "run on other pictures", "order of techniques, times, RAM", "precision; times; RAM"],
+        ["table 6.1", "run on other pictures", "order of techniques, times", "precision; times"],
         ["figures 4.8, 6.7 (techniques)", "the author's matrices of corridor", corridor, "Corridor"],
         ["figures 3.12, 3.20, 3.21", "run on other sets", "AUC rises seldom", "memorable maps"],
         ["figures 4.7, 5.7", "from the sizes in the text", smaller, "memory of a map"],
@@ -53,14 +53,12 @@ thesis's own inputs.
 """
     sections = (
         costs.charge(),
-        costs.charge_here(results),
         costs.times(results),
         quality.corridor(results),
         quality.precision(results),
         costs.pcu(results),
         quality.memorable(results),
         costs.memory(results),
-        costs.encode_ram(results),
         own_tables(),
         tail,
     )
