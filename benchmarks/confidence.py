@@ -6,8 +6,7 @@ as `map build` does, and judged by the set's own queries and by those of all oth
 has been fitted without it. Which evidence counts, and how far a map moves the weights, was chosen with all sets in
 view.
 
-Writes confidence.json, confidence.md and confidence.png (reliability) into benchmarks/results/; --ship writes the
-models that edgevpr has.
+Writes confidence.json and confidence.md into benchmarks/results/; --ship writes the models that edgevpr has.
 """
 
 import argparse
@@ -23,7 +22,7 @@ from pathlib import Path
 import base
 import numpy as np
 import walks
-from base import DATA, RESULTS, camera_of
+from base import DATA, camera_of
 from confidence_rows import Row, gather, kind_of_match, site_of
 from shipped_model import FittedSite, shipped_model
 
@@ -70,9 +69,8 @@ def main() -> None:
     if args.ship:
         ship(args.ship, rows)
     sets = [judged(rows[name], models[name]) for name in names]
-    found = {**base.made_by(), "sets": sets, "flights": flights, "reliability": reliability(rows, models)}
+    found = {**base.made_by(), "sets": sets, "flights": flights}
     base.write("confidence", found, page(found))
-    draw(found["reliability"], RESULTS / "confidence.png")
 
 
 def ship(folder: Path, rows: Rows) -> None:
@@ -152,25 +150,6 @@ def _bins(sure: np.ndarray) -> Iterator[np.ndarray]:
     yield from (bins == each for each in sorted(set(bins.tolist())))
 
 
-def reliability(rows: Rows, models: dict[str, Model]) -> base.Row:
-    """Return confidence and share of right ones of own queries, by camera, in ten bins; each set counts the same."""
-    found = {}
-    for camera in KINDS:
-        own = [[row for row in rows[name] if row.kind == "own"] for name in rows if camera_of(name) == camera]
-        sure = np.array([_sure(models[row.map], row) for of_set in own for row in of_set])
-        right = np.array([row.right for of_set in own for row in of_set])
-        weight = np.array([1 / len(of_set) for of_set in own for _ in of_set])
-        found[camera] = [
-            {
-                "confidence": float(np.average(sure[bins], weights=weight[bins])),
-                "right": float(np.average(right[bins], weights=weight[bins])),
-                "queries": int(np.count_nonzero(bins)),
-            }
-            for bins in _bins(sure)
-        ]
-    return found
-
-
 def followed(name: str, models: dict[str, Model]) -> base.Row:
     """Fly along the way of a map in several manners, each query by itself and followed, and count fixes."""
     dataset = walks.dataset_of(DATA / name)
@@ -235,8 +214,6 @@ other sites.
 At {default}, {taken} of {sum(row["foreign"] for row in found["sets"])} foreign queries are accepted, over all pairings
 of sets and both cameras.
 
-![reliability](confidence.png)
-
 ## Followed from query to query
 
 Flights along the way of the map, at the default precision, each query by itself and followed; nothing is known of time
@@ -252,20 +229,6 @@ brackets wrong, beside, foreign.
 def _flown(count: base.Row) -> str:
     share = count["right"] / max(1, count["queries"])
     return f"{share:.2f} ({count['wrong']}, {count['beside']}, {count['foreign']})"
-
-
-def draw(found: base.Row, path: Path) -> None:
-    """Draw the share of right matches against the confidence, with the number of queries."""
-    drawn, axes = base.panels(9, 4.4, len(found), sharey=True)
-    for axis, (camera, bins) in zip(axes, found.items(), strict=True):
-        axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-        sizes = [20 + 60 * np.log10(each["queries"]) for each in bins]
-        axis.scatter([each["confidence"] for each in bins], [each["right"] for each in bins], s=sizes, color="#2060c0")
-        for each in bins:
-            axis.annotate(each["queries"], (each["confidence"], each["right"]), (8, -12), textcoords="offset points")
-        axis.set(xlabel="confidence", title={"forward": "ahead", "nadir": "straight down"}[camera], xlim=(-0.03, 1.06))
-    axes[0].set(ylabel="share of right matches", ylim=(-0.03, 1.06))
-    base.save(drawn, path)
 
 
 if __name__ == "__main__":

@@ -1,25 +1,12 @@
-"""What flights.py found: its figures, its page, and some of the flights drawn over the mosaics."""
+"""What flights.py found: its figures and its page."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import base
 import numpy as np
 from base import Row, use_of
-from flight_sites import Site
 from where import honest, spread
 
-from edgevpr.mapmaking.orthophoto import Orthophoto
-
-_DRAWN = (
-    ("aerial_caliterra", "across"),
-    ("aerial_swindale", "along"),
-    ("aerial_swindale", "leave"),
-    ("kite_ochota", "across"),
-    ("aerial_copr", "along"),
-    ("rows", "along"),
-)
-_COLOURS = {"right": "#20e020", "wrong": "#ff2020", None: "white"}
 _COLUMNS = {
     "flights": "{name}",
     "mode": "{mode}",
@@ -127,12 +114,7 @@ Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNED_ON
 {(chr(10) * 2).join(tables)}
 
 Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}; {result["took_s"]} s.
-`python benchmarks/flights.py` makes this page; flights.json has every flight, `--events FILE` every query.
-
-![flights](flights.jpg)
-
-Green: a right fix. White: refused over the map. Grey: refused beside it, or over ground of another set. Red: a wrong
-fix, with a line to where it says that the aircraft is. The picture is the mosaic that is flown over.
+`python benchmarks/flights.py` makes this page; flights.json has every flight.
 """
 
 
@@ -148,40 +130,3 @@ def _table(groups: Row) -> str:
         for mode, each in modes.items()
     ]
     return base.table(rows, _COLUMNS)
-
-
-def draw(rows: Sequence[Row], sites: dict[str, Site], path: Path) -> None:
-    """Draw some flights over what they were flown over, a row of pictures a mode."""
-    modes = list(dict.fromkeys(row["mode"] for row in rows))
-    drawn = [each for each in _DRAWN if any((row["site"], row["kind"]) == each for row in rows)]
-    if not drawn:
-        return
-    figure, axes = base.panels(2.6 * len(drawn), 2.9 * len(modes), len(drawn) * len(modes), len(modes))
-    for column, (name, kind) in enumerate(drawn):
-        site = sites[name]
-        half_m = site.room.metres_per_px * len(site.room.values) / 2
-        photo = Orthophoto(site.flown)
-        ground, valid = photo.cut(site.position(np.zeros(2)), 2 * half_m, 500)
-        photo.close()
-        ground[~valid] = 80
-        for axis, mode in zip(axes[column :: len(drawn)], modes, strict=True):
-            these = [row for row in rows if (row["site"], row["kind"], row["mode"]) == (name, kind, mode)]
-            at = np.array([(row["east_m"], row["north_m"]) for row in these])
-            axis.imshow(0.8 * ground[..., ::-1] / 255, extent=(-half_m, half_m, -half_m, half_m))
-            axis.plot(*at.T, color="0.7", lw=0.6)
-            for (east_m, north_m), row in zip(at, these, strict=True):
-                colour = _COLOURS[row["fix"]] if row["fix"] or row["is_mapped"] else "#909090"
-                axis.plot(east_m, north_m, "o", color=colour, ms=4 if row["fix"] else 3, mew=0)
-                if row["fix"] == "wrong":
-                    east, north = (east_m, east_m + row["off_east_m"]), (north_m, north_m + row["off_north_m"])
-                    axis.plot(east, north, color=_COLOURS["wrong"], lw=1)
-            shown = np.vstack([site.way, at])
-            middle, room = (shown.min(axis=0) + shown.max(axis=0)) / 2, np.ptp(shown, axis=0).max() / 2
-            west, south = middle - room - site.footprint_m / 2
-            east, north = middle + room + site.footprint_m / 2
-            axis.set(xlim=(west, east), ylim=(south, north), facecolor="0.25")
-            fixes = [row["fix"] for row in these]
-            counts = f"{fixes.count('right')} right, {fixes.count('wrong')} wrong"
-            axis.set_title(f"{name}, {kind}\n{mode}: {counts}", fontsize=8)
-            axis.grid(False)
-    figure.savefig(path, dpi=75)

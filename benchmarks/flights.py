@@ -22,7 +22,6 @@ over: too few.
 """
 
 import argparse
-import csv
 import os
 import tempfile
 import time
@@ -176,7 +175,6 @@ def _told(event: Recognition, site: Site, query: Row) -> Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sites", metavar="A,B", default=",".join(FLOWN), help="whose maps are flown with (all)")
-    parser.add_argument("--events", type=Path, metavar="CSV", help="write a line for each query and mode, too")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     base.find_sets(names=[name for name in FLOWN if name != ROWS])
@@ -190,18 +188,9 @@ def main() -> None:
         sites = {site.name: site for site in pool.map(prepare, FLOWN)}
         for flight, new in zip(flights, pool.map(partial(flown, sites=sites), flights), strict=True):
             rows += new
-            fixes = {mode: [row["fix"] for row in new if row["mode"] == mode] for mode in MODES}
-            said = ", ".join(f"{mode} {each.count('right')}/{each.count('wrong')}" for mode, each in fixes.items())
-            print(f"{flight.number:3} {flight.site:18} {flight.kind:13} {flight.odometry:12} {said}", flush=True)
-        args.out.mkdir(parents=True, exist_ok=True)
-        flight_page.draw(rows, sites, args.out / "flights.jpg")
+            print(flight, flush=True)
     found = {**base.made_by(), "took_s": round(time.monotonic() - began_s), **flight_page.summary(rows, list(MODES))}
     base.write("flights", found, page(found), args.out)
-    if args.events:
-        with open(args.events, "w", newline="") as handle:
-            table = csv.DictWriter(handle, list(max(rows, key=len)))
-            table.writeheader()
-            table.writerows(rows)
 
 
 def page(found: Row) -> str:

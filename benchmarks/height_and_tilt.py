@@ -17,7 +17,7 @@ import base
 import cv2
 import numpy as np
 import walks
-from base import RESULTS, Row
+from base import Row
 
 from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
@@ -46,7 +46,6 @@ def main() -> None:
     rows = [row for folder in base.find_sets(camera="nadir") for row in measured(folder)]
     found = {**base.made_by(), "rows": rows}
     base.write("height_and_tilt", found, page(found))
-    draw(rows, RESULTS / "height_and_tilt.png")
 
 
 def measured(folder: Path) -> Iterator[Row]:
@@ -201,22 +200,6 @@ def page(found: Row) -> str:
         parts.append(base.table(lines, {"height over that of the map": "{set}", **columns}))
     parts += ["## All figures", base.table(rows, {name.replace("_", " "): f"{{{name}}}" for name in rows[0]})]
     return "\n\n".join(part.strip() for part in parts)
-
-
-def draw(rows: list[Row], path: Path) -> None:
-    """Draw recall against the height, a panel a tilt."""
-    drawn, axes = base.panels(11, 4.2, len(TILTS_DEG), sharey=True)
-    for axis, tilt_deg in zip(axes, TILTS_DEG, strict=True):
-        for name, own in base.groups((row for row in rows if row["tilt_deg"] == tilt_deg), lambda row: row["set"]):
-            label = f"{name} ({own[0]['queries']})" + (", tuned on" if base.use_of(name) == "tune" else "")
-            axis.plot([row["height_ratio"] for row in own], [row["recall_at_1"] for row in own], "o-", label=label)
-        axis.set(xscale="log", xlabel="height over that of the map", ylim=(0, 1.03))
-        axis.set_title(f"any heading, {tilt_deg:g}° of tilt")
-        axis.set_xticks(RATIOS, [f"{ratio:g}" for ratio in RATIOS], minor=False)
-        axis.minorticks_off()
-    axes[0].set_ylabel("recall@1")
-    axes[0].legend(loc="lower center", fontsize=8)
-    base.save(drawn, path)
 
 
 if __name__ == "__main__":

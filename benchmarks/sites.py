@@ -3,8 +3,8 @@
 All sets from the air are one map looking down, and corridor and grief_stromovka_seasons one looking ahead. Each query
 asks for its place among all of them, as in a flight that knows nothing of where it is. The maps are nested: first a
 right place for every query (as few as that takes), then the other pictures of the sites, then places that are nowhere
-near (`foreign_places.py`), in equal mixture at every size. So up to the size that is marked as all sites, right places
-come in too; from there on only foreign ones do.
+near (`foreign_places.py`), in equal mixture at every size. So up to the size of all sites, right places come in too;
+from there on only foreign ones do.
 
 Places have no positions: the confidence is the shipped one, and looking down landmarks tell which places show the same
 ground. Each map is asked in a process of its own, one thread. Times are of the processor. Beside that all places are
@@ -25,7 +25,7 @@ from pathlib import Path
 import base
 import numpy as np
 import walks
-from base import RESULTS, Row
+from base import Row
 from flight_process import memory_mb
 from foreign_places import MIRRORED, foreign
 from run_sets import join
@@ -86,7 +86,6 @@ def main() -> None:
         rows.append(base.kept(WORK / f"{camera}_{places}_{how}.json", in_a_process))
         found = {**base.made_by(), "rows": rows}
         base.write("sites", found, page(found))
-        draw(rows, RESULTS / "sites.png")
 
 
 def planned() -> Iterator[tuple[str, int, str]]:
@@ -267,44 +266,7 @@ def page(found: Row) -> str:
             parts.append(base.table(exact, {**_FOUND, **also}))
         if unlike:
             parts += ["Without mirrored ground:", base.table(unlike, _FOUND)]
-    parts.append("![recall, what is accepted, times and memory as the map grows](sites.png)")
     return "\n\n".join([*parts, base.made_line(found, "make sites")])
-
-
-def draw(rows: list[Row], path: Path) -> None:
-    """Draw recall, what is accepted, and times, against the places of the map."""
-    drawn, axes = base.panels(14, 4.2, 3)
-    for camera, colour in zip(TITLES, ("tab:orange", "tab:blue"), strict=True):
-        flown, exact, unlike = by_how([dict(row) for row in rows], camera)
-        if not flown:
-            continue
-        title, places = TITLES[camera].lower(), [row["places"] for row in flown]
-
-        def curve(
-            axis, style: str, label: str, values: list[float], at: list[int] = places, colour: str = colour
-        ) -> None:
-            axis.plot(at, values, style, color=colour, label=label)
-
-        curve(axes[0], "o-", f"{title}, {flown[0]['queries']} queries", [row["recall_at_1"] for row in flown])
-        intervals = np.array([row["recall_at_1_interval"] or (np.nan, np.nan) for row in flown])
-        axes[0].fill_between(places, *intervals.T, color=colour, alpha=0.15, linewidth=0)
-        for beside, mark, what in ((exact, "x:", "all compared"), (unlike, "s:", "no mirrored ground")):
-            if beside:
-                label, at = f"{title}, {what} ({beside[0]['queries']})", [row["places"] for row in beside]
-                curve(axes[0], mark, label, [row["recall_at_1"] for row in beside], at)
-        curve(axes[1], "o-", f"{title}, right", [row["accepted_right"] / row["queries"] for row in flown])
-        curve(axes[1], "x--", "wrong", [row["accepted_wrong"] / row["queries"] for row in flown])
-        curve(axes[2], "o-", f"{title}, query", [row["t_query_ms"] for row in flown])
-        curve(axes[2], "x--", "scan", [row["t_scan_ms"] for row in flown])
-        for axis in axes[:2]:
-            axis.axvline(max(row["of_sites"] for row in flown), color=colour, linestyle=":", linewidth=1)
-    axes[0].set(title="recall@1 (dotted upright: all sites are in)", ylim=(0.5, 1.01))
-    axes[1].set(title="share of the queries accepted", ylim=(-0.02, 1.01))
-    axes[2].set(title="time of the processor, ms", yscale="log")
-    for axis in axes:
-        axis.set(xscale="log", xlabel="places in the map")
-        axis.legend(fontsize=8, frameon=False)
-    base.save(drawn, path)
 
 
 if __name__ == "__main__":
