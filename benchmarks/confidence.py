@@ -13,7 +13,7 @@ import argparse
 import json
 import os
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
@@ -121,10 +121,11 @@ def judged(rows: Sequence[Row], model: Model) -> base.Row:
     """Judge the queries of one map, its own and those of other sites."""
     own, foreign = ([row for row in rows if row.kind == kind] for kind in ("own", "foreign"))
     sure, right = np.array([_sure(model, row) for row in own]), np.array([row.right for row in own])
-    apart = [abs(sure[bins].mean() - right[bins].mean()) * bins.mean() for bins in _bins(sure)]
+    tenth = np.minimum((_BINS * sure).astype(int), _BINS - 1)
+    apart = np.bincount(tenth, sure - right) / len(own)  # of each bin, by its share of the queries
     made = {"set": rows[0].map, "use": base.use_of(rows[0].map), "queries": len(own), "right": int(right.sum())}
     made |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
-    made |= {"roc_auc": roc_auc(sure, right), "ece": float(sum(apart)), "precision": {}}
+    made |= {"roc_auc": roc_auc(sure, right), "ece": float(abs(apart).sum()), "precision": {}}
     for precision in PRECISIONS:
         taken = [row for row in own if _accepted(model, row, precision)]
         made["precision"][str(precision)] = {
@@ -142,12 +143,6 @@ def _sure(model: Model, row: Row) -> float:
 
 def _accepted(model: Model, row: Row, precision: float) -> bool:
     return row.veto is None and _sure(model, row) >= model.threshold(precision)
-
-
-def _bins(sure: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield which confidences are in each tenth that has any, bool (N,)."""
-    bins = np.minimum((_BINS * sure).astype(int), _BINS - 1)
-    yield from (bins == each for each in sorted(set(bins.tolist())))
 
 
 def followed(name: str, models: dict[str, Model]) -> base.Row:

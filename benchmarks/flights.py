@@ -38,7 +38,7 @@ import flight_sites
 import flight_tracks
 import numpy as np
 import walks
-from base import RESULTS, Row
+from base import Row
 from flight_sites import ROWS, Site
 
 from edgevpr.core.contract import Technique
@@ -175,7 +175,6 @@ def _told(event: Recognition, site: Site, query: Row) -> Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sites", metavar="A,B", default=",".join(FLOWN), help="whose maps are flown with (all)")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     base.find_sets(names=[name for name in FLOWN if name != ROWS])
     began_s, rows = time.monotonic(), []
@@ -190,7 +189,7 @@ def main() -> None:
             rows += new
             print(flight, flush=True)
     found = {**base.made_by(), "took_s": round(time.monotonic() - began_s), **flight_page.summary(rows, list(MODES))}
-    base.write("flights", found, page(found), args.out)
+    base.write("flights", found, page(found))
 
 
 def page(found: Row) -> str:

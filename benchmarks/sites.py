@@ -11,7 +11,7 @@ ground. Each map is asked in a process of its own, one thread. Times are of the 
 compared in full, which no flight has time for: looking ahead, in the map of 200, for every third query.
 Looking down, a third of the foreign places is mirrored ground of the very sites; a map of others only stands beside.
 
-What is measured stays in the folder --work, so that an interrupted run goes on.
+What is measured stays in sites_work/, so that an interrupted run goes on.
 """
 
 import argparse
@@ -20,6 +20,8 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import base
@@ -42,8 +44,8 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 TITLES = {"nadir": "Looking straight down", "forward": "Looking ahead"}
 AHEAD = ("corridor", "grief_stromovka_seasons")  # the sets that look ahead and are large enough to be asked
-EXACT_PLACES, EXACT_EVERY = 200, 3  # every third query
-UNLIKE, UNLIKE_PLACES = "unlike", 5_000
+EXACT_EVERY = 3  # every third query
+UNLIKE = "unlike"
 WORK = Path("sites_work")
 _BESIDE = 2  # pictures, as where a map has no positions
 _FOUND = {
@@ -76,26 +78,24 @@ def main() -> None:
         camera, places, how = args.measure
         print(json.dumps(measured(camera, int(places), how)))
         return
-    rows = []
-    for camera, places, how in planned():
-
-        def in_a_process(words: tuple = (camera, places, how)) -> Row:
-            argv = [sys.executable, __file__, "--measure", *map(str, words)]
-            return json.loads(subprocess.run(argv, check=True, stdout=subprocess.PIPE).stdout)
-
-        rows.append(base.kept(WORK / f"{camera}_{places}_{how}.json", in_a_process))
-        found = {**base.made_by(), "rows": rows}
-        base.write("sites", found, page(found))
+    rows = [base.kept(WORK / f"{'_'.join(words)}.json", partial(in_a_process, words)) for words in planned()]
+    found = {**base.made_by(), "rows": rows}
+    base.write("sites", found, page(found))
 
 
-def planned() -> Iterator[tuple[str, int, str]]:
+def in_a_process(words: tuple[str, ...]) -> Row:
+    done = subprocess.run([sys.executable, __file__, "--measure", *words], check=True, stdout=subprocess.PIPE)
+    return json.loads(done.stdout)
+
+
+def planned() -> Iterator[tuple[str, str, str]]:
     """Yield what is to be measured; the map of all places is built before its camera's first."""
     for camera in TITLES:
-        dataset, count = dataset_of(camera), _build(camera)
-        sizes = sorted({size for size in SIZES if size <= count} | {len(dataset.references)})
-        yield from ((camera, size, "flown") for size in sizes)
-    yield "nadir", UNLIKE_PLACES, UNLIKE
-    yield "forward", EXACT_PLACES, "exact"
+        _build(camera)
+        for size in sorted({*SIZES, len(dataset_of(camera).references)}):
+            yield camera, str(size), "flown"
+    yield "nadir", "5000", UNLIKE
+    yield "forward", "200", "exact"
 
 
 def folders_of(camera: str) -> list[Path]:
@@ -110,19 +110,17 @@ def dataset_of(camera: str) -> Dataset:
     return walks.dataset_of(joined)
 
 
-def _build(camera: str) -> int:
-    """Build the map of all places, or go on with it; return how many it has."""
-    dataset, path, technique = dataset_of(camera), WORK / f"{camera}.gpkg", walks.cohog(camera)
-    with PlaceMap.open_for_adding(path) if path.exists() else PlaceMap.create(path, technique.spec) as place_map:
-        if len(place_map) < max(SIZES):
-
-            def frames() -> Iterator:
-                yield from walks.frames_of(dataset.ref_dir)
-                missing = max(SIZES) - len(dataset.references)
-                yield from foreign(camera, missing, base.DATA, folders_of(camera))
-
-            build_map(frames(), technique, place_map, walks.meter())
-        return len(place_map)
+def _build(camera: str) -> None:
+    """Build the map of all places, unless it is there."""
+    path, unfinished = WORK / f"{camera}.gpkg", WORK / f"{camera}_unfinished.gpkg"
+    if path.exists():
+        return
+    unfinished.unlink(missing_ok=True)
+    dataset, technique = dataset_of(camera), walks.cohog(camera)
+    strangers = foreign(camera, max(SIZES) - len(dataset.references), base.DATA, folders_of(camera))
+    with PlaceMap.create(unfinished, technique.spec) as place_map:
+        build_map(chain(walks.frames_of(dataset.ref_dir), strangers), technique, place_map, walks.meter())
+    unfinished.rename(path)
 
 
 def chosen(dataset: Dataset, names: list[str], count: int) -> set[str]:
@@ -239,28 +237,18 @@ def _whereabouts(place: str, query: str, sites: list[str]) -> str:
     return kind or ("own site" if place.startswith(own) else "another site")
 
 
-def by_how(rows: list[Row], camera: str) -> list[list[Row]]:
-    """Return the rows of a camera that were flown, exact, and unlike, by places, with words for `where` and the recall
-    as flown of the queries that were asked exactly."""
-    mine = sorted((row for row in rows if row["camera"] == camera), key=lambda row: row["places"])
-    for row in mine:
-        row["where"] = ", ".join(f"{count} {kind}" for kind, count in sorted(row["wrong_by"].items())) or "-"
-    flown, exact, unlike = ([row for row in mine if row["how"] == how] for how in ("flown", "exact", UNLIKE))
-    for row in exact:
-        hits = next((each["hits"] for each in flown if each["places"] == row["places"]), "")[::EXACT_EVERY]
-        row["as_flown"] = hits.count("+") / len(hits) if hits else None
-    return [flown, exact, unlike]
-
-
 def page(found: Row) -> str:
     """Return the page for people."""
     parts = ["# One map out of many sites", base.told(__doc__, "What is measured")]
     for camera, title in TITLES.items():
-        flown, exact, unlike = by_how([dict(row) for row in found["rows"]], camera)
-        if not flown:
-            continue
+        rows = [dict(row) for row in found["rows"] if row["camera"] == camera]
+        for row in rows:
+            row["where"] = ", ".join(f"{count} {kind}" for kind, count in sorted(row["wrong_by"].items())) or "-"
+        flown, exact, unlike = ([row for row in rows if row["how"] == how] for how in ("flown", "exact", UNLIKE))
         parts += [f"## {title}: {flown[0]['queries']} queries", base.table(flown, _FOUND), base.table(flown, _COSTS)]
-        if exact:
+        for row in exact:
+            (hits,) = (each["hits"][::EXACT_EVERY] for each in flown if each["places"] == row["places"])
+            row["as_flown"] = hits.count("+") / len(hits)
             parts.append(f"All places compared in full, {exact[0]['queries']} of the queries:")
             also = {"flown, the same queries": "{as_flown:.3f}", "query ms": "{t_query_ms:.0f}"}
             parts.append(base.table(exact, {**_FOUND, **also}))

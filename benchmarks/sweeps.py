@@ -15,13 +15,13 @@ Where a view shows nothing it is black and masked, so no edge of it is taken for
 picture starts from the view that is not turned. Techniques are opened as they fly; maps of `cohog` are refined and
 calibrated as `map build` does. The networks run on the one that edgevpr ships, `calc`. `seqslam` needs a flight.
 
-What is measured stays in the folder --work, so that an interrupted run goes on.
+What is measured of a set stays in sweeps_work/, so that an interrupted run goes on.
 """
 
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import base
@@ -37,7 +37,6 @@ from edgevpr import techniques
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
-from edgevpr.lab.evaluate.metrics import interval
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
@@ -74,60 +73,37 @@ class Shown:
         return Levelled(frame.image, self.mask, UNKNOWN_VIEW)
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A technique that is asked: its walk over a map, what it is shown, and the names of the places by their slots."""
-
-    walk: Recogniser
-    shown: Shown
-    names: list[str]
+Asked = tuple[Recogniser, Shown, list[str]]  # a walk over a map, what it is shown, and the places' names by slot
 
 
 def main() -> None:
     rows: list[Row] = []
     for folder in base.find_sets(names=SETS):
-        rows += _gathered(WORK / f"{folder.name}.json", folder)
-        found = {**base.made_by(), "rows": rows}
-        base.write("sweeps", found, page(found))
-        draw(rows, RESULTS / "sweeps.png")
+        rows += base.kept(WORK / f"{folder.name}.json", partial(swept, folder))
+    found = {**base.made_by(), "rows": rows}
+    base.write("sweeps", found, page(found))
+    draw(rows, RESULTS / "sweeps.png")
 
 
-def _gathered(path: Path, folder: Path) -> list[Row]:
-    """Return what each technique finds of a set: what the file has of it, and the levels that it lacks, written one by
-    one."""
-    camera = camera_of(folder.name)
-    found = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
-    found = json.loads(path.read_text()) if path.exists() else found
-    wanted = [(sweep, level) for sweep in SWEEPS for level in SWEEPS[sweep].of(camera)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for levels in swept(folder, wanted[len(found[0]["levels"]) :]):
-        for row, level in zip(found, levels, strict=True):
-            row["levels"].append(level)
-        path.with_suffix(".new").write_text(json.dumps(found))
-        path.with_suffix(".new").replace(path)
-    return found
-
-
-def swept(folder: Path, wanted: list[tuple[str, float]]) -> Iterator[list[Row]]:
-    """Ask in the maps of a set, at the wanted levels of sweeps; yield a level of each technique."""
-    if not wanted:
-        return
+def swept(folder: Path) -> list[Row]:
+    """Return what each technique finds in its map of a set, at all levels of all sweeps."""
     camera = camera_of(folder.name)
     starts = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder))
+    rows = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
     with ExitStack() as stack:
         asked = []
         for name in TECHNIQUES:
             technique, shown = create(name, {"camera": camera} if name == "cohog" else {}), Shown()
             place_map, index, _ = stack.enter_context(walks.map_of(folder, technique, folder / "ref"))
             walk = walks.walk(place_map, index, technique, levelling=shown)
-            asked.append(Asked(walk, shown, walks.names_of(place_map, index)))
-        unchanged = None
-        for sweep, level in wanted:
-            if level != NONE.get(sweep, 0):
-                yield _asked(asked, starts, camera, sweep, level)
-            else:
-                unchanged = unchanged or _asked(asked, starts, camera, sweep, level)
-                yield [{**each, "sweep": sweep, "level": level} for each in unchanged]
+            asked.append((walk, shown, walks.names_of(place_map, index)))
+        unchanged = _asked(asked, starts, camera, "yaw", 0)
+        for sweep, level in ((key, level) for key, each in SWEEPS.items() for level in each.of(camera)):
+            is_none = level == NONE.get(sweep, 0)
+            found = unchanged if is_none else _asked(asked, starts, camera, sweep, level)
+            for row, each in zip(rows, found, strict=True):
+                row["levels"].append({"sweep": sweep, "level": level, **each})
+    return rows
 
 
 def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> list[Row]:
@@ -144,22 +120,19 @@ def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, lev
             image = spoilt(sweep, level, image, rng)
         shares.append(mask.mean())
         ignored = start.ignored | _overlapping(start, change @ start.onto)
-        for each, of_it in zip(asked, found, strict=True):
-            each.shown.mask = None if mask.all() else mask
-            event = each.walk.step(walks.frame(image, start.name))
-            ranked = walks.ranked(event, each.names)
+        for (walk, shown, names), of_it in zip(asked, found, strict=True):
+            shown.mask = None if mask.all() else mask
+            event = walk.step(walks.frame(image, start.name))
+            ranked = walks.ranked(event, names)
             of_it["hits"].append(next((place for place in ranked if place not in ignored), None) in start.right)
             of_it["accepted"] += event.accepted
             if event.accepted and ranked[0] not in start.right | ignored:
                 of_it["wrong"].append((start.name, ranked[0]))
     return [
         {
-            "sweep": sweep,
-            "level": level,
             "asked": len(shares),
             "shown": round(float(np.mean(shares)), 3) if shares else 0.0,
             "recall_at_1": round(float(np.mean(each["hits"])), 4) if shares else None,
-            "recall_at_1_interval": interval(np.array(each["hits"])) if shares else None,
             "accepted": each["accepted"],
             "accepted_wrong": len(each["wrong"]),
             "wrong": each["wrong"],
@@ -194,29 +167,24 @@ def _over_mosaic(folder: Path) -> Iterator[Start]:
     """Start where places of the map were taken, over the mosaic of the queries."""
     on = laid(folder)
     ground, covered = mosaic_of(folder, on, "query")
-    onto, lies, sizes = {}, {}, {}
     every = sorted(path.name for path in (folder / "ref").iterdir())
-    for name in every:
-        if name in on.middle:
-            image = read_image(folder / "ref" / name)
-            there = np.vstack([on.matrix(name, image), [0, 0, 1]])
-            onto[name], lies[name] = np.linalg.inv(there), through(there, corners(image))
-            sizes[name] = image.shape[1::-1]
-    starts = []
-    for name in onto:
-        start = Start(
+    images = {name: read_image(folder / "ref" / name) for name in every if name in on.middle}
+    there = {name: np.vstack([on.matrix(name, image), [0, 0, 1]]) for name, image in images.items()}
+    lies = {name: through(there[name], corners(image)) for name, image in images.items()}
+    starts = [
+        Start(
             name=name,
             ground=ground,
             covered=covered,
-            onto=onto[name],
-            size=sizes[name],
+            onto=np.linalg.inv(there[name]),
+            size=image.shape[1::-1],
             right=frozenset([name]),
-            ignored=frozenset(every) - frozenset(onto),
+            ignored=frozenset(every) - frozenset(images),
             lies={other: each for other, each in lies.items() if other != name},
         )
-        if seen(start, start.onto)[1].mean() >= _LEAST_COVERED:
-            starts.append(start)
-    yield from _some(starts)
+        for name, image in images.items()
+    ]
+    yield from _some([start for start in starts if seen(start, start.onto)[1].mean() >= _LEAST_COVERED])
 
 
 def _ahead(folder: Path) -> Iterator[Start]:
@@ -246,13 +214,13 @@ def page(found: Row) -> str:
     parts.append("![recall@1 and accepted queries against each change](sweeps.png)")
     for name, rows in base.groups(found["rows"], lambda row: row["set"]):
         columns = {"change": "{change}", "level": "{level:g}", "asked": "{asked}", "shown": "{shown:.2f}"}
-        columns |= {row["technique"]: f"{{{row['technique']}}}" for row in rows}
         lines = []
         for levels in zip(*(row["levels"] for row in rows), strict=True):
             sweep = SWEEPS[levels[0]["sweep"]]
-            cells = ("{recall_at_1:.2f} ({accepted}, {accepted_wrong})", [row["technique"] for row in rows])
-            told = {name: base.cell(cells[0], level) for name, level in zip(cells[1], levels, strict=True)}
-            lines.append({**levels[0], "change": f"{sweep.title}, {sweep.unit}", **told})
+            lines.append({**levels[0], "change": f"{sweep.title}, {sweep.unit}"})
+            for row, level in zip(rows, levels, strict=True):
+                lines[-1][row["technique"]] = base.cell("{recall_at_1:.2f} ({accepted}, {accepted_wrong})", level)
+        columns |= {row["technique"]: f"{{{row['technique']}}}" for row in rows}
         parts.append(f"## {name} ({base.use_of(name).replace('tune', 'tuned on')})")
         parts.append("recall@1; in brackets accepted and, of these, wrong.")
         parts.append(base.table(lines, columns))

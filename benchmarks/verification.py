@@ -20,14 +20,11 @@ from base import Row
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement, Verification
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.techniques import Technique
 
 LEAST_OVERLAP = 0.3
 WIDTH_PX = 640  # of the pictures that the truth was measured in
@@ -56,7 +53,6 @@ def main() -> None:
     asked = {each.name: [(path.name, read_image(path)) for path in list_images(each / "query")] for each in folders}
     for folder in folders:
         found["sets"].append(_of_set(folder, asked))
-        print(found["sets"][-1], flush=True)
     base.write("verification", found, page(found))
 
 
@@ -73,7 +69,8 @@ def _of_set(folder: Path, asked: dict[str, Pictures]) -> Row:
     chance: Counter[int] = Counter()
     costs = []
     with walks.map_of(folder) as (place_map, index, technique):
-        both = _both(place_map, index, technique)
+        rule = accept_rule(technique, walks.config().match)
+        both = [walks.walk(place_map, index, technique, rule=rule, verify=verify) for verify in (False, True)]
         for name, query, image in ((name, *each) for name, pictures in asked.items() for each in pictures):
             events = [walk.step(walks.frame(image, query)) for walk in both]
             ranking, accepted = events[1].ranking, [event.accepted for event in events]
@@ -101,14 +98,10 @@ def _of_set(folder: Path, asked: dict[str, Pictures]) -> Row:
                 off["landmarks"].append(_off((turn, complex(*proof.shift_share)), true))
     t_query_ms, t_verify_ms = (1000 * np.median(costs, axis=0)).tolist()
     row |= {"by_inliers": {str(count): chance[count] for count in sorted(chance)}}
-    row |= {"errors": {who: _summary(errors) for who, errors in off.items()}}
+    names = ("middle_px", "rotation_deg", "scale")
+    both_ends = {who: np.quantile(errors, (0.5, 0.9), axis=0).round(3).T.tolist() for who, errors in off.items()}
+    row |= {"errors": {who: dict(zip(names, ends, strict=True)) for who, ends in both_ends.items()}}
     return row | {"t_query_ms": t_query_ms, "t_verify_ms": t_verify_ms}
-
-
-def _both(place_map: PlaceMap, index: PlaceIndex, technique: Technique) -> list[Recogniser]:
-    """Return a walk without verification, and one with it."""
-    rule = accept_rule(technique, walks.config().match)
-    return [walks.walk(place_map, index, technique, rule=rule, verify=verify) for verify in (False, True)]
 
 
 def _proofs(walk: Recogniser, image: np.ndarray, ranking: Ranking) -> Iterator[Agreement]:
@@ -143,17 +136,7 @@ def _truth(folder: Path) -> dict[tuple[str, str], Way]:
 def _off(found: Way, true: Way) -> tuple[float, float, float]:
     """Return how far off the middle (pixels), the rotation (degrees) and the scale (a share) are."""
     beside = found[0] / true[0]
-    return (
-        WIDTH_PX * abs(found[1] - true[1]),
-        abs(math.degrees(np.angle(beside))),
-        abs(math.log(abs(beside))),
-    )
-
-
-def _summary(errors: list[tuple[float, float, float]]) -> dict[str, tuple[float, float]]:
-    names = ("middle_px", "rotation_deg", "scale")
-    columns = zip(names, zip(*errors, strict=True), strict=True)
-    return {name: tuple(np.quantile(column, (0.5, 0.9)).round(3).tolist()) for name, column in columns}
+    return WIDTH_PX * abs(found[1] - true[1]), abs(np.degrees(np.angle(beside))), abs(np.log(abs(beside)))
 
 
 def page(found: Row) -> str:
