@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-VARIABLE = "EDGEVPR_MACHINE"  # names the folder of the machine
-USUAL = Path.home() / ".cache" / "edgevpr-machine"
 NEEDED = ("debootstrap", "mkfs.ext4", "qemu-img", "qemu-system-x86_64")  # Debian: debootstrap, e2fsprogs, qemu-*
 _SUITE, _MIRROR = "bookworm", "http://deb.debian.org/debian"
 # What a user's Debian has, and the agent by which QEMU lets commands be run inside.
@@ -32,7 +30,7 @@ _FILES = {
 
 def folder() -> Path:
     """Return the folder that the machine is kept in, outside of the repository."""
-    return Path(os.environ.get(VARIABLE, USUAL))
+    return Path(os.environ.get("EDGEVPR_MACHINE", Path.home() / ".cache" / "edgevpr-machine"))
 
 
 def lacking() -> str | None:
@@ -52,33 +50,26 @@ def make(where: Path) -> None:
     root = where / "root"
     shutil.rmtree(root, ignore_errors=True)
     include = f"--include={','.join(_PACKAGES)}"
-    _run("debootstrap", "--variant=minbase", include, _SUITE, root, _MIRROR)
+    run("debootstrap", "--variant=minbase", include, _SUITE, root, _MIRROR)
     for name, text in _FILES.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
     (root / "etc/machine-id").write_text("")
-    _run("chroot", root, "systemctl", "enable", "systemd-networkd")
+    run("chroot", root, "systemctl", "enable", "systemd-networkd")
     shutil.copytree(where / "wheelhouse", root / "opt/wheelhouse")
     for kind in ("vmlinuz", "initrd.img"):
         shutil.copy(next((root / "boot").glob(f"{kind}-*")), where / kind)
     unfinished = where / "unfinished.raw"
     unfinished.unlink(missing_ok=True)
-    _run("mkfs.ext4", "-q", "-d", root, unfinished, "6G")
+    run("mkfs.ext4", "-q", "-d", root, unfinished, "6G")
     shutil.rmtree(root)
     unfinished.rename(where / "debian.raw")
 
 
 def make_wheel(where: Path) -> Path:
     """Make the wheel of this checkout."""
-    shutil.rmtree(where, ignore_errors=True)
-    _run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", REPOSITORY, "--wheel-dir", where)
+    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", REPOSITORY, "--wheel-dir", where)
     return next(where.glob("edgevpr-*.whl"))
-
-
-def make_disk(path: Path, label: str, size: str) -> None:
-    """Make an empty file system."""
-    path.unlink(missing_ok=True)
-    _run("mkfs.ext4", "-q", "-L", label, path, size)
 
 
 def _make_wheelhouse(where: Path) -> None:
@@ -89,11 +80,12 @@ def _make_wheelhouse(where: Path) -> None:
     words = "--quiet", "--no-deps", "--require-hashes", "--only-binary", ":all:", "--requirement", lock
     debian = "--python-version", "3.11", "--platform", "manylinux_2_28_x86_64", "--platform", "manylinux_2_17_x86_64"
     older = "--platform", "manylinux2014_x86_64", "--platform", "manylinux2010_x86_64"
-    _run(sys.executable, "-m", "pip", "download", *words, *debian, *older, "--dest", unfinished)
+    run(sys.executable, "-m", "pip", "download", *words, *debian, *older, "--dest", unfinished)
     unfinished.rename(where)
 
 
-def _run(*words: object) -> None:
+def run(*words: object) -> None:
+    """Run a program. Raises RuntimeError, with what it said, where it fails."""
     done = subprocess.run([*map(str, words)], stdin=subprocess.DEVNULL, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{words[0]} failed: {(done.stdout + done.stderr)[-2000:]}")

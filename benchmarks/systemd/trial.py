@@ -3,8 +3,8 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 from machine import HOST, Answer, Machine
@@ -141,7 +141,7 @@ class Trial:
         texts = self.world.ground.texts
 
         def heard() -> list[float]:
-            return [each.t_s for each in texts if each.t_s > since_s and part in each.text]
+            return [t_s for t_s, text in texts if t_s > since_s and part in text]
 
         wait_until(heard, limit_s, f"the text {part!r}")
         return heard()[0] - since_s
@@ -160,7 +160,11 @@ class Trial:
     def log(self) -> list[dict[str, Any]]:
         """Read the logs of all flights, the newest last: their whole lines."""
         numbered = LOG.replace(".jsonl", "-*.jsonl")
-        return lines_of(self.machine.output(f"cat {numbered} {LOG} 2>/dev/null"))
+        lines = []
+        for line in self.machine.output(f"cat {numbered} {LOG} 2>/dev/null").splitlines():
+            with suppress(ValueError):
+                lines.append(json.loads(line))
+        return lines
 
     def journal(self, since_inside_s: float) -> str:
         """Return what the journal has of the service, of this boot, since then."""
@@ -179,21 +183,5 @@ class Trial:
         return found[0] - since_inside_s
 
 
-def lines_of(content: bytes) -> list[dict[str, Any]]:
-    """Return the whole lines of a flight log."""
-    lines = []
-    for line in content.splitlines():
-        try:
-            lines.append(json.loads(line))
-        except ValueError:
-            continue
-    return lines
-
-
 def of_kind(lines: Sequence[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     return [line for line in lines if line["kind"] == kind]
-
-
-def longest_gap_s(times_s: Sequence[float]) -> float:
-    """Return the longest pause between times."""
-    return max((later - earlier for earlier, later in pairwise(times_s)), default=0.0)

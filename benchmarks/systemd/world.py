@@ -7,7 +7,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -43,21 +42,14 @@ def write_track(path: Path) -> Path:
     return path
 
 
-@dataclass(frozen=True, slots=True)
-class Text:
-    """One text that the ground station has heard, and when (on this machine's monotonic clock)."""
-
-    t_s: float
-    text: str
-
-
 class Ground:
-    """A ground station: pymavlink at a UDP port, which keeps what edgevpr tells it."""
+    """A ground station: pymavlink at a UDP port, which keeps what edgevpr tells it: `texts` with their times, and when
+    accepted matches and queries were told, by this machine's monotonic clock."""
 
     def __init__(self) -> None:
         self.port = _free_port(socket.SOCK_DGRAM)
-        self.texts: list[Text] = []
-        self.matches_s: list[float] = []  # when accepted matches were told
+        self.texts: list[tuple[float, str]] = []
+        self.matches_s: list[float] = []
         self.queries_s: list[float] = []
         self._link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{self.port}", source_system=255)
         self._on = True
@@ -71,7 +63,7 @@ class Ground:
                 continue
             now_s = time.monotonic()
             if message.get_type() == "STATUSTEXT":
-                self.texts.append(Text(now_s, message.text))
+                self.texts.append((now_s, message.text))
             elif message.get_type() == "NAMED_VALUE_INT" and message.name == "vpr_place":
                 self.matches_s.append(now_s)
             elif message.get_type() == "NAMED_VALUE_FLOAT" and message.name == "vpr_cpu":
@@ -79,7 +71,7 @@ class Ground:
 
     def told_since(self, begin_s: float) -> list[str]:
         """Return the texts since then, each once, in order."""
-        return list(dict.fromkeys(each.text for each in list(self.texts) if each.t_s >= begin_s))
+        return list(dict.fromkeys(text for t_s, text in list(self.texts) if t_s >= begin_s))
 
     def close(self) -> None:
         self._on = False
