@@ -13,10 +13,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from itertools import count
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -39,17 +40,8 @@ _AFTER = 0.06  # of a cycle: so long after its return what was away may still sh
 _EVERY_S = 5.0  # from one look at the process to the next
 _PATIENCE_S = 60.0
 _TURN_S = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Absence:
-    """Something that is away from `begin` to `end`, in parts of a cycle."""
-
-    name: str
-    begin: float
-    end: float
-    go: Callable[[], None]
-    come: Callable[[], None]
+# Something that is away from one part of a cycle to another: its name, those two, and how it goes and comes.
+Absence = tuple[str, float, float, Callable[[], None], Callable[[], None]]
 
 
 def main() -> None:
@@ -57,7 +49,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     minutes = parser.parse_args().minutes
     with TemporaryDirectory(prefix="edgevpr-soak-") as folder:
-        print("drawing the ground, the film and the map", flush=True)
         found = base.made_by() | run(Path(folder), 60 * minutes, _EVERY_S)
     base.write("soak", found, page(found))
     draw(found, RESULTS / "soak.png")
@@ -113,11 +104,8 @@ class Flight:
         }
         config.write_text(yaml.safe_dump(settings))
         with open(self._stderr, "w") as stderr:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "edgevpr", "run", "--config", config],
-                stdin=subprocess.DEVNULL,
-                stderr=stderr,
-            )
+            command = [sys.executable, "-m", "edgevpr", "run", "--config", config]
+            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=stderr)
 
     def wait_until_it_flies(self) -> None:
         """Wait for the first query. Raises RuntimeError where none comes."""
@@ -147,11 +135,9 @@ class _Ground:
         self._socket.setblocking(False)
 
     def read(self) -> None:
-        try:
+        with suppress(OSError):  # there is no more, or it is closed
             while self._socket.recv(65_536):
                 pass
-        except OSError:  # there is no more, or it is closed
-            pass
 
     def close(self) -> None:
         self._socket.close()
@@ -161,50 +147,57 @@ class _Watch:
     """Looks at the flight every few seconds, and lets things go away and come back. `events` counts these by name."""
 
     def __init__(self, flight: Flight, ground: _Ground, cycle_s: float, every_s: float) -> None:
-        self.events: dict[str, int] = {}
+        self.events: Counter[str] = Counter()
         self.statuses = 0
         self._flight, self._ground, self._cycle_s, self._every_s = flight, ground, cycle_s, every_s
         self._process = psutil.Process(flight.process.pid)
-        self._away: list[str] = []
+        self._away: dict[str, Callable[[], None]] = {}  # what is away, and how it comes back
         self._returned_s = float("-inf")
 
     def look_until(self, lasts_s: float, absences: list[Absence]) -> list[Row]:
         """Return a sample for each look. Raises RuntimeError where the flight ends before its time."""
-        timetable = _timetable(absences, self._cycle_s)
-        due_s, *step = next(timetable)
+        steps = sorted(
+            [(each[1], each) for each in absences] + [(each[2], each) for each in absences], key=itemgetter(0)
+        )
+        timetable = (((cycle + part) * self._cycle_s, each) for cycle in count() for part, each in steps)
+        due_s, absence = next(timetable)
         begin_s, samples = time.monotonic(), []
         while (t_s := time.monotonic() - begin_s) < lasts_s:
             while due_s <= t_s:  # all of it and in its order, however late
-                self._do(*step, t_s)
-                due_s, *step = next(timetable)
+                self._turn(absence, t_s)
+                due_s, absence = next(timetable)
             if t_s < len(samples) * self._every_s:
                 time.sleep(_TURN_S)
                 continue
             samples.append(self._sample(t_s))
             self._ground.read()
             if self._away:  # else a reader that has just left would be counted while all is there
-                self._read_status()
-        for each in absences:
-            if each.name in self._away:
-                each.come()
+                with suppress(EdgevprError):  # counted as none
+                    self.statuses += read_status(self._flight.status) is not None
+        for come in self._away.values():
+            come()
         return samples
 
-    def _do(self, goes: bool, each: Absence, t_s: float) -> None:
-        if goes:
-            each.go()
-            self._away.append(each.name)
-            self.events[each.name] = self.events.get(each.name, 0) + 1
-        else:
-            each.come()
-            self._away.remove(each.name)
+    def _turn(self, absence: Absence, t_s: float) -> None:
+        """Let what is there go, or what is away come back."""
+        name, _, _, go, come = absence
+        if name in self._away:
+            self._away.pop(name)()
             self._returned_s = t_s
+        else:
+            go()
+            self._away[name] = come
+            self.events[name] += 1
 
     def _sample(self, t_s: float) -> Row:
         try:
             with self._process.oneshot():
-                memory, cpu = self._process.memory_full_info(), self._process.cpu_times()
+                memory, cpu = self._process.memory_info(), self._process.cpu_times()
                 threads = self._process.num_threads()
-            descriptors = self._descriptors()
+            descriptors = 0
+            for _ in range(3):  # a log that changes its file has one less for a moment
+                descriptors = max(descriptors, self._process.num_fds())
+                time.sleep(_TURN_S)
         except psutil.Error as error:
             raise RuntimeError(f"the flight has ended after {t_s:.0f} s: {self._flight.end()}") from error
         log_bytes = sum(path.stat().st_size for path in self._flight.log.parent.glob("flight*.jsonl"))
@@ -212,8 +205,6 @@ class _Watch:
         return {
             "t_s": round(t_s, 2),
             "rss_mb": memory.rss / 1e6,
-            "pss_mb": memory.pss / 1e6,
-            "uss_mb": memory.uss / 1e6,
             "descriptors": descriptors,
             "threads": threads,
             "cpu_s": cpu.user + cpu.system,
@@ -223,36 +214,14 @@ class _Watch:
             "is_calm": not self._away and t_s - self._returned_s >= _AFTER * self._cycle_s,
         }
 
-    def _descriptors(self) -> int:
-        """Count the descriptors, three times: a log that changes its file has one less for a moment."""
-        counts = [self._process.num_fds()]
-        for _ in range(2):
-            time.sleep(_TURN_S)
-            counts.append(self._process.num_fds())
-        return max(counts)
-
-    def _read_status(self) -> None:
-        """Read the status once."""
-        with suppress(EdgevprError):  # counted as none
-            self.statuses += read_status(self._flight.status) is not None
-
-
-def _timetable(absences: list[Absence], cycle_s: float) -> Iterator[tuple[float, bool, Absence]]:
-    """Yield when who goes (else comes back), cycle after cycle."""
-    steps = [(each.begin, True, each) for each in absences] + [(each.end, False, each) for each in absences]
-    steps.sort(key=lambda step: step[0])
-    for cycle in count():
-        for part, goes, each in steps:
-            yield (cycle + part) * cycle_s, goes, each
-
 
 def _absences(camera: FilmCamera, autopilot: Autopilot, ground: _Ground) -> list[Absence]:
     return [
-        Absence("camera pulled out", 0.27, 0.33, camera.pull_out, camera.plug_in),
-        Absence("autopilot killed", 0.42, 0.49, autopilot.kill, autopilot.start),
-        Absence("camera silent", 0.58, 0.63, lambda: camera.fall_silent(True), lambda: camera.fall_silent(False)),
-        Absence("autopilot frozen", 0.73, 0.78, lambda: autopilot.freeze(True), lambda: autopilot.freeze(False)),
-        Absence("ground station closed", 0.88, 0.92, ground.close, ground.open),
+        ("camera pulled out", 0.27, 0.33, camera.pull_out, camera.plug_in),
+        ("autopilot killed", 0.42, 0.49, autopilot.kill, autopilot.start),
+        ("camera silent", 0.58, 0.63, lambda: camera.fall_silent(True), lambda: camera.fall_silent(False)),
+        ("autopilot frozen", 0.73, 0.78, lambda: autopilot.freeze(True), lambda: autopilot.freeze(False)),
+        ("ground station closed", 0.88, 0.92, ground.close, ground.open),
     ]
 
 

@@ -6,33 +6,23 @@ from pathlib import Path
 import base
 import numpy as np
 from base import Row
-from scipy.stats import theilslopes
 
 GROWTH_MB = 2.0  # asked for: less than that after the first five minutes
 _SETTLED_S = 300.0
 _SETTLED_PART = 0.1  # of a short run
-_MEMORY = {"rss_mb": "RSS", "pss_mb": "PSS", "uss_mb": "USS"}
-_COLUMNS = {
-    "": "{title}",
-    "first, MB": "{first_mb:.2f}",
-    "last, MB": "{last_mb:.2f}",
-    "grown, MB": "{grown_mb:+.2f}",
-    "slope, MB/h": "{slope_mb_h:+.2f}",
-}
 
 
-def growth(samples: list[Row], what: str = "rss_mb") -> Row:
-    """Compute how one of the figures in MB has grown since the flight has settled: the median of the last tenth less
-    that of as long after settling (`grown_mb`), and the slope of all in between (Theil and Sen)."""
-    t_s, values = (np.array([each[name] for each in samples], float) for name in ("t_s", what))
+def growth(samples: list[Row]) -> Row:
+    """Compute how memory (RSS) has grown since the flight has settled: the median of the last tenth (`last_mb`) less
+    that of as long after settling (`first_mb`)."""
+    t_s, values = (np.array([each[name] for each in samples], float) for name in ("t_s", "rss_mb"))
     settled_s = min(_SETTLED_S, _SETTLED_PART * float(t_s[-1]))
     after = t_s >= settled_s
     early = after & (t_s < 2 * settled_s)
     late = t_s >= 0.9 * t_s[-1]
     first_mb = float(np.median(values[early if early.any() else after]))
-    last_mb, slope_mb_h = float(np.median(values[late])), 3600 * float(theilslopes(values[after], t_s[after])[0])
-    found = {"settled_s": settled_s, "first_mb": first_mb, "last_mb": last_mb, "slope_mb_h": slope_mb_h}
-    return found | {"grown_mb": last_mb - first_mb}
+    last_mb = float(np.median(values[late]))
+    return {"settled_s": settled_s, "first_mb": first_mb, "last_mb": last_mb, "grown_mb": last_mb - first_mb}
 
 
 def verdict(soak: Row) -> list[str]:
@@ -60,12 +50,12 @@ def page(soak: Row) -> str:
     """Return the page for people."""
     samples, broken = soak["samples"], verdict(soak)
     calm = [each for each in samples if each["is_calm"]]
-    memory = [{"title": title, **growth(samples, name)} for name, title in _MEMORY.items()]
+    memory = growth(samples)
     counts = [
         {"name": name, "calm": _range([each[name] for each in calm]), "all": _range([each[name] for each in samples])}
         for name in ("descriptors", "threads")
     ]
-    settled = memory[0]["settled_s"] / 60
+    settled = memory["settled_s"] / 60
     events = "; ".join(f"{name}: {count}" for name, count in soak["events"].items())
     cores = (samples[-1]["cpu_s"] - samples[0]["cpu_s"]) / (samples[-1]["t_s"] - samples[0]["t_s"])
     return f"""# A long flight
@@ -77,11 +67,8 @@ status file, a tlog, and a flight log limited to {soak["log_limit_mb"]:g} MB.
 
 **{"As it should be." if not broken else " ".join(broken)}**
 
-Memory: medians of the {settled:.1f} minutes after the first {settled:.1f}, and of the last tenth.
-
-{base.table(memory, _COLUMNS)}
-
-RSS is what was asked about; PSS and USS also change with other programs that use the same libraries.
+Memory (RSS): {memory["first_mb"]:.2f} MB in the {settled:.1f} minutes after the first {settled:.1f},
+{memory["last_mb"]:.2f} MB in the last tenth (medians), {memory["grown_mb"]:+.2f} MB.
 
 What is counted while all is there ({len(calm)} looks), and at any time:
 
@@ -102,9 +89,9 @@ def draw(soak: Row, path: Path) -> None:
     """Draw the figures over time; what is away is shaded."""
     samples = soak["samples"]
     t_min = np.array([each["t_s"] for each in samples]) / 60
-    drawn, axes = base.panels(10, 8, 4, 4, sharex=True)
-    panels = (("rss_mb",), ("pss_mb", "uss_mb"), ("descriptors", "threads"), ("log_mb", "tlog_mb"))
-    for axis, names, label in zip(axes, panels, ("memory, MB", "memory, MB", "count", "files, MB"), strict=True):
+    drawn, axes = base.panels(10, 6, 3, 3, sharex=True)
+    panels = {"memory, MB": ("rss_mb",), "count": ("descriptors", "threads"), "files, MB": ("log_mb", "tlog_mb")}
+    for axis, (label, names) in zip(axes, panels.items(), strict=True):
         for name in names:
             axis.plot(t_min, [each[name] for each in samples], lw=1.2, label=name.removesuffix("_mb"))
         away = [bool(each["away"]) for each in samples]
@@ -113,7 +100,7 @@ def draw(soak: Row, path: Path) -> None:
         axis.legend(loc="lower right", fontsize=8)
     first_mb = growth(samples)["first_mb"]
     axes[0].axhspan(first_mb, first_mb + GROWTH_MB, color="C0", alpha=0.08, linewidth=0)
-    axes[3].set_xlabel("minutes of flight (shaded above: the growth that is allowed; beside: something is away)")
+    axes[2].set_xlabel("minutes of flight (shaded above: the growth that is allowed; beside: something is away)")
     base.save(drawn, path)
 
 
