@@ -59,8 +59,7 @@ sites: $(VENV)/installed
 sweeps: $(VENV)/installed
 	$(BIN)/python benchmarks/sweeps.py
 
-# `cohog` beside other ways, into benchmarks/results/: forty minutes. It goes on in peers_work/ (700 MB) where it was
-# interrupted. What cannot be installed is left out.
+# `cohog` beside other ways, into benchmarks/results/: forty minutes. What cannot be installed is left out.
 peers: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check faiss-cpu || echo "faiss-cpu: left out"

@@ -60,7 +60,6 @@ def rows() -> list[Row]:
         return [
             *memory_rows(place_map, frames, folder),
             metering_row(folder / "memory.jsonl"),
-            accounted_row(folder / "memory.jsonl"),
             *start_rows(place_map, frames, folder),
             *idle_rows(place_map, frames, folder),
         ]
@@ -112,15 +111,6 @@ def metering_row(log: Path) -> Row:
         meter.reading()
         taken_s.append(time.process_time() - begin_s)
     return row_of("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
-
-
-def accounted_row(log: Path) -> Row:
-    """The share of the CPU time of the process that is some stage of a query, once the flight in `log` has begun: the
-    rest is the log, the link and the loop."""
-    lines = list(read_log(log))
-    queries = [line for line in lines if line["kind"] == "query"]
-    in_queries_s = sum(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
-    return row_of("CPU time that is a stage of a query", 100 * in_queries_s / lines[-1]["process_cpu_s"], "%", None)
 
 
 def start_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:

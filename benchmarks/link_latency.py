@@ -7,18 +7,17 @@ edgevpr asks an autopilot for: attitude ten times a second and position five tim
 """
 
 import argparse
-import json
+import multiprocessing
 import os
 import pty
 import select
 import socket
 import statistics
-import subprocess
-import sys
 import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -56,33 +55,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fixes", type=int, default=1000)
     parser.add_argument("--idle-s", type=float, default=60.0)
-    parser.add_argument("--peer", nargs=3, metavar=("KIND", "FD", "KEY"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.peer:
-        _peer(args.peer[0], int(args.peer[1]), bytes.fromhex(args.peer[2]))
-        return
     rows = [row(kind, signed, args.fixes, args.idle_s) for kind in OPENERS for signed in (False, True)]
     found = {**base.made_by(), "rows": rows}
     base.write("link", found, page(found))
-    print(page(found))
 
 
 def row(kind: str, signed: bool, fixes: int, idle_s: float) -> Row:
     """Measure one kind of link, with or without signing."""
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, OPENERS[kind]() as (url, descriptor):
         signing = Signing(KEY, TimeStamps(Path(folder) / "time")) if signed else NOT_SIGNING
-        command = [sys.executable, __file__, "--peer", kind, str(descriptor), KEY.hex() if signed else ""]
-        with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[descriptor], text=True
-        ) as peer:
-            with Link(parse_link(url), LinkSettings(signing=signing)) as link:
-                while not link.listens():
-                    time.sleep(0.01)
-                sent_s = _send(link, fixes)
-                time.sleep(1.0)
-                cpu_share, messages_s = _idle(link, idle_s)
-            arrived_s = json.loads(peer.communicate("")[0])
-    took_ms = sorted(1000 * (arrived_s[str(number)] - sent_s[number]) for number in range(fixes))
+        processes = multiprocessing.get_context("fork")
+        near, far = processes.Pipe()
+        peer = processes.Process(target=_peer, args=(kind, descriptor, KEY if signed else b"", far), daemon=True)
+        peer.start()
+        with Link(parse_link(url), LinkSettings(signing=signing)) as link:
+            while not link.listens():
+                time.sleep(0.01)
+            sent_s = _send(link, fixes)
+            time.sleep(1.0)
+            cpu_share, messages_s = _idle(link, idle_s)
+        near.send("end")
+        arrived_s = near.recv()
+        peer.join()
+    took_ms = sorted(1000 * (arrived_s[number] - sent_s[number]) for number in range(fixes))
     return {
         "link": f"{kind}, signed" if signed else kind,
         "fixes": len(took_ms),
@@ -163,8 +159,8 @@ class _Port:
             os.write(self.descriptor, data)
 
 
-def _peer(kind: str, descriptor: int, key: bytes) -> None:
-    """Be an autopilot until standard input ends, then print when each fix was read."""
+def _peer(kind: str, descriptor: int, key: bytes, asker: Connection) -> None:
+    """Be an autopilot until asked to end, then tell when each fix was read."""
     port, packer, receiver = _Port(kind, descriptor), mavlink.MAVLink(None, 1, 1), PacketReader()
     if key:
         packer.signing.sign_outgoing, packer.signing.secret_key = True, key
@@ -173,9 +169,10 @@ def _peer(kind: str, descriptor: int, key: bytes) -> None:
     arrived_s: dict[int, float] = {}
     while True:
         wait_s = max(0.0, min(due_s.values()) - time.monotonic())
-        ready, _, _ = select.select([sys.stdin, port.descriptor], [], [], wait_s)
-        if sys.stdin in ready:
-            break
+        ready, _, _ = select.select([asker, port.descriptor], [], [], wait_s)
+        if asker in ready:
+            asker.send(arrived_s)
+            return
         if port.descriptor in ready:
             data, now_s = port.read(), time.monotonic()
             for message in receiver.feed(data):
@@ -186,7 +183,6 @@ def _peer(kind: str, descriptor: int, key: bytes) -> None:
             if time.monotonic() >= due_s[every_s]:
                 due_s[every_s] += every_s
                 port.write(make().pack(packer))
-    print(json.dumps(arrived_s))
 
 
 def page(found: Row) -> str:

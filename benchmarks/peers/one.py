@@ -1,8 +1,6 @@
 """One piece of work of `peers.py`, in a process of its own, so that its memory is its own: prints JSON.
 
-python one.py map CAMERA SET FILE
 python one.py cohog CAMERA SET FILE
-python one.py learn WAY FILE SET ...
 python one.py way WAY SET FILE
 
 Maps and words are made beforehand and come from a FILE: what is measured is a flight with them. Times are of the
@@ -20,18 +18,6 @@ from typing import Any
 
 MOST_QUERIES = 200
 _QUALITY = "recall", "precision_at", "auc", "queries", "references"
-
-
-def make_map(camera: str, folder: str, file: str) -> dict[str, Any]:
-    """Make a map of the references of a set, as `edgevpr map build` does."""
-    from edgevpr.frames.source import open_source
-    from edgevpr.lab.evaluate import evaluate
-    from edgevpr.techniques import create
-
-    images = Path(folder) / "ref"
-    frames = evaluate.all_frames(open_source(str(images), live=False))
-    evaluate.make_map(Path(file), frames, create("cohog", {"camera": camera}), images)
-    return {}
 
 
 def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
@@ -64,15 +50,6 @@ def cohog(camera: str, folder: str, file: str) -> dict[str, Any]:
     }
 
 
-def learn(name: str, file: str, *folders: str) -> dict[str, Any]:
-    """Learn the words of a way on the references of these sets."""
-    from ways import WAYS
-
-    paths = [path for folder in folders for path in sorted((Path(folder) / "ref").iterdir())]
-    Path(file).write_bytes(pickle.dumps(WAYS[name]().learn([_grey(path) for path in paths])))
-    return {}
-
-
 def way(name: str, folder: str, file: str) -> dict[str, Any]:
     """Measure another way."""
     begin_s = time.process_time()
@@ -87,10 +64,10 @@ def way(name: str, folder: str, file: str) -> dict[str, Any]:
     import_s = time.process_time() - begin_s
     cv2.setNumThreads(1)
     dataset, known = _dataset(folder), pickle.loads(Path(file).read_bytes())
-    index = it.index([it.encode(_grey(dataset.ref_dir / each), known) for each in dataset.references], known)
+    index = it.index([it.encode(grey(dataset.ref_dir / each), known) for each in dataset.references], known)
     scores, ranks, times_ms = [], [], []
     for query in dataset.queries:
-        picture = _grey(query.path)
+        picture = grey(query.path)
         begin_s = time.process_time()
         asked = it.encode(picture, known)
         encoded_s = time.process_time()
@@ -127,7 +104,8 @@ def _dataset(folder: str) -> Any:
     return replace(whole, queries=whole.queries[:: -(-len(whole.queries) // MOST_QUERIES)])
 
 
-def _grey(path: Path) -> Any:
+def grey(path: Path) -> Any:
+    """Read a picture, uint8 (H, W)."""
     import cv2
 
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -138,7 +116,6 @@ def _quality(found: dict[str, Any]) -> dict[str, Any]:
 
 
 _STARTED_MB = _peak_mb()  # of the bare interpreter: nothing large is imported yet
-_WORK = {"map": make_map, "cohog": cohog, "learn": learn, "way": way}
 
 if __name__ == "__main__":
-    print(json.dumps(_WORK[sys.argv[1]](*sys.argv[2:])))
+    print(json.dumps({"cohog": cohog, "way": way}[sys.argv[1]](*sys.argv[2:])))

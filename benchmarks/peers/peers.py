@@ -4,29 +4,31 @@ python benchmarks/peers/peers.py [--sets A,B]
 
 Every way recognises the same queries among the same references, each in a process of its own; of a set one way comes
 after the other, so that a busy machine is busy for all. Words are learnt on the references of sets that are not
-reported. What was measured is kept, each row with its commit, and a run that was broken off goes on; without peers.json
-all is measured anew. A way whose package is missing is left out, and said. Words and maps lie in peers_work/ (700 MB).
+reported. A way whose package is missing is left out, and said.
 """
 
 import argparse
 import json
+import pickle
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import base
 from base import Row, camera_of
+from one import grey
 from ways import WAYS
 
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import markdown
+from edgevpr.frames.source import open_source
+from edgevpr.lab.evaluate import evaluate
+from edgevpr.techniques import create
 
 SETS = "aerial_brighton", "aerial_copr", "aerial_swindale", "kite_ochota", "grief_stromovka_seasons", "nordland_tiny"
-WORK = base.REPOSITORY / "peers_work"
 OURS = "cohog (edgevpr)"
 _COSTS = {
     "t_e ms": "{t_encode_ms:.1f}",
@@ -51,51 +53,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", default=",".join(SETS), metavar="A,B")
     folders = base.find_sets(names=parser.parse_args().sets.split(","))
-    training = base.find_sets(names=base.TUNED_ON)
-    WORK.mkdir(exist_ok=True)
+    references = [path for folder in base.find_sets(names=base.TUNED_ON) for path in sorted((folder / "ref").iterdir())]
+    training = [grey(path) for path in references]
     found = {"rows": {}} | base.read("peers") | base.made_by()
-
-    def measured(key: str, measure: Callable[[], Row]) -> None:
-        if key in found["rows"]:
-            return
-        try:
-            found["rows"][key] = {**measure(), "commit": found["commit"]}
-        except EdgevprError as error:
-            print(f"{key} is left out: {error}", file=sys.stderr, flush=True)
-            return
-        base.write("peers", found, page(found))
-        print(key, flush=True)
-
-    for folder in folders:
-        measured(f"{folder.name}: {OURS}", lambda folder=folder: _cohog(folder))
-        for way in WAYS:
-            measured(f"{folder.name}: {way}", lambda way=way, folder=folder: _way(way, folder, training))
-
-
-def _cohog(folder: Path) -> Row:
-    camera, file = camera_of(folder.name), WORK / f"{folder.name}.gpkg"
-    if not file.exists():
-        unfinished = file.with_name(f"unfinished_{file.name}")
-        unfinished.unlink(missing_ok=True)
-        _one("map", camera, folder, unfinished)
-        unfinished.rename(file)
-    return _one("cohog", camera, folder, file)
-
-
-def _way(way: str, folder: Path, training: list[Path]) -> Row:
-    words = WORK / f"{way}.words"
-    if not words.exists():
-        _one("learn", way, words, *training)
-    return _one("way", way, folder, words)
+    with TemporaryDirectory(prefix="edgevpr-peers-") as name:
+        for way, make in WAYS.items():
+            try:
+                (Path(name) / way).write_bytes(pickle.dumps(make().learn(training)))
+            except ModuleNotFoundError as error:
+                print(f"{way} is left out: {error}", file=sys.stderr, flush=True)
+        ways = [path.name for path in Path(name).iterdir()]
+        for folder in folders:
+            camera, images, place_map = camera_of(folder.name), folder / "ref", Path(name) / f"{folder.name}.gpkg"
+            frames = evaluate.all_frames(open_source(str(images), live=False))
+            evaluate.make_map(place_map, frames, create("cohog", {"camera": camera}), images)
+            rows = {OURS: _one("cohog", camera, folder, place_map)}
+            rows |= {way: _one("way", way, folder, Path(name) / way) for way in ways}
+            found["rows"] |= {f"{folder.name}: {way}": row | {"commit": found["commit"]} for way, row in rows.items()}
+            base.write("peers", found, page(found))
 
 
 def _one(*words: object) -> Row:
-    """Do one piece of work in a process of its own. Raises EdgevprError, with its last line, where that fails."""
+    """Do one piece of work in a process of its own."""
     argv = [sys.executable, Path(__file__).with_name("one.py"), *words]
-    done = subprocess.run([*map(str, argv)], capture_output=True, text=True)
-    if done.returncode:
-        raise EdgevprError((done.stderr.strip() or f"it ended with {done.returncode}").splitlines()[-1])
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(subprocess.run([*map(str, argv)], stdout=subprocess.PIPE, check=True).stdout)
 
 
 def page(found: Row) -> str:

@@ -24,11 +24,11 @@ SIDE_PX = 512
 class Way:
     """A way of recognising: see the module. `nbytes` is what a reference takes in memory."""
 
-    learn: Callable[[Sequence[np.ndarray]], Any]
     encode: Callable[[np.ndarray, Any], Any]
-    index: Callable[[Sequence[Any], Any], Any]
     scores: Callable[[Any, Any], np.ndarray]
-    nbytes: Callable[[Any, int], float]
+    learn: Callable[[Sequence[np.ndarray]], Any] = lambda pictures: None
+    index: Callable[[Sequence[Any], Any], Any] = lambda found, words: list(found)
+    nbytes: Callable[[Any, int], float] = lambda places, count: sum(each.nbytes for each in places) / count
 
 
 def published_cohog() -> Way:
@@ -45,33 +45,23 @@ def published_cohog() -> Way:
         regions, good = asked
         return np.array(competitor.match(regions, good, places)) if good.any() else np.zeros(len(places))
 
-    return Way(
-        learn=_nothing,
-        encode=encode,
-        index=lambda found, _: [regions for regions, _ in found],
-        scores=scores,
-        nbytes=lambda places, count: sum(each.nbytes for each in places) / count,
-    )
+    return Way(encode, scores, index=lambda found, _: [regions for regions, _ in found])
 
 
 def orb_with_ratio_test() -> Way:
     """500 ORB features a picture, by Hamming distance."""
-    return _ratio_test(cv2.ORB_create(FEATURES), cv2.NORM_HAMMING, np.zeros((0, 32), np.uint8))
+    return _ratio_test(cv2.ORB_create(FEATURES))
 
 
 def sift_with_ratio_test() -> Way:
     """500 SIFT features a picture, by Euclidean distance."""
-    return _ratio_test(cv2.SIFT_create(FEATURES), cv2.NORM_L2, np.zeros((0, 128), np.float32))
+    return _ratio_test(cv2.SIFT_create(FEATURES))
 
 
-def _ratio_test(detector: cv2.Feature2D, norm: int, none: np.ndarray) -> Way:
+def _ratio_test(detector: cv2.Feature2D) -> Way:
     """Compare all features of two pictures, without a check of their geometry; the score is how many pass the ratio
     test (Lowe 2004)."""
-    matcher = cv2.BFMatcher(norm)
-
-    def encode(grey: np.ndarray, _: Any) -> np.ndarray:
-        found = detector.detectAndCompute(grey, None)[1]
-        return none if found is None else found
+    matcher = cv2.BFMatcher(detector.defaultNorm())
 
     def passed(asked: np.ndarray, place: np.ndarray) -> int:
         if len(asked) < 2 or len(place) < 2:
@@ -80,11 +70,8 @@ def _ratio_test(detector: cv2.Feature2D, norm: int, none: np.ndarray) -> Way:
         return sum(len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance for pair in pairs)
 
     return Way(
-        learn=_nothing,
-        encode=encode,
-        index=lambda found, _: list(found),
+        encode=lambda grey, _: _features(detector, grey),
         scores=lambda asked, places: np.array([passed(asked, place) for place in places], float),
-        nbytes=lambda places, count: sum(each.nbytes for each in places) / count,
     )
 
 
@@ -93,8 +80,7 @@ def bag_of_orb_words() -> Way:
     orb = cv2.ORB_create(FEATURES)
 
     def features(grey: np.ndarray) -> np.ndarray:
-        found = orb.detectAndCompute(grey, None)[1]
-        return np.zeros((0, 256), np.float32) if found is None else np.unpackbits(found, axis=1).astype(np.float32)
+        return np.unpackbits(_features(orb, grey), axis=1).astype(np.float32)
 
     def learn(pictures: Sequence[np.ndarray]) -> np.ndarray:
         return _words(np.concatenate([features(each) for each in pictures]), WORDS_ORB)
@@ -123,9 +109,7 @@ def sift_vlad() -> Way:
     sift = cv2.SIFT_create(FEATURES)
 
     def features(grey: np.ndarray) -> np.ndarray:
-        found = sift.detectAndCompute(grey, None)[1]
-        if found is None:
-            return np.zeros((0, 128), np.float32)
+        found = _features(sift, grey)
         return np.sqrt(found / np.maximum(1e-6, found.sum(axis=1, keepdims=True)))
 
     def learn(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -143,7 +127,6 @@ def sift_vlad() -> Way:
         encode=encode,
         index=lambda found, _: np.stack(found),
         scores=lambda asked, places: places @ asked,
-        nbytes=lambda places, count: places.nbytes / count,
     )
 
 
@@ -176,13 +159,7 @@ def faiss_on_our_codes() -> Way:
         found[slots[0]] = -distances[0]
         return found
 
-    return Way(
-        learn=_nothing,
-        encode=encode,
-        index=index,
-        scores=scores,
-        nbytes=lambda index, count: index[0].code_size,
-    )
+    return Way(encode, scores, index=index, nbytes=lambda index, count: index[0].code_size)
 
 
 WAYS: dict[str, Callable[[], Way]] = {
@@ -195,8 +172,11 @@ WAYS: dict[str, Callable[[], Way]] = {
 }
 
 
-def _nothing(pictures: Sequence[np.ndarray]) -> None:
-    """Learn nothing."""
+def _features(detector: cv2.Feature2D, grey: np.ndarray) -> np.ndarray:
+    """Return the descriptors of a picture's features, a row each."""
+    found = detector.detectAndCompute(grey, None)[1]
+    kind = np.uint8 if detector.descriptorType() == cv2.CV_8U else np.float32
+    return np.zeros((0, detector.descriptorSize()), kind) if found is None else found
 
 
 def _words(features: np.ndarray, count: int) -> np.ndarray:
