@@ -1,8 +1,10 @@
 """Shared by all benchmarks: where images and results lie, who made a figure, and tables, pages and pictures of rows."""
 
+import csv
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -51,22 +53,23 @@ def made_by() -> Row:
 def commit() -> str:
     """Return the commit that is measured, and whether something has changed since."""
 
-    def git(*arguments: str) -> str:
-        try:
-            return subprocess.run(
-                ["git", "-C", str(REPOSITORY), *arguments], capture_output=True, text=True
-            ).stdout.strip()
-        except OSError:  # no git on this machine
-            return ""
-
-    changed = git("status", "--porcelain", "--", "edgevpr", "models")
-    return git("rev-parse", "--short", "HEAD") + (" with changes" if changed else "") or "unknown"
+    if not shutil.which("git"):
+        return "unknown"
+    asked = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
+    of = ("git", "-C", str(REPOSITORY))
+    head, changed = (subprocess.run([*of, *words], capture_output=True, text=True).stdout.strip() for words in asked)
+    return head + (" with changes" if changed else "") or "unknown"
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:
     """Return the content of NAME.json; {} where it is not there."""
     path = folder / f"{name}.json"
     return json.loads(path.read_text()) if path.exists() else {}
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as handle:
+        return list(csv.DictReader(handle))
 
 
 def write(name: str, found: Row, page: str, folder: Path = RESULTS) -> None:

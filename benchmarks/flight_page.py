@@ -57,10 +57,12 @@ def _figures(rows: Sequence[Row]) -> dict:
         "wrong_over_other_ground": sum(row["over"] != row["site"] for row in fixes),
         "over_the_map_s": round(sum(each[0] for each in lost)),
         "lost_s": round(sum(each[1] for each in lost)),
-        "longest_gap_s": dict(zip(("median", "worst"), _gaps_s(gaps_s), strict=True)),
-        "error": spread(_off(right)) if right else None,
+        "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,
+        "error": spread([row["off_m"] for row in right]) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": honest(_off(own), [(row["var_east_m2"], row["var_north_m2"]) for row in own], 0.0) if own else None,
+        "within": honest([row["off_m"] for row in own], [(row["var_east_m2"], row["var_north_m2"]) for row in own], 0.0)
+        if own
+        else None,
     }
 
 
@@ -86,17 +88,17 @@ def _lost(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
     return over_s, lost_s, gaps_s
 
 
-def _off(rows: Sequence[Row]) -> list[complex]:
-    return [complex(row["off_east_m"], row["off_north_m"]) for row in rows]
-
-
-def _gaps_s(gaps_s: Sequence[float]) -> tuple[float | None, float | None]:
-    return (round(float(np.median(gaps_s)), 1), round(max(gaps_s), 1)) if gaps_s else (None, None)
-
-
 def page(result: Row, text: str) -> str:
     """Return the results as Markdown."""
-    tables = [f"By {group}:\n\n{_table(result[group])}" for group in ("use", "site", "kind", "odometry")]
+    tables = []
+    for group in ("all", "use", "site", "kind", "odometry"):
+        rows = [
+            each | {"name": name, "mode": mode, "lost": over_s and each["lost_s"] / over_s}
+            for name, modes in result[group].items()
+            for mode, each in modes.items()
+            for over_s in [each["over_the_map_s"] or None]
+        ]
+        tables.append((f"By {group}:\n\n" if group != "all" else "") + base.table(rows, _COLUMNS))
     return f"""# Flights over real aerial pictures
 
 {text}
@@ -106,27 +108,13 @@ median and worst of the flights. Errors: median / 95th percentile of right fixes
 axis, within one and two standard deviations that the fix claims (asked: .68 and .95), of all fixes over the site's own
 ground.
 
-{_table(result["all"])}
+{tables[0]}
 
 Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNED_ON if name in result["site"])} (use
 *tune*), of the sites here; on none of these flights.
 
-{(chr(10) * 2).join(tables)}
+{(chr(10) * 2).join(tables[1:])}
 
 Commit {result["commit"]}, {result["date"]}, {result["machine"]["cpu"]}; {result["took_s"]} s.
 `python benchmarks/flights.py` makes this page; flights.json has every flight.
 """
-
-
-def _table(groups: Row) -> str:
-    rows = [
-        {
-            "name": name,
-            "mode": mode,
-            "lost": each["lost_s"] / each["over_the_map_s"] if each["over_the_map_s"] else None,
-        }
-        | each
-        for name, modes in groups.items()
-        for mode, each in modes.items()
-    ]
-    return base.table(rows, _COLUMNS)

@@ -131,13 +131,11 @@ def flown(flight: Flight, sites: dict[str, Site]) -> list[Row]:
         query: Row = {
             **of_flight,
             "odometry": flight.odometry,
-            "query": number,
             "t_s": round(t_s, 2),
             "east_m": round(east_m, 2),
             "north_m": round(north_m, 2),
             "over": over,
             "is_mapped": bool(over == site.name and share[number] >= _OVER_THE_MAP),
-            "footprint_m": round(float(track.footprints_m[number]), 1),
         }
         frame = walks.frame(image, f"{number:03d}", t_s)
         for mode, recogniser in asked.items():
@@ -149,26 +147,19 @@ def flown(flight: Flight, sites: dict[str, Site]) -> list[Row]:
 
 def _told(event: Recognition, site: Site, query: Row) -> Row:
     """Return what a query has led to: `fix` is "right", "wrong" or None, with its error by the truth of the query."""
-    best, where, row = event.best, event.located, {}
-    row["reason"] = event.reason
-    row["place"] = best.place.place_id if best else None
-    row["score"] = round(best.match.score, 4) if best else None
-    row["landmarks"] = event.proof.inliers if event.proof else None
-    row["fix"] = None
+    where = event.located
     if where is None:
-        return row
+        return {"fix": None}
     off_m = site.offset(where.position) - (query["east_m"], query["north_m"])
     error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, where.accuracy_m
     foreign = query["over"] != site.name
     is_wrong = foreign or error_m > max(_WRONG_OF_SIDE * side_m, _WRONG_SD * sd_m)
-    return row | {
+    return {
         "fix": "wrong" if is_wrong else "right",
         "is_far": bool(foreign or error_m > _FAR_OF_SIDE * side_m),
-        "off_east_m": round(float(off_m[0]), 2),
-        "off_north_m": round(float(off_m[1]), 2),
+        "off_m": complex(*off_m),
         "sd_m": round(sd_m, 2),
-        "var_east_m2": round(where.covariance_m2[0], 2),
-        "var_north_m2": round(where.covariance_m2[2], 2),
+        "variances_m2": (where.covariance_m2[0], where.covariance_m2[2]),
     }
 
 

@@ -9,8 +9,6 @@ Footprints were chosen to fit each set, as a user does who knows his camera and 
 from_orthophoto.md into benchmarks/results/.
 """
 
-import csv
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,8 +55,7 @@ class Laid:
 
 def laid(folder: Path) -> Laid:
     """Read the largest component of a set's mosaic, scaled so that a picture keeps about its resolution."""
-    with open(folder / "mosaic_positions.csv", newline="") as handle:
-        rows = list(csv.DictReader(handle))
+    rows = base.read_csv(folder / "mosaic_positions.csv")
     components = [row["component"] for row in rows]
     of = max(set(components), key=components.count)
     rows = [row for row in rows if row["component"] == of]
@@ -176,7 +173,6 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="edgevpr-orthophoto-") as work:
         for folder in base.find_sets(names=CASES):
             found["sets"].append(measure(folder, *CASES[folder.name], Path(work)))
-            print(json.dumps(found["sets"][-1]), flush=True)
     base.write("from_orthophoto", found, page(found))
 
 

@@ -7,7 +7,6 @@ is what a camera of 66 degrees across sees that looks at the same point. Which p
 the pictures lie on each other (`pairs_overlap.csv`): those of which, or of the query, three tenths are common.
 """
 
-import csv
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 import walks
 from base import Row
 
+from edgevpr.core.text import markdown
 from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.lab.evaluate.evaluate import mapped
@@ -102,18 +102,17 @@ def asked(walk: Recogniser, dataset: Dataset, pictures: Pictures, ratio: float, 
 def laid(pairs: Path, queries: dict, references: dict) -> dict[tuple[str, str], np.ndarray]:
     """How queries lie on references, of each pair that was registered: the similarity from pixels to pixels, (3, 3)."""
     lies = {}
-    with open(pairs, newline="") as handle:
-        for row in csv.DictReader(handle):
-            a, b = row["file_a"], row["file_b"]
-            images = queries | references
-            if not ({a, b} <= images.keys() and (a in queries) != (b in queries)):
-                continue
-            turned = math.radians(float(row["rotation_deg"]))
-            across, along = (float(row["scale"]) * part for part in (math.cos(turned), math.sin(turned)))
-            matrix = np.array([[across, -along], [along, across]])
-            shift = middle(images[b]) + np.array([row["dx_px"], row["dy_px"]], float) - matrix @ middle(images[a])
-            a_on_b = np.vstack([np.column_stack([matrix, shift]), [0, 0, 1]])
-            lies[(a, b) if a in queries else (b, a)] = a_on_b if a in queries else np.linalg.inv(a_on_b)
+    images = queries | references
+    for row in base.read_csv(pairs):
+        a, b = row["file_a"], row["file_b"]
+        if not ({a, b} <= images.keys() and (a in queries) != (b in queries)):
+            continue
+        turned = math.radians(float(row["rotation_deg"]))
+        across, along = (float(row["scale"]) * part for part in (math.cos(turned), math.sin(turned)))
+        matrix = np.array([[across, -along], [along, across]])
+        shift = middle(images[b]) + np.array([row["dx_px"], row["dy_px"]], float) - matrix @ middle(images[a])
+        a_on_b = np.vstack([np.column_stack([matrix, shift]), [0, 0, 1]])
+        lies[(a, b) if a in queries else (b, a)] = a_on_b if a in queries else np.linalg.inv(a_on_b)
     return lies
 
 
@@ -189,15 +188,12 @@ def page(found: Row) -> str:
     """Return the page for people."""
     rows = found["rows"]
     parts = ["# From another height, turned and tilted", f"{__doc__}\nTuned on aerial_caliterra and aerial_garfield28."]
-    recall = {(row["set"], row["height_ratio"], row["tilt_deg"]): row["recall_at_1"] for row in rows}
+    recall = {(row["set"], row["height_ratio"], row["tilt_deg"]): f"{row['recall_at_1']:.2f}" for row in rows}
     for tilt_deg in TILTS_DEG:
         parts.append(f"## Recall@1, any heading, {tilt_deg:g} degrees of tilt")
-        lines = [
-            {"set": name, **{f"at {ratio}".replace(".", "_"): recall[name, ratio, tilt_deg] for ratio in RATIOS}}
-            for name in sorted({row["set"] for row in rows})
-        ]
-        columns = {f"{ratio:g}": "{at " + str(ratio).replace(".", "_") + ":.2f}" for ratio in RATIOS}
-        parts.append(base.table(lines, {"height over that of the map": "{set}", **columns}))
+        sets = sorted({row["set"] for row in rows})
+        lines = [[name, *(recall[name, ratio, tilt_deg] for ratio in RATIOS)] for name in sets]
+        parts.append(markdown(("height over that of the map", *(f"{ratio:g}" for ratio in RATIOS)), lines))
     parts += ["## All figures", base.table(rows, {name.replace("_", " "): f"{{{name}}}" for name in rows[0]})]
     return "\n\n".join(part.strip() for part in parts)
 

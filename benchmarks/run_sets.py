@@ -109,10 +109,9 @@ def join(folders: list[Path], out: Path) -> None:
             (out / part).mkdir(parents=True, exist_ok=True)
             for path in (folder / part).iterdir():
                 (out / part / f"{folder.name}_{path.name}").symlink_to(path.resolve())
-        with open(folder / "ground_truth.csv", newline="") as handle:
-            for row in csv.DictReader(handle):
-                named = {key: [f"{folder.name}_{name}" for name in (row.get(key) or "").split()] for key in _COLUMNS}
-                rows.append([*(" ".join(names) for names in named.values()), row.get("status") or "ok"])
+        for row in base.read_csv(folder / "ground_truth.csv"):
+            named = ([f"{folder.name}_{name}" for name in (row.get(key) or "").split()] for key in _COLUMNS)
+            rows.append([*map(" ".join, named), row.get("status") or "ok"])
     with open(out / "ground_truth.csv", "w", newline="") as handle:
         csv.writer(handle).writerows([(*_COLUMNS, "status"), *rows])
 

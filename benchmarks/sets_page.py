@@ -16,21 +16,6 @@ CURVES = "curves.png"
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
 _NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame", " candidates")
 
-# Recall@1 on corridor with the papers' own weights, from the similarity matrices that the thesis's authors published
-# with their benchmark (VPR-Bench), and what is different here.
-SMALL = "the small network that is shipped stands in for a large one trained for places or ImageNet"
-PUBLISHED = {
-    "cohog, thesis": (0.622, "the true gradient magnitude, regions in 8 bits"),
-    "hog": (0.477, "512x512 pixels in cells of 8, of the root of the image"),
-    "calc, original weights": (0.324, "the same weights and preparation"),
-    "calc": (0.324, "other weights"),
-    "alexnet": (0.685, SMALL),
-    "amosnet": (0.847, SMALL),
-    "hybridnet": (0.901, SMALL),
-    "netvlad": (0.676, SMALL),
-    "region_vlad": (0.432, SMALL),
-}
-
 _ABOUT = """\
 `cohog` is as it flies: a scan of 144 bytes a place (looking down 200), then the displacement vote over the best places;
 in the aerial sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the

@@ -4,7 +4,6 @@ A change of the camera is a homography over flat ground; one of the picture is m
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -72,52 +71,24 @@ def view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.r
 
 
 def spoilt(sweep: str, level: float, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a picture after the change, uint8."""
+    """Return a picture after the change, uint8. What hides a share of it is one plain patch of the picture's shape."""
     if level == NONE.get(sweep, 0):
         return image
-    return _SPOIL[sweep](image, level, rng)
-
-
-def _dark(image: np.ndarray, left: float, rng: np.random.Generator) -> np.ndarray:
-    return _bytes(left * image + _READ_NOISE * rng.normal(size=image.shape))
-
-
-def _fog(image: np.ndarray, veil: float, rng: np.random.Generator) -> np.ndarray:
-    return _bytes((1 - veil) * image + veil * _FOG_GREY + _READ_NOISE * rng.normal(size=image.shape))
-
-
-def _blur(image: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), sigma * image.shape[1] / _OF_WIDTH)
-
-
-def _jpeg(image: np.ndarray, quality: float, rng: np.random.Generator) -> np.ndarray:
-    coded = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, int(quality)))[1]
-    return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
-
-
-def _hidden(image: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Hide a share behind one plain patch of the picture's shape."""
-    hidden = image.copy()
-    high, wide = (round(math.sqrt(share) * side) for side in image.shape[:2])
-    top, left = (rng.integers(0, side - own + 1) for side, own in zip(image.shape[:2], (high, wide), strict=True))
-    hidden[top : top + high, left : left + wide] = rng.integers(0, 256)
-    return hidden
-
-
-def _season(image: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-    return _bytes(255 * another_season(grey.astype(np.float32) / 255, rng, strength))
-
-
-def _bytes(image: np.ndarray) -> np.ndarray:
-    return np.clip(image, 0, 255).round().astype(np.uint8)
-
-
-_SPOIL: dict[str, Callable[[np.ndarray, float, np.random.Generator], np.ndarray]] = {
-    "dark": _dark,
-    "fog": _fog,
-    "blur": _blur,
-    "jpeg": _jpeg,
-    "hidden": _hidden,
-    "season": _season,
-}
+    high, wide = image.shape[:2]
+    if sweep == "blur":
+        return cv2.GaussianBlur(image, (0, 0), level * wide / _OF_WIDTH)
+    if sweep == "jpeg":
+        coded = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, int(level)))[1]
+        return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+    if sweep == "hidden":
+        hidden, sides = image.copy(), [round(math.sqrt(level) * side) for side in (high, wide)]
+        top, left = (rng.integers(0, side - own + 1) for side, own in zip((high, wide), sides, strict=True))
+        hidden[top : top + sides[0], left : left + sides[1]] = rng.integers(0, 256)
+        return hidden
+    if sweep == "season":
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        changed = 255 * another_season(grey.astype(np.float32) / 255, rng, level)
+    else:
+        changed = level * image if sweep == "dark" else (1 - level) * image + level * _FOG_GREY
+        changed = changed + _READ_NOISE * rng.normal(size=image.shape)
+    return np.clip(changed, 0, 255).round().astype(np.uint8)

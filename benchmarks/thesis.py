@@ -6,7 +6,6 @@ other benchmarks. The values of the thesis stand in thesis.yaml, each with its s
 """
 
 import argparse
-import csv
 from dataclasses import asdict
 from pathlib import Path
 
@@ -35,8 +34,7 @@ def main() -> None:
 def matrices(folder: Path, images: Path) -> dict[str, dict]:
     """Measure every stored similarity matrix of the author, as `edgevpr eval --similarity` does, and add the times that
     he published with them."""
-    with open(folder / f"{SET}_figures.csv", newline="") as handle:
-        times = {row["technique"]: row for row in csv.DictReader(handle)}
+    times = {row["technique"]: row for row in base.read_csv(folder / f"{SET}_figures.csv")}
     truth = read_truth(images / "ground_truth.csv")
     found = {}
     for path in sorted(folder.glob(f"{SET}_*.npy")):

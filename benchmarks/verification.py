@@ -5,7 +5,6 @@ confirmed of the right places, and how far off the middle, the rotation and the 
 of no place of the map, and whatever is confirmed of them is wrong. Truth is pairs_overlap.csv of each set.
 """
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -123,13 +122,12 @@ def _kind(dataset: Dataset, query: str, event: Recognition) -> str | None:
 def _truth(folder: Path) -> dict[tuple[str, str], Way]:
     """Return how the first picture of each pair lies on the second, for the pairs that overlap enough."""
     ways = {}
-    with (folder / "pairs_overlap.csv").open() as file:
-        for pair in csv.DictReader(file):
-            if float(pair["overlap"]) >= LEAST_OVERLAP:
-                turn = float(pair["scale"]) * np.exp(1j * math.radians(float(pair["rotation_deg"])))
-                step = complex(float(pair["dx_px"]), float(pair["dy_px"])) / WIDTH_PX
-                ways[pair["file_a"], pair["file_b"]] = turn, step
-                ways[pair["file_b"], pair["file_a"]] = 1 / turn, -step / turn
+    for pair in base.read_csv(folder / "pairs_overlap.csv"):
+        if float(pair["overlap"]) >= LEAST_OVERLAP:
+            turn = float(pair["scale"]) * np.exp(1j * math.radians(float(pair["rotation_deg"])))
+            step = complex(float(pair["dx_px"]), float(pair["dy_px"])) / WIDTH_PX
+            ways[pair["file_a"], pair["file_b"]] = turn, step
+            ways[pair["file_b"], pair["file_a"]] = 1 / turn, -step / turn
     return ways
 
 

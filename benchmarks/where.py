@@ -15,7 +15,6 @@ Writes where.json, where.md and the picture where_maps.png into benchmarks/resul
 """
 
 import csv
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +76,7 @@ def load(folder: Path) -> Set:
     solved = _registered(folder, names, tags)
     largest = np.bincount(solved.component).argmax()
     truth = {name: complex(solved.position[at]) for at, name in enumerate(names) if solved.component[at] == largest}
-    rows = _table(folder / "mosaic_positions.csv")
+    rows = base.read_csv(folder / "mosaic_positions.csv")
     components = [row["component"] for row in rows]
     of = max(set(components), key=components.count)
     mosaic = {row["file"]: complex(float(row["x_px"]), -float(row["y_px"])) for row in rows if row["component"] == of}
@@ -87,8 +86,12 @@ def load(folder: Path) -> Set:
 def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Solved:
     number = {name: at for at, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
-    rejected = [(row["file_a"], row["file_b"]) for row in _table(rejected_path)] if rejected_path.is_file() else []
-    rows = [row for row in _table(folder / "pairs_overlap.csv") if (row["file_a"], row["file_b"]) not in rejected]
+    rejected = (
+        [(row["file_a"], row["file_b"]) for row in base.read_csv(rejected_path)] if rejected_path.is_file() else []
+    )
+    rows = [
+        row for row in base.read_csv(folder / "pairs_overlap.csv") if (row["file_a"], row["file_b"]) not in rejected
+    ]
     longest = {name: max(picture(folder, name).shape[:2]) for name in names}
     step = [complex(float(row["dx_px"]), -float(row["dy_px"])) / longest[row["file_b"]] for row in rows]
     turn = [complex(np.log(float(row["scale"])), -np.radians(float(row["rotation_deg"]))) for row in rows]
@@ -101,11 +104,6 @@ def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Sol
 def picture(folder: Path, name: str) -> np.ndarray:
     """Read a picture of a set, of the map or a query."""
     return read_image(next(folder / part / name for part in ("ref", "query") if (folder / part / name).is_file()))
-
-
-def _table(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as handle:
-        return list(csv.DictReader(handle))
 
 
 def measure(folder: Path, work: Path) -> tuple[Row, dict[str, Place], Set]:
@@ -201,7 +199,7 @@ def generated(work: Path, what: str, lens: tuple[str, ...]) -> Row:
 
 
 def _add_noise(path: Path, seed: int) -> None:
-    rows, rng = _table(path), np.random.default_rng(seed)
+    rows, rng = base.read_csv(path), np.random.default_rng(seed)
     with open(path, "w", newline="") as handle:
         table = csv.DictWriter(handle, rows[0])
         table.writeheader()
@@ -236,7 +234,6 @@ def main() -> None:
             row, places, of = measure(folder, Path(work))
             found["sets"].append(row)
             shown.append((of, places))
-            print(json.dumps(row), flush=True)
         found["sets"].append(generated(Path(work), "attitude unknown", ()))
         found["sets"].append(generated(Path(work), "attitude known", ("--fov-deg", "66")))
     base.write("where", found, page(found))
