@@ -149,7 +149,8 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
     """Return, for each slot, the best mean score of the trajectories that end there, float32 (N,). `rows` has the
-    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since.
+    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since. A trajectory
+    has, for each of these queries, by how many slots its place lies before the slot where it ends.
     """
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:

@@ -214,8 +214,8 @@ class Playback(Tape):
         """Return at once: the time comes from the tape."""
 
     def _head(self) -> str:
-        """Perform the turns that come next on the tape, and return the kind of the answer after them, which stays on
-        the tape. Raises TapeEnded."""
+        """Return the kind of the next answer on the tape, without taking it. What the links did in the flight before
+        that answer stands on the tape too, and is done first. Raises TapeEnded."""
         while note := self._next():
             perform = self.links.get(note[0])
             if perform is None:

@@ -159,7 +159,7 @@ class CoHog:
     def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
         """Describe a square picture, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
         4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
-        blocks."""
+        blocks: seen ones whose entropy is at least `gt`."""
         blocks = normalised_blocks(oriented_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             seen = np.ones(blocks.shape[:2], bool)

@@ -99,9 +99,9 @@ def read_plan(path: str | Path) -> EvaluationPlan:
 
 
 def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> EvaluationPlan:
-    """Make the plan of the command line: each of `folders` is a data set, and the rows `chosen` are measured on all.
-    `common` has the settings of all sets; its `query` and `ref`, if given, are one more set. Sets are named by their
-    folders. Raises ConfigError for a ground truth of a folder."""
+    """Make the plan of the command line: each of `folders` is a data set, and the rows `chosen` (techniques with their
+    settings) are measured on all. `common` has the settings of all sets; its `query` and `ref`, if given, are one more
+    set, named by both folders. Raises ConfigError if `common` has a ground truth although there are `folders`."""
     sets: dict[str, SetPlan] = {}
     if common.query and common.ref:
         query, ref = (str(Path(each).resolve()) for each in (common.query, common.ref))

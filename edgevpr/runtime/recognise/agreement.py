@@ -306,8 +306,8 @@ def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
 
 
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the shift along each axis, as a share squared, from the inliers: their points `asked` in
-    the query and `known` in the place, complex (n,) each."""
+    """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers:
+    their points `asked` in the query and `known` in the place, complex (n,) each."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()

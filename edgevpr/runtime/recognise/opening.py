@@ -195,7 +195,8 @@ def _recogniser(
     narrowed: bool,
     follows: bool,
 ) -> Recogniser:
-    """Make a recogniser from all that is open."""
+    """Make the recogniser of an open map for a board. `narrowed`: it may leave out places that the vehicle cannot have
+    reached. `follows`: it follows the aircraft from query to query."""
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
     matcher = Matcher(technique, index, rule, search_of(length))

@@ -101,7 +101,8 @@ class Gate:
         return worth_of(scores, self.thresholds, usual)
 
     def maps(self, image: Image) -> Maps:
-        """Compute the maps of a frame. Raises ModelError as `look` does."""
+        """Compute the maps of salience of a frame: memorability, staticity and entropy of its pixels. Raises ModelError
+        as `look` does."""
         if self._detector:
             if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
                 self._static, self._until_detection = None, self._detect_every  # None, if the detector fails
