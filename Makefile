@@ -83,7 +83,7 @@ bench-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/bench_arm64.py
 
 # edgevpr on an emulated ARM board: the core of the tests (as root; Debian's qemu-user-static, debootstrap and gcc), into
-# benchmarks/results/. The system is kept in ~/.cache.
+# benchmarks/results/.
 test-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/on_arm64.py
 

@@ -1,6 +1,6 @@
-"""What a query costs an ARM core: instructions, bytes and multiply-adds of its parts, counted while an emulated
-Cortex-A53 runs them. `make bench-arm64` writes
-benchmarks/results/arm64.md and arm64.json, and the counts that `edgevpr profile` estimates ARM boards by.
+"""What a query costs an ARM core: the instructions of its parts, counted while an emulated Cortex-A53 runs them.
+`make bench-arm64` writes benchmarks/results/arm64.md and arm64.json, and the counts that `edgevpr profile` estimates
+ARM boards by.
 
 It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of Debian and PyPI. Counts repeat to some
 thousandths; times do not.
@@ -30,8 +30,6 @@ WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the par
 _COLUMNS = {
     "part": "{part}",
     "million instructions": "{millions:.2f}",
-    "MB moved": "{mb:.1f}",
-    "million multiply-adds": "{million_madds:.1f}",
     "s on Zero 2 W": "{zero_s:.3f}",
 }
 
@@ -42,12 +40,10 @@ def main() -> None:
         sys.exit(f"bench_arm64: as root, install qemu-user, debootstrap and gcc ({' '.join(missing)} is not there).")
     with TemporaryDirectory(prefix="edgevpr-arm64-") as folder:
         work = Path(folder)
-        print("building an aarch64 system", flush=True)
         build(work)
         maps = [str(work / f"{camera}.gpkg") for camera in ("forward", "nadir")]
         for path in maps:
             make_big_map(Path(path), create("cohog", {"camera": Path(path).stem}).spec, counted.LARGE)
-        print("counting", flush=True)
         rows = count(work, maps)
     found = {**base.made_by(), "parts": rows}
     figures = counted.figures({row["part"]: row["instructions"] for row in rows})
@@ -63,37 +59,28 @@ def build(work: Path) -> None:
 
 
 def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
-    """Run the parts under emulation. Returns for each what it took: `part`, `instructions`, `bytes` loaded and stored,
-    and `multiply_adds`."""
+    """Run the parts under emulation. Returns for each its name (`part`) and its `instructions`."""
     argv = ["qemu-aarch64", "-cpu", CPU, "-L", str(work / "system"), "-plugin", str(work / "count.so")]
     argv += [str(work / f"system/usr/bin/python{PYTHON}"), str(HERE / "arm64" / "work.py"), *maps]
     done = run(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
-    marks = [[int(number) for number in line.split()] for line in done.stderr.splitlines() if line[:1].isdigit()]
+    marks = [int(line) for line in done.stderr.splitlines() if line.isdigit()]
     names = done.stdout.splitlines()
     if len(marks) != 2 * len(names):
         raise RuntimeError(f"{len(marks)} marks of {len(names)} parts: {done.stderr}")
-    rows = []
-    for name, before, after in zip(names, marks[::2], marks[1::2], strict=True):
-        instructions, moved, multiply_adds = (late - early for early, late in zip(before, after, strict=True))
-        rows.append({"part": name, "instructions": instructions, "bytes": moved, "multiply_adds": multiply_adds})
-    return rows
+    counted_of = zip(names, marks[::2], marks[1::2], strict=True)
+    return [{"part": name, "instructions": after - before} for name, before, after in counted_of]
 
 
 def page(found: dict[str, Any]) -> str:
     """Return the page for people."""
     machine, mips = found["machine"], load_board("rpi-zero-2w").benchmark_score.arm64_mips
-    rows = [
-        row
-        | {"millions": row["instructions"] / 1e6, "mb": row["bytes"] / 1e6, "million_madds": row["multiply_adds"] / 1e6}
-        | {"zero_s": row["instructions"] / 1e6 / mips}
-        for row in found["parts"]
-    ]
+    millions = {row["part"]: row["instructions"] / 1e6 for row in found["parts"]}
+    rows = [{"part": part, "millions": each, "zero_s": each / mips} for part, each in millions.items()]
     return f"""# What a query costs an ARM core
 
 Made by `make bench-arm64` on {found["date"]}, commit {found["commit"]}: {counted.LARGE} places, and a picture in which
 nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
-{machine["opencv"]} for aarch64. MB moved are all loads and stores, most of them from caches. Multiply-adds are those of
-vector instructions. The last column divides by the {mips:g} million instructions a second of
+{machine["opencv"]} for aarch64. The last column divides by the {mips:g} million instructions a second of
 `profiles/rpi-zero-2w.yaml`.
 
 {base.table(rows, _COLUMNS)}

@@ -57,10 +57,6 @@ def _bits(path: Path, rng: Rng, first: int = 0, end: int | None = None, most: in
     path.write_bytes(data)
 
 
-def _header(path: Path, rng: Rng) -> None:
-    _bits(path, rng, 0, 100, most=3)
-
-
 def _pages(path: Path, rng: Rng) -> None:
     data = bytearray(path.read_bytes())
     for page in rng.integers(0, len(data) // _PAGE, rng.integers(1, 6)):
@@ -68,10 +64,6 @@ def _pages(path: Path, rng: Rng) -> None:
         other = int(rng.integers(0, len(data) // _PAGE)) * _PAGE
         data[start : start + _PAGE] = (rng.bytes(_PAGE), bytes(_PAGE), data[other : other + _PAGE])[rng.integers(3)]
     path.write_bytes(data)
-
-
-def _cut(path: Path, rng: Rng) -> None:
-    os.truncate(path, int(rng.random() * path.stat().st_size))
 
 
 def _position(path: Path, rng: Rng) -> None:
@@ -116,41 +108,36 @@ def _spec(path: Path, rng: Rng) -> None:
     _written(path, ("UPDATE edgevpr_map SET value = ? WHERE key = ?", change))
 
 
-def _schema(path: Path, rng: Rng) -> None:
-    _written(path, (_SCHEMA[rng.integers(len(_SCHEMA))], ()))
-
-
 def _another(path: Path, rng: Rng) -> None:
-    moved = [(point_blob(51 + rng.random(), 9.0), place) for place in range(1, _PLACES + 1)]
-    _written(path, *(("UPDATE places SET geom = ? WHERE place_id = ?", each) for each in moved))
+    for place in range(1, _PLACES + 1):
+        _moved_to(path, place, 51 + rng.random())
     if rng.random() < 0.5:
         _written(path, ("UPDATE edgevpr_map SET value = ? WHERE key = 'map_id'", (f'"{rng.bytes(4).hex()}"',)))
 
 
-def _moved(path: Path, rng: Rng) -> None:
-    place = int(rng.integers(1, _PLACES + 1))
-    _written(path, ("UPDATE places SET geom = ? WHERE place_id = ?", (point_blob(51.0, 9.0), place)))
+def _moved_to(path: Path, place: int, lat_deg: float) -> None:
+    _written(path, ("UPDATE places SET geom = ? WHERE place_id = ?", (point_blob(lat_deg, 9.0), place)))
 
 
 KINDS: dict[str, Callable[[Path, Rng], None]] = {
     "bits flipped": _bits,
-    "bits of the header flipped": _header,
+    "bits of the header flipped": lambda path, rng: _bits(path, rng, 0, 100, most=3),
     "pages overwritten": _pages,
-    "cut": _cut,
+    "cut": lambda path, rng: os.truncate(path, int(rng.random() * path.stat().st_size)),
     "bits of a position flipped": _position,
     "values of a wrong type": _values,
     "parts of places exchanged": _swapped,
     "rows gone or renumbered": _rows,
     "description damaged": _spec,
-    "tables changed": _schema,
+    "tables changed": lambda path, rng: _written(path, (_SCHEMA[rng.integers(len(_SCHEMA))], ())),
     "another map": _another,
-    "moved by a program": _moved,
+    "moved by a program": lambda path, rng: _moved_to(path, int(rng.integers(1, _PLACES + 1)), 51.0),
 }
 
 
 def damaged_maps(folder: Path, whole_map: Path, count: int, seed: int) -> Iterator[tuple[str, Path]]:
-    """Write `count` damaged copies of a map of this file into the folder, and yield the kind of damage and the path of
-    each; the kinds take turns. The same seed damages in the same way."""
+    """Write `count` damaged copies of a map into the folder, one after the other; yield the kind of damage and the path
+    of each. The kinds take turns."""
     for number in range(count):
         kind = list(KINDS)[number % len(KINDS)]
         path = folder / f"{number:05d}.gpkg"

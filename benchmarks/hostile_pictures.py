@@ -7,7 +7,6 @@ other way. A spoilt picture that is recognised as its own place is no fault. Eve
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import base
@@ -24,14 +23,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A picture to ask: its kind, and the references that it may be taken for (empty: none)."""
-
-    kind: str
-    image: np.ndarray
-    may_be: frozenset[str] = frozenset()
+Asked = tuple[str, np.ndarray, frozenset[str]]  # a kind, a picture, and the references that it may be taken for
 
 
 def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = None) -> list[Row]:
@@ -46,12 +38,12 @@ def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = 
         with tempfile.TemporaryDirectory(prefix="edgevpr-hostile-") as temporary:
             recogniser = mapped(folder, Path(temporary))
             with recogniser.place_map:
-                for asked in _asked(walks.dataset_of(folder), others, count, seed + number):
-                    event = recogniser.step(walks.frame(asked.image, asked.kind))
-                    of_kind = counts.setdefault(asked.kind, {"tried": 0, "accepted": 0, "accepted_wrong": 0})
+                for kind, image, may_be in _asked(walks.dataset_of(folder), others, count, seed + number):
+                    event = recogniser.step(walks.frame(image, kind))
+                    of_kind = counts.setdefault(kind, {"tried": 0, "accepted": 0, "accepted_wrong": 0})
                     of_kind["tried"] += 1
                     of_kind["accepted"] += event.accepted
-                    of_kind["accepted_wrong"] += event.accepted and event.best.place.source_image not in asked.may_be
+                    of_kind["accepted_wrong"] += event.accepted and event.best.place.source_image not in may_be
         where = {"set": folder.name, "camera": camera_of(folder.name)}
         rows += [{"kind": kind, **where, **of_kind} for kind, of_kind in counts.items()]
     return rows
@@ -68,15 +60,15 @@ def mapped(folder: Path, temporary: Path) -> Recogniser:
 
 def _asked(dataset: Dataset, others: list[Path], count: int, seed: int) -> Iterator[Asked]:
     for _, image in pictures(seed, count):
-        yield Asked("of nothing", image)
+        yield "of nothing", image, frozenset()
     rng = np.random.default_rng((seed, 1))
     queries = -(-count // len(SPOILT))
     for number in rng.choice(len(dataset.queries), queries, replace=queries > len(dataset.queries)):
         query = dataset.queries[number]
         for _, image in spoilt(seed + int(number), read_image(query.path)):
-            yield Asked("spoilt", image, query.right | query.ignored)
+            yield "spoilt", image, query.right | query.ignored
     paths = [path for other in others for part in ("query", "ref") for path in list_images(other / part)]
     order = rng.permutation(len(paths))
     for number in range(count):
         path, turns = paths[order[number % len(paths)]], number // len(paths)  # a picture asked again is turned
-        yield Asked("of the other camera", np.ascontiguousarray(np.rot90(read_image(path), turns)))
+        yield "of the other camera", np.ascontiguousarray(np.rot90(read_image(path), turns)), frozenset()

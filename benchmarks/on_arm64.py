@@ -1,22 +1,18 @@
 """edgevpr on 64-bit ARM, without the hardware: `make test-arm64` writes benchmarks/results/test_arm64.md and
 test_arm64.json, and ends with code 1 where something is not as on x86-64.
 
-python benchmarks/on_arm64.py [--cache FOLDER]
-
-As root, with Debian's packages debootstrap, qemu-user-static and gcc, it makes a Debian system for aarch64 in a cache
-folder, installs the locked wheels and edgevpr's own, and has QEMU run them as a Cortex-A53: the core of the test suite,
-whose golden tests hold descriptors, scores and maps to those of x86-64.
+As root, with Debian's packages debootstrap, qemu-user-static and gcc, it makes a Debian system for aarch64, installs
+the locked wheels and edgevpr's own, and has QEMU run them as a Cortex-A53: the core of the test suite, whose golden
+tests hold descriptors, scores and maps to those of x86-64.
 """
 
-import argparse
-import hashlib
 import os
 import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -46,17 +42,12 @@ _COLUMNS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    usual = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edgevpr-arm64"
-    parser.add_argument("--cache", type=Path, default=usual, help=f"where the system is kept ({usual})")
-    args = parser.parse_args()
     missing = [tool for tool in TOOLS if not shutil.which(tool)]
     qemu = next(filter(None, map(shutil.which, QEMUS)), None)
     if missing or not qemu or os.geteuid():
         sys.exit("on_arm64: as root, install debootstrap, qemu-user-static and gcc.")
     with TemporaryDirectory(prefix="edgevpr-arm64-") as work:
-        print("building an aarch64 system", flush=True)
-        arm = build(args.cache.resolve(), qemu, Path(work))
+        arm = build(qemu, Path(work))
         system = {**base.made_by(), **userland.versions(arm, qemu)}
         tree, without = arm.work / "tree", (".*", "__pycache__", "edgevpr", "demo_out", "results")
         shutil.copytree(REPOSITORY, tree, ignore=shutil.ignore_patterns(*without))  # the wheel is in place of edgevpr
@@ -65,35 +56,21 @@ def main() -> None:
     sys.exit(failures(found))
 
 
-def build(cache: Path, qemu: str, work: Path) -> Arm:
-    """Make what is not in the cache, and edgevpr's wheel."""
-    system, tools = cache / userland.RELEASE, [f"{name}=={metadata.version(name)}" for name in FOR_TESTS]
-    key = hashlib.sha256(LOCK.read_bytes() + repr(tools).encode()).hexdigest()[:12]
-    python, own = system / "usr/bin/python", work / "own"
-    arm = Arm(python, cache / key / "locked", cache / key / "tools", own, work, imageio_ffmpeg.get_ffmpeg_exe())
-    _made_once(system, userland.make_system)
+def build(qemu: str, work: Path) -> Arm:
+    """Make the system, and install the locked wheels, those that the tests need, and edgevpr's own."""
+    system = work / "system"
+    folders = (work / "locked", work / "tools", work / "own", work)
+    arm = Arm(system / "usr/bin/python", *folders, imageio_ffmpeg.get_ffmpeg_exe())
+    userland.make_system(system)
     userland.make_launcher(system, qemu)
-    _made_once(arm.locked, lambda folder: userland.install(folder, "--require-hashes", "-r", str(LOCK)))
-    _made_once(arm.tools, lambda folder: userland.install(folder, *tools))
+    userland.install(arm.locked, "--require-hashes", "-r", str(LOCK))
+    userland.install(arm.tools, *(f"{name}=={metadata.version(name)}" for name in FOR_TESTS))
     for program in (arm.locked / "bin").glob("*.py"):  # where an installation has them, and tests look for them
-        link = system / "usr/bin" / program.name
-        link.unlink(missing_ok=True)
-        link.symlink_to(program)
+        (system / "usr/bin" / program.name).symlink_to(program)
     wheel = ["wheel", "--quiet", "--no-deps", "--no-build-isolation", f"--wheel-dir={work}", str(REPOSITORY)]
     userland.run([sys.executable, "-m", "pip", *wheel])
     userland.install(arm.own, "--no-deps", *map(str, work.glob("edgevpr-*.whl")))
     return arm
-
-
-def _made_once(folder: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder under another name, so that it is there only when it is whole."""
-    if folder.exists():
-        return
-    unfinished = folder.with_name(f"{folder.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.parent.mkdir(parents=True, exist_ok=True)
-    make(unfinished)
-    unfinished.rename(folder)
 
 
 def run_tests(python: Path, tree: Path, env: dict[str, str], what: Sequence[str] = CORE) -> Row:

@@ -53,9 +53,9 @@ def test_no_hostile_input_ends_a_command_otherwise_than_with_a_sentence():
 @pytest.mark.parametrize(
     ("program", "wrong"),
     [
-        ("raise ValueError", "traceback"),
-        ("import sys; sys.exit('edgevpr: \\x1b[31m')", "leak"),
-        ("import sys; sys.exit(2)", "exit code"),  # and no sentence
+        ("raise ValueError", "tracebacks"),
+        ("import sys; sys.exit('edgevpr: \\x1b[31m')", "leaks"),
+        ("import sys; sys.exit(2)", "wrong_exit_codes"),  # and no sentence
     ],
 )
 def test_what_goes_wrong_is_counted(program, wrong, tmp_path, monkeypatch):
