@@ -1,4 +1,4 @@
-"""The stages of a query of `cohog`, each beside the published way (competitor.py) or the least that any way has to do.
+"""The stages of a query of `cohog`, beside the published way (competitor.py) or the vote over all places.
 
 What is compared takes turns on the same pictures, on one thread, so that whatever else the machine does hits all of it;
 ratios are taken turn by turn. Frames, 640x480 grey, come from the generated scene and, where they are at hand, from
@@ -55,8 +55,8 @@ def timed_s(function: Callable, *arguments: object) -> float:
 
 
 def encode_rows() -> Iterator[Row]:
-    """Encode each frame with both definitions of entropy: ours, the published way, and the floor, which is the resize
-    to 512x512 and two 3x3 Sobel passes. `good_differing` blocks are good for one of the two only."""
+    """Encode each frame with both definitions of entropy, our way and the published one. `good_differing` blocks are
+    good for one of the two only."""
     for entropy in ("shannon", "filled_bins"):
         technique, times_s, worst, differing = create("cohog", {"entropy": entropy}), [], 0.0, 0
 
@@ -68,42 +68,32 @@ def encode_rows() -> Iterator[Row]:
             ours, theirs = technique.encode(picture), published(picture)
             worst = max(worst, float(np.abs(ours.regions - theirs[0]).max()))
             differing += int((ours.good != theirs[1]).sum())
-            ways = technique.encode, published, _floor
+            ways = technique.encode, published
             times_s += [[timed_s(way, picture) for way in ways] for _ in range(ENCODE_TURNS)]
-        yield {"entropy": entropy, **_beside(times_s, "floor"), "worst_difference": worst, "good_differing": differing}
+        yield {"entropy": entropy, **_beside(times_s), "worst_difference": worst, "good_differing": differing}
 
 
-def _floor(picture: np.ndarray) -> None:
-    grey = cv2.resize(picture, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
-    cv2.Sobel(grey, cv2.CV_32F, 1, 0)
-    cv2.Sobel(grey, cv2.CV_32F, 0, 1)
-
-
-def _beside(times_s: list[list[float]], least: str) -> Row:
-    """Return medians of turns: ours, the published way and the least, and the ratios of each turn."""
-    ours_s, theirs_s, least_s = np.array(times_s).T
-    ours_ms, competitor_ms, least_ms = (1000 * np.median(times_s, axis=0)).tolist()
-    ratio, times_least = float(np.median(theirs_s / ours_s)), float(np.median(ours_s / least_s))
-    times = {"ours_ms": ours_ms, "competitor_ms": competitor_ms, "ratio": ratio}
-    return times | {f"{least}_ms": least_ms, f"times_{least}": times_least}
+def _beside(times_s: list[list[float]]) -> Row:
+    """Return medians of turns, ours and the published way, and of the ratios of each turn."""
+    ours_s, theirs_s = np.array(times_s).T
+    ours_ms, competitor_ms = (1000 * np.median(times_s, axis=0)).tolist()
+    return {"ours_ms": ours_ms, "competitor_ms": competitor_ms, "ratio": float(np.median(theirs_s / ours_s))}
 
 
 def match_rows() -> Iterator[Row]:
-    """Compare one place in full: ours with the displacement vote, the published way without it, and the bare float32
-    product of the same size. Each reference is another picture, as in a map."""
+    """Compare one place in full: ours with the displacement vote, the published way without it. Each reference is
+    another picture, as in a map."""
     technique, pictures = create("cohog"), frames()
     # Shifted copies stand in where there are too few pictures: the time does not depend on what they show.
     places = [technique.encode(np.roll(pictures[at % len(pictures)], at)) for at in range(REFERENCES)]
     query = technique.encode(pictures[0])
-    asking = query.regions[query.good]
-    exact, single = [place.regions.astype(np.float64) for place in places], [place.regions for place in places]
+    exact = [place.regions.astype(np.float64) for place in places]
     ways = (
         lambda: [technique.match(query, place.fine, None) for place in places],
         lambda: competitor.match(query.regions.astype(np.float64), query.good, exact),
-        lambda: [asking @ reference.T for reference in single],
     )
     times_s = [[timed_s(way) / REFERENCES for way in ways] for _ in range(MATCH_TURNS)]
-    yield {"references": REFERENCES, **_beside(times_s, "product")}
+    yield {"references": REFERENCES, **_beside(times_s)}
 
 
 @contextmanager
