@@ -40,7 +40,6 @@ GATES = {
     "staticity": Thresholds(staticity=FULL.staticity),
     "entropy": Thresholds(entropy=FULL.entropy),
 }
-FIVE_PLACES = ("grief_michigan_monthly", "grief_stromovka_monthly")
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
 DETECTOR = "yolox_nano"

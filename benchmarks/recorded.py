@@ -31,7 +31,6 @@ def main() -> None:
     found = base.made_by()
     found["flights"] = [_of_flight(Path(log)) for log in sys.argv[1:]]
     base.write("replay", found, page(found))
-    print(page(found))
 
 
 def _of_flight(log: Path) -> Row:
@@ -39,7 +38,7 @@ def _of_flight(log: Path) -> Row:
     again = replay(flight, lambda done, total: None)
     took_s, lines = time.perf_counter() - begin_s, compare(flight.lines, again.lines)
     queries = [line for line in again.lines if line.get("kind") == "query"]
-    row = {
+    return {
         "flight": log.parent.name,
         "queries": len(queries),
         "minutes": (queries[-1]["t_mono_s"] - queries[0]["t_mono_s"]) / 60,
@@ -51,8 +50,6 @@ def _of_flight(log: Path) -> Row:
         "why_ended": again.why_ended,
         "replay_s": took_s,
     }
-    print(row, flush=True)
-    return row
 
 
 def page(found: Row) -> str:

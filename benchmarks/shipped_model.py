@@ -65,7 +65,8 @@ def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence],
     right = np.concatenate([np.full(len(group), each) for group, each in groups])
     weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
     scales = np.maximum(evidence_matrix(rows, names).std(0), 1e-3)
-    return fitted(nothing_known(names, scales), rows, right, weights, _PULL * len(groups))
+    nothing_known = Logistic(tuple(names), (0.0,) * len(names), tuple(scales.tolist()), 0.0)
+    return fitted(nothing_known, rows, right, weights, _PULL * len(groups))
 
 
 def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
@@ -93,19 +94,10 @@ def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
 
 
 def _tail(logits: Sequence[Sequence[float]], counts: Sequence[int], part: float) -> Tail:
-    """Fit the tail of the wrong matches of sites, which have these `counts` of matches; each site counts the same."""
-    shares = [np.full(len(of_site), 1 / (count * len(logits))) for of_site, count in zip(logits, counts, strict=True)]
-    return tail_of(np.concatenate([np.array(each, float) for each in logits]), np.concatenate(shares), part)
-
-
-def nothing_known(names: Sequence[str], scales: Sequence[float]) -> Logistic:
-    """Return the regression from which the first one is fitted: no evidence weighs anything."""
-    return Logistic(tuple(names), (0.0,) * len(names), tuple(map(float, scales)), 0.0)
-
-
-def tail_of(wrong: np.ndarray, shares: np.ndarray, part: float) -> Tail:
-    """Fit the tail of the logits of wrong matches, float (N,), each of which is this share of all matches, float (N,):
-    to the highest `part` of them."""
+    """Fit the tail of the wrong matches of sites, which have these `counts` of matches, to the highest `part` of their
+    logits; each site counts the same."""
+    shares = np.repeat([1 / (count * len(logits)) for count in counts], [len(of_site) for of_site in logits])
+    wrong = np.array([each for of_site in logits for each in of_site])
     order = np.argsort(-wrong, kind="stable")
     wrong, shares = wrong[order], shares[order]
     count = max(_FEWEST_IN_TAIL, int(np.searchsorted(np.cumsum(shares), part * shares.sum())) + 1)
