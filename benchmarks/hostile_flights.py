@@ -109,14 +109,8 @@ def _pose(number: float) -> simulated.CameraPose:
 
 
 def _mapped_from(number: int, rng: np.random.Generator) -> simulated.CameraPose:
-    north_m, height_m, heading_deg = rng.normal(0, (1.0, 1.0, 1.0))
-    exact = _pose(number)
-    return replace(
-        exact,
-        north_m=exact.north_m + north_m,
-        height_m=exact.height_m + height_m,
-        heading_deg=exact.heading_deg + heading_deg,
-    )
+    exact, off = _pose(number), dict(zip(("north_m", "height_m", "heading_deg"), rng.normal(0, 1, 3), strict=True))
+    return replace(exact, **{name: getattr(exact, name) + each for name, each in off.items()})
 
 
 def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Path) -> Row:

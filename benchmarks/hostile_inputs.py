@@ -10,12 +10,12 @@ import os
 import resource
 import subprocess
 import sys
+from collections import namedtuple
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from itertools import count as numbers
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import cv2
 import hypothesis
@@ -60,17 +60,12 @@ battery:
   pack: 4S5200"""
 
 
-class Ground(NamedTuple):
-    """What hostile files are put beside: a folder with two pictures, a map of them, a network and its card."""
-
-    pictures: str
-    map: str
-    network: str
-    card: str
-
-
 # Writes the hostile file into a folder, and returns the command that is given it.
 Attempt = Callable[[Path], list[str | bytes]]
+
+
+# What hostile files are put beside: a folder with two pictures, a map of them, a network and its card.
+Ground = namedtuple("Ground", "pictures map network card")
 
 
 def run(count: int, seed: int) -> list[Row]:

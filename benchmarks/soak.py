@@ -52,7 +52,6 @@ def main() -> None:
         found = base.made_by() | run(Path(folder), 60 * minutes, _EVERY_S)
     base.write("soak", found, page(found))
     draw(found, RESULTS / "soak.png")
-    print(page(found))
     sys.exit("\n".join(f"soak: {each}" for each in verdict(found)) or None)
 
 

@@ -69,11 +69,9 @@ def make_world(folder: Path, radius_m: float) -> World:
 
 def _poses(radius_m: float, count: int) -> Iterator[CameraPose]:
     for turn in 2 * np.pi * np.arange(count) / count:
-        east_m, north_m = _CENTRE_M + radius_m * np.array([np.sin(turn), np.cos(turn)])
-        heading_deg = float(np.degrees(turn)) + 90.0
-        yield CameraPose(
-            east_m=float(east_m), north_m=float(north_m), height_m=_HEIGHT_M, heading_deg=heading_deg % 360
-        )
+        east_m, north_m = (_CENTRE_M + radius_m * np.array([np.sin(turn), np.cos(turn)])).tolist()
+        heading_deg = (math.degrees(turn) + 90.0) % 360
+        yield CameraPose(east_m=east_m, north_m=north_m, height_m=_HEIGHT_M, heading_deg=heading_deg)
 
 
 def _shoot(film: Path, scene: Scene, flight: GeneratedFlight) -> None:

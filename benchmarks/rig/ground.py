@@ -31,7 +31,6 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
     """Return the ground in the light of a day, uint8 (H, W, 3) BGR, read from its file only where it is looked at."""
     files = {name: work / f"ground-{name}.npy" for name in LIGHTS}
     if not all(path.exists() for path in files.values()):
-        print("making the ground", file=sys.stderr, flush=True)
         work.mkdir(parents=True, exist_ok=True)
         scene = make_scene(SEED, WIDTH_M, DEPTH_M, METRES_PER_PIXEL)
         for number, (name, path) in enumerate(files.items()):
@@ -60,7 +59,6 @@ def place_map(work: Path) -> Path:
     if path.exists():
         return path
     ground = lit_ground(work, "mapping")
-    print("flying the mapping flight", file=sys.stderr, flush=True)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(SEED)
     with open(folder / "positions.csv", "w", newline="", encoding="utf-8") as handle:
@@ -71,15 +69,12 @@ def place_map(work: Path) -> Path:
             (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
             where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
             table.writerow((name, *where, f"{pose.heading_deg % 360:.2f}"))
-    print("building the map", file=sys.stderr, flush=True)
     unfinished = work / "unfinished.gpkg"
     unfinished.unlink(missing_ok=True)
     pictures = ("--images", folder / "images", "--positions", folder / "positions.csv", "--camera", "nadir")
     command = ("map", "build", *pictures, "--fov-deg", FOV_DEG, "--technique", "cohog", unfinished)
-    with open(work / "map.txt", "w", encoding="utf-8") as said:
-        subprocess.run(
-            [sys.executable, "-m", "edgevpr", *map(str, command)], env=environment(), check=True, stdout=said
-        )
+    words = [sys.executable, "-m", "edgevpr", *map(str, command)]
+    subprocess.run(words, env=environment(), check=True, stdout=subprocess.DEVNULL)
     unfinished.rename(path)
     return path
 
@@ -90,13 +85,7 @@ def _mapping_poses(rng: np.random.Generator) -> list[CameraPose]:
     poses = []
     for leg, north_m in enumerate(np.arange(EDGE_M, DEPTH_M - EDGE_M + 1, SPACING_M)):
         for east in east_m if leg % 2 == 0 else east_m[::-1]:
-            off_east_m, off_north_m, off_height_m, off_deg = rng.normal(0, (1.0, 1.0, 0.7, 1.0))
-            poses.append(
-                CameraPose(
-                    east_m=float(east + off_east_m),
-                    north_m=float(north_m + off_north_m),
-                    height_m=float(MAPPED_FROM_M + off_height_m),
-                    heading_deg=float((90 if leg % 2 == 0 else 270) + off_deg),
-                )
-            )
+            planned = (east, north_m, MAPPED_FROM_M, 90 if leg % 2 == 0 else 270)
+            flown = (planned + rng.normal(0, (1.0, 1.0, 0.7, 1.0))).tolist()
+            poses.append(CameraPose(**dict(zip(("east_m", "north_m", "height_m", "heading_deg"), flown, strict=True))))
     return poses

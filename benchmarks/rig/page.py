@@ -60,7 +60,6 @@ def write_page(work: Path) -> None:
     result = {**base.made_by(), "scenarios": {name: runs for name, runs in found.items() if runs}}
     base.write("rig", result, page(result))
     _draw(work, list(result["scenarios"]), RESULTS / "rig.jpg")
-    print(page(result))
 
 
 def _runs(runs: Path, name: str) -> dict[str, Row]:

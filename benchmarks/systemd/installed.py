@@ -32,19 +32,8 @@ def installed_trial() -> Iterator[tuple[Trial, dict[str, Any]]]:
     make_flight(where / "flight")
     with TemporaryDirectory(prefix="edgevpr-machine-", dir=where) as name:
         folder = Path(name)
-        create = (
-            "qemu-img",
-            "create",
-            "-q",
-            "-f",
-            "qcow2",
-            "-F",
-            "raw",
-            "-b",
-            where / "debian.raw",
-            folder / "root.qcow2",
-        )
-        image.run(*create)
+        layered = ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b"]
+        image.run(*layered, where / "debian.raw", folder / "root.qcow2")
         for disk, size in _DISKS.items():
             image.run("mkfs.ext4", "-q", "-L", disk, folder / f"{disk}.raw", size)
             image.run("qemu-img", "convert", "-O", "qcow2", folder / f"{disk}.raw", folder / f"{disk}.qcow2")

@@ -9,7 +9,6 @@ seconds are those of a slow board.
 """
 
 import argparse
-import json
 import sys
 import traceback
 from dataclasses import asdict
@@ -61,7 +60,6 @@ def record(name: str, trial: Trial, machine: Row) -> None:
         traceback.print_exc()
         outcome = Outcome(fault=name, failed=[" ".join(str(error).split())[-300:] or type(error).__name__])
         trial.begins_anew()
-    print(json.dumps(asdict(outcome)), flush=True)
     rows = base.read("service_faults").get("faults", {}) | {name: asdict(outcome) | {"made_by": base.made_by()}}
     found = {"faults": {each: rows[each] for each in ORDER if each in rows}, "machine": machine}
     base.write("service_faults", found, page(found))
