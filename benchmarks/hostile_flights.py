@@ -54,14 +54,10 @@ def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True
         for number, stream in enumerate(each for each in streams() if only(each.name)):
             log = place_map.with_name(f"{number}.jsonl")
             rows.append(_flown(stream, stream.camera(film, seed), film, place_map, log))
-    return [*rows, total([row for row in rows if not row["is_whole"]])]
-
-
-def total(rows: list[Row]) -> Row:
-    """Add up the rows of damaged streams."""
-    sums = {name: sum(row[name] for row in rows) for name in ("sent", "queries", "fixes", "old", "ahead")}
-    oldest_s = max((row["oldest_s"] for row in rows), default=0.0)
-    return {"stream": "all that are damaged", "is_whole": False, **sums, "oldest_s": oldest_s}
+    damaged = [row for row in rows if not row["is_whole"]]
+    sums = {name: sum(row[name] for row in damaged) for name in ("sent", "queries", "fixes", "old", "ahead")}
+    oldest_s = max((row["oldest_s"] for row in damaged), default=0.0)
+    return [*rows, {"stream": "all that are damaged", "is_whole": False, **sums, "oldest_s": oldest_s}]
 
 
 def behind_s(fixes: Sequence[ReceivedFix], sent_s: dict[int, float]) -> np.ndarray:

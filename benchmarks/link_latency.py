@@ -74,7 +74,10 @@ def row(kind: str, signed: bool, fixes: int, idle_s: float) -> Row:
                 time.sleep(0.01)
             sent_s = _send(link, fixes)
             time.sleep(1.0)
-            cpu_share, messages_s = _idle(link, idle_s)
+            heard, cpu_s, begin_s = sum(link.stats().received.values()), time.process_time(), time.monotonic()
+            time.sleep(idle_s)
+            cpu_s, lasted_s = time.process_time() - cpu_s, time.monotonic() - begin_s
+            heard = sum(link.stats().received.values()) - heard
         near.send("end")
         arrived_s = near.recv()
         peer.join()
@@ -85,8 +88,8 @@ def row(kind: str, signed: bool, fixes: int, idle_s: float) -> Row:
         "median_ms": statistics.median(took_ms),
         "p99_ms": took_ms[round(0.99 * (fixes - 1))],
         "most_ms": took_ms[-1],
-        "idle_cpu_share": cpu_share,
-        "idle_messages_s": messages_s,
+        "idle_cpu_share": cpu_s / lasted_s,
+        "idle_messages_s": heard / lasted_s,
     }
 
 
@@ -100,14 +103,6 @@ def _send(link: Link, fixes: int) -> list[float]:
         sent_s.append(now_s)
         sending.wait(0.02)
     return sent_s
-
-
-def _idle(link: Link, idle_s: float) -> tuple[float, float]:
-    """Return the share of a core that this process takes while its link is idle, and the messages heard a second."""
-    before, cpu_s, begin_s = sum(link.stats().received.values()), time.process_time(), time.monotonic()
-    time.sleep(idle_s)
-    cpu_s, lasted_s = time.process_time() - cpu_s, time.monotonic() - begin_s
-    return cpu_s / lasted_s, (sum(link.stats().received.values()) - before) / lasted_s
 
 
 @contextmanager

@@ -3,8 +3,8 @@ link and clock."""
 
 import signal
 import time
-from itertools import pairwise
 
+import numpy as np
 from trial import MAP, PATIENCE_S, Outcome, Trial, fault, of_kind
 from world import wait_until
 
@@ -90,10 +90,7 @@ def clock_set(trial: Trial, row: Outcome) -> None:
         time.sleep(8)
     matches_s = trial.matches_since(trial.begin_s)
     lines = [line for line in of_kind(trial.log(), "query") if line["t_mono_s"] > trial.begin_inside_s]
-    times_s, gap_s = (
-        [line["t_mono_s"] for line in lines],
-        max((later - earlier for earlier, later in pairwise(matches_s)), default=0.0),
-    )
+    times_s, gap_s = [line["t_mono_s"] for line in lines], max(np.diff(matches_s), default=0.0)
     row.does = (
         f"goes on: frames, fixes and ages run by the monotonic clock (longest pause between matches {gap_s:.1f} s)"
     )
