@@ -60,9 +60,7 @@ def _figures(rows: Sequence[Row]) -> dict:
         "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,
         "error": spread([row["off_m"] for row in right]) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": honest([row["off_m"] for row in own], [(row["var_east_m2"], row["var_north_m2"]) for row in own], 0.0)
-        if own
-        else None,
+        "within": honest([row["off_m"] for row in own], [row["variances_m2"] for row in own], 0.0) if own else None,
     }
 
 

@@ -8,8 +8,7 @@ set has queries with a ground truth, these are asked as they are.
 
 The network sees one of 5x5 crops at a time, as the network of the thesis does (3.2.1), and a frame's score is the mean
 over its crops; so the labels of frames teach what a crop is worth. It is a logistic regression on eight statistics of a
-crop: a convolutional network of 6,000 weights was worse at the changed pictures of every site
-that it had not seen.
+crop: a convolutional network of 6,000 weights was worse at the changed pictures of every site that it had not seen.
 """
 
 import sys
