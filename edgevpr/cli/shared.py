@@ -153,7 +153,9 @@ def _worded(value: Any) -> str:
         return ", ".join(map(_worded, value))
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return str(value)
 
 
 def report(*sentences: str) -> None:
