@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
+    add_known,
     add_parameters,
     command,
     config_of,
@@ -50,6 +51,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
+    add_known(parser)
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
     add_keys(parser, "source.camera", "source.fov_deg", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
@@ -155,6 +157,8 @@ def _plan(args: Namespace) -> "EvaluationPlan":
     if args.sets:
         if args.data or args.query or args.ref or args.rate_hz:
             raise UsageError("--sets names all sets: leave --data, --query, --ref and --rate-hz out.")
+        if args.known:
+            raise UsageError("--sets says of each row what is known (`known: heading,height`): leave --known out.")
         return read_plan(args.sets)
     if not (args.data or (args.query and args.ref)):
         raise UsageError(
@@ -204,6 +208,7 @@ def _rows(args: Namespace) -> "dict[str, RowPlan]":
             sequence=match.sequence,
             exact=args.exact,
             follow=args.follow,
+            known=args.known,
         )
         for offer in offers(wanted, forms, settings)
     }

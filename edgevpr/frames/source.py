@@ -139,6 +139,14 @@ class FolderSource(RecordingSource):
         return tagged(image, name, self._clock(), self._tags.get(name) or read_exif(path))
 
 
+def tags_of(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
+    """Read what a `FolderSource` says of each image of a folder beside its picture, by path; `positions` is the
+    source's. Raises UsageError for an unusable table."""
+    csv_path = positions or find_positions(folder)
+    tags = read_positions(csv_path) if csv_path else {}
+    return {path: tags.get(decoded_name(path.name)) or read_exif(path) for path in list_images(folder)}
+
+
 def open_source(
     uri: str,
     *,

@@ -12,8 +12,10 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.positions import GeoTag
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
+from edgevpr.lab.evaluate.knowing import NO_TAG, Known
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
@@ -36,12 +38,14 @@ class MatchOptions:
     """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
     flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
     are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
+    `known`: what each is told beside its picture, such as "heading,height" (None: nothing, see `hints.Told`).
     """
 
     candidates: int | None = bounded(1, 1_000_000, default=None)
     sequence: int | None = bounded(1, 100, default=None)
     exact: bool = False
     follow: bool = False
+    known: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +77,8 @@ class QueryAnswer:
 
 class Walk:
     """A recogniser that is open on a map and set up by `options`, for asking one query after another. `length` is the
-    number of queries that are matched together. `is_in_order` is True if an answer depends on the queries before it."""
+    number of queries that are matched together. `is_in_order` is True if an answer depends on the queries before it.
+    `known` is what `options.known` says of each query."""
 
     def __init__(
         self,
@@ -84,7 +89,9 @@ class Walk:
         *,
         options: MatchOptions,
         gate: Gate | None = None,
+        known: Known = Known(),  # noqa: B008  it is frozen
     ) -> None:
+        self.known = known
         self.length = length_of(technique.spec, options.sequence)
         rule = accept_rule(technique, load_config(None).match, self.length, calibration_of(place_map))
         follows = options.follow and self.length == 1 and rule.sure is not None
@@ -97,6 +104,7 @@ class Walk:
                 meter,
                 WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
                 preparation=Preparation(gate=gate),
+                prior=known.prior(technique.spec),
                 follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
             )
 
@@ -142,14 +150,23 @@ def answers(walk: Walk, dataset: Dataset, progress: Progress[Path]) -> Iterator[
     if walk.is_in_order:  # those that are not scored are part of a sequence as well
         paths = list_images(paths[0].parent)
     for path in progress(paths, len(paths), f"{recogniser.technique.spec.name}: queries"):
-        event = asked(recogniser, path)
+        event = asked(recogniser, path, walk.known.tags.get(path, NO_TAG))
         if query := scored.get(path.name):
             yield answer_of(event, query, dataset.references, recogniser.index)
 
 
-def asked(recogniser: Recogniser, path: Path) -> Recognition:
-    """Recognise the image `path`. Raises ModelError if that fails: figures without some queries would mislead."""
-    event = recogniser.step(Frame(image=read_image(path), name=path.name, t_mono_s=0.0))  # without gaps in time
+def asked(recogniser: Recogniser, path: Path, tag: GeoTag = NO_TAG) -> Recognition:
+    """Recognise the image `path`, of which `tag` is known. Raises ModelError if that fails: figures without some
+    queries would mislead."""
+    frame = Frame(
+        image=read_image(path),
+        name=path.name,
+        t_mono_s=0.0,  # without gaps in time
+        position=tag.position,
+        heading_deg=tag.heading_deg,
+        height_m=tag.height_m,
+    )
+    event = recogniser.step(frame)
     if event.failed:
         raise ModelError(event.reason)
     return event

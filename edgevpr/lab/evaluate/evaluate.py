@@ -21,6 +21,7 @@ from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers
 from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.evaluate.knowing import known_of
 from edgevpr.lab.evaluate.metrics import Quality, figures
 from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
 from edgevpr.mapmaking.mapping import build_map
@@ -30,6 +31,7 @@ from edgevpr.places.sequence import length_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.hints import told_parts
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, labelled
@@ -45,9 +47,9 @@ class TechniqueResult(Quality):
     `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1 (5.1).
     `descriptor_bytes` is the RAM of a place, `fine_bytes` the size of its fine part on disk. Charges are for all
     queries, in Ah: `ah_total` (5.7) from the battery pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V;
-    `ah_assumes` names board, pack and efficiency. `sequence`: how many queries were matched together. `weights`:
-    origin of the network's weights (None: no network). `pcu` and `t_encode_max_s`: filled in by `compare`, since they
-    depend on all techniques compared.
+    `ah_assumes` names board, pack and efficiency. `sequence`: how many queries were matched together. `known`: that of
+    `MatchOptions`. `weights`: origin of the network's weights (None: no network). `pcu` and `t_encode_max_s`: filled in
+    by `compare`, since they depend on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
@@ -65,6 +67,7 @@ class TechniqueResult(Quality):
     ah_total_cpu_rail: float
     ah_assumes: str
     sequence: int = 1
+    known: str | None = None
     discarded: int = 0
     weights: str | None = None
     pcu: float | None = None
@@ -92,7 +95,7 @@ def evaluate(
     """
     technique = create(technique_name, parameters)
     found = answered(technique, dataset, options, progress, gate)
-    return summary(technique, len(dataset.references), found, length_of(technique.spec, options.sequence))
+    return summary(technique, len(dataset.references), found, options)
 
 
 def answered(
@@ -102,11 +105,13 @@ def answered(
     progress: Progress[Any] = quietly,
     gate: Gate | None = None,
 ) -> list[QueryAnswer]:
-    """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers."""
+    """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers. Raises
+    UsageError where no query has what `options.known` asks for."""
+    known = known_of(options.known, dataset, technique.spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), own_meter()
     frames = progress(all_frames(source), source.total, f"{technique.spec.name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
-        walk = Walk(technique, place_map, index, meter, options=options, gate=gate)
+        walk = Walk(technique, place_map, index, meter, options=options, gate=gate, known=known)
         walk.warm_up(dataset.queries[0].path)
         return list(answers(walk, dataset, progress))
 
@@ -191,10 +196,13 @@ def all_frames(source: Source) -> Iterator[Frame]:
 
 
 def summary(
-    technique: Technique, references: int, answers: Sequence[QueryAnswer], sequence: int = 1
+    technique: Technique,
+    references: int,
+    answers: Sequence[QueryAnswer],
+    options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
 ) -> TechniqueResult:
-    """Return the result of `technique`, without the PCU, from its answers to all queries. `references` is the number of
-    references, `sequence` the number of queries that were matched together."""
+    """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
+    `options`. `references` is the number of references."""
     queries = len(answers)
     scores = np.array([answer.score for answer in answers])
     ranks = np.array([answer.first_right for answer in answers])
@@ -226,7 +234,8 @@ def summary(
         u_match=u_match,
         ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
         ah_total_cpu_rail=queries_ah(queries, rail_ah(query_j)),
-        sequence=sequence,
+        sequence=length_of(technique.spec, options.sequence),
+        known=options.known and ",".join(told_parts(options.known)),
         ah_assumes=(
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"

@@ -22,10 +22,10 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Position
-from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import Footprint, footprint, shared
-from edgevpr.frames.positions import GeoTag, find_positions, read_positions
+from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.source import tags_of
 from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, load_dataset, names_in
 from edgevpr.lab.evaluate.numbered import read_numbered
 from edgevpr.lab.evaluate.videos import side_of, without_position
@@ -120,10 +120,7 @@ def _utm_m(path: Path) -> tuple[float, float]:
 
 def _tagged(folder: Path) -> Tags:
     """Return the tags of the pictures of a folder that have a position."""
-    csv_path = find_positions(folder)
-    known = read_positions(csv_path) if csv_path else {}
-    tags = ((path, known.get(path.name) or read_exif(path)) for path in list_images(folder))
-    return {path: tag for path, tag in tags if tag.position}
+    return {path: tag for path, tag in tags_of(folder).items() if tag.position}
 
 
 def _offsets_m(tags: Tags, origin: Position) -> Doubles:

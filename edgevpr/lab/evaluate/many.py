@@ -27,9 +27,9 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.asking import Progress, QueryAnswer
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, answered, compare, from_json, summary
+from edgevpr.lab.evaluate.knowing import lacking
 from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 from edgevpr.lab.evaluate.provenance import key_of, machine, stamp, today, versions
-from edgevpr.places.sequence import length_of
 from edgevpr.techniques import create
 
 CURVE_TO = 25  # the largest K of the curve of recall@K
@@ -122,15 +122,18 @@ def _rows_on_sets(plan: EvaluationPlan, sets: dict[str, Dataset], folder: Path, 
     code = [stamp(path) for path in sorted(Path(edgevpr.__file__).parent.rglob("*.py"))]
     for name, dataset in sets.items():
         truth = [(query.path.name, sorted(query.right), sorted(query.ignored)) for query in dataset.queries]
-        places = [path for path in (find_positions(dataset.ref_dir),) if path]
-        asked = list_images(dataset.queries[0].path.parent)
+        query_dir = dataset.queries[0].path.parent
+        places, asked = filter(None, map(find_positions, (dataset.ref_dir, query_dir))), list_images(query_dir)
         pictures = [stamp(path) for path in (*places, *list_images(dataset.ref_dir), *asked)]
         for label, row in plan.rows.items():
             settings = row.settings(plan.sets[name].camera)
             try:
                 spec = create(row.technique, settings).spec
+                why = lacking(row.known, dataset, spec, row.sequence)
             except ModelError as error:  # a network that cannot be used stops no other row
-                failed[name, label] = str(error)
+                why = str(error)
+            if why:
+                failed[name, label] = why
                 continue
             who = [spec.name, spec.parameters, spec.form, spec.model_sha256]
             key = key_of(code, versions(), pictures, truth, who, asdict(row))
@@ -168,9 +171,8 @@ def _measured(row: RowOnSet, workers: int) -> str | None:
     try:
         technique = create(row.row.technique, row.settings)
         answers = answered(technique, row.dataset, row.row)
-        length = length_of(technique.spec, row.row.sequence)
         content = {
-            "result": asdict(summary(technique, len(row.dataset.references), answers, length)),
+            "result": asdict(summary(technique, len(row.dataset.references), answers, row.row)),
             "answers": [asdict(answer) for answer in answers],
             "made": {"date": today(), "machine": machine(), "versions": versions(), "workers": workers},
         }

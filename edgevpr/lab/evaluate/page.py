@@ -217,6 +217,7 @@ def _how(outcome: Measurements) -> str:
         f"95 %: the queries resampled {RESAMPLES} times (seed {SEED}); where all or none hit, by Clopper and Pearson. "
         "Times are means over the queries, each on one thread, beside as many workers as are named. Recall "
         "counts queries whose status is ok; a match that is only loosely right counts neither way.",
+        *(f"Known of each query of {result.technique}: {result.known}." for result in results if result.known),
         *(f"mAh: {result.ah_assumes}." for result in results),
         *(f"Weights of {result.weights}." for result in results if result.weights),
     ]

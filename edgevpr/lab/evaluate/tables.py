@@ -72,6 +72,7 @@ def results_text(results: Sequence[TechniqueResult]) -> str:
         f"{first.queries} queries scored against {first.references} references; times are means over the queries.",
         _on_figures(first),
         *([f"Matched in sequences of queries: {', '.join(sequences)}."] if sequences else []),
+        *(f"Known of each query of {each.technique}: {each.known}." for each in results if each.known),
         *(_discarded(each) for each in results if each.discarded),
         "accepted: queries that would have moved the aircraft, by the technique's own rule.",
         f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {1000 * (first.t_encode_max_s or 0):.1f} ms.",

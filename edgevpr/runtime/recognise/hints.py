@@ -1,20 +1,27 @@
 """Hints for a query beside its picture: where the aircraft can be, its heading, and the height it flies at. They narrow
 the recogniser's search of the map.
 
-No hint is ever the only way to find a place: a compass may be wrong and a satellite position false. A query that is not
-accepted with hints is therefore followed by one without.
+In flight no hint is ever the only way to find a place: a compass may be wrong and a satellite position false. A query
+that is not accepted with hints is therefore followed by one without (`Prior`). Recorded queries that are measured need
+not follow each other: each is asked with what is said to be known of it (`Told`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from edgevpr.core.contract import nearest_height
+from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.types import Candidate, Frame, Position, Vehicle
+from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
+from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expectation
 
+TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
+TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _FIX_GOOD_FOR_S = 60.0
+# Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
+_NEEDED = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +85,8 @@ class Prior:
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
         reach = self._reach(frame.t_mono_s, vehicle, margin_m)
-        if reach and not 0 < index.within(reach.position, reach.radius_m).sum() < len(index):
-            reach = None
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
-        if self._heading_within_deg is None or not index.knows_headings:
-            heading_deg = None
-        self._known = None if reach is None and heading_deg is None else Hints(reach, heading_deg)
+        self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None
 
     def _reach(self, now_s: float, vehicle: Vehicle | None, margin_m: float) -> Reach | None:
@@ -116,6 +119,74 @@ class Prior:
             self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
             self._last_fix = found.place.position, t_mono_s
+
+
+class Told:
+    """Makes the hints for each recorded query from its own frame, whatever became of the query before. `known` are
+    members of `TOLD`; what a frame lacks of them is not known of this query. `looks_again` and `height_ratio` are those
+    of `Prior`, for the query of the last `hints`.
+
+    `heading_within_deg` is that of `Prior`. `map_height_m` is the height at which the map was made, metres. None: it or
+    the heights of all queries are unknown, and `height` says that each was taken at the map's height.
+    """
+
+    def __init__(
+        self, known: Collection[str], heading_within_deg: float | None, map_height_m: float | None = None
+    ) -> None:
+        self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
+        self.height_ratio = 1.0
+        self.looks_again = True
+
+    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
+        """Return the hints for a frame, as `Prior.hints` does. The aircraft is within `TOLD_REACH_M` metres of its
+        recorded position; `vehicle` and `margin_m`, which are those of a flight, do not count."""
+        ratio: float | None = 1.0
+        if self._map_height_m is not None:
+            ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
+        self.looks_again = "height" not in self._known or ratio is None
+        self.height_ratio = 1.0 if self.looks_again else ratio or 1.0
+        uses_heading = "heading" in self._known and self._heading_within_deg is not None
+        reach = Reach(frame.position, TOLD_REACH_M) if "reach" in self._known and frame.position else None
+        return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
+
+    def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
+        """Learn nothing: the next query is another flight's."""
+
+
+def told_parts(text: str | None) -> tuple[str, ...]:
+    """Read "height,heading" as members of `TOLD`, in their order; None as none. Raises UsageError for another text."""
+    names = [] if text is None else [name.strip() for name in text.split(",")]
+    if unknown := [name for name in names if name not in TOLD]:
+        raise UsageError(f"`known` names `{unknown[0]}`: use some of {', '.join(TOLD)}, with commas between them.")
+    return tuple(name for name in TOLD if name in names)
+
+
+def lacking(
+    known: Collection[str],
+    queries: Collection[GeoTag],
+    places: Collection[GeoTag] | Collection[Place],
+    sequence: int,
+) -> str | None:
+    """Return a sentence on why no query can be asked with what is `known` (see `Told`); None if some can. `sequence` is
+    the number of queries that are matched together."""
+    # A place that a hint kept out of one query of a sequence would count as compared and unlike it.
+    if known and sequence > 1:
+        return f"{sequence} queries are matched together, and what is known narrows only single ones: leave one out."
+    for part, (field, columns) in _NEEDED.items():
+        for name, of in (("query", queries), ("place", places)):
+            if part in known and all(getattr(each, field) is None for each in of):
+                return f"No {name} has what `{part}` needs: write {columns} into positions.csv, or leave `{part}` out."
+    return None
+
+
+def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
+    """Return what narrows a search of the index; None if nothing does. An area that contains all places or none does
+    not, nor does a heading if the index knows no headings."""
+    if reach and not 0 < index.within(reach.position, reach.radius_m).sum() < len(index):
+        reach = None
+    if not index.knows_headings:
+        heading_deg = None
+    return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
 
 
 def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:

@@ -23,7 +23,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification, landmarks_of
 from edgevpr.runtime.recognise.evidence import evidence_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
-from edgevpr.runtime.recognise.hints import Prior, expected_of, other_heights
+from edgevpr.runtime.recognise.hints import Prior, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
     NEW_FOR_S,
     AcceptRule,
@@ -97,7 +97,7 @@ class Recogniser:
         settings: WalkSettings = WalkSettings(),
         *,
         preparation: Preparation = Preparation(),
-        prior: Prior | None = None,
+        prior: Prior | Told | None = None,
         follower: Follower | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
@@ -197,10 +197,10 @@ class Recogniser:
         """Search for a query as expected and, if nothing is accepted, at all other heights. Returns as `_judged`
         does."""
         prior, spec, search = self._prior, self.technique.spec, self.search
-        height_ratio = prior.height_ratio if prior else 1.0
         if prior:
             margin_m = max(self.accuracy_m, self.rule.neighbour_m)
             event.hints = prior.hints(seen_as(frame, picture.view), event.vehicle, self.index, margin_m)
+        height_ratio = prior.height_ratio if prior else 1.0
         expected = expected_of(event.hints, height_ratio, self.index)
         ranking = self._look(descriptor, expected)
         if search:

@@ -1,0 +1,121 @@
+"""What is known of a query beside its picture: `eval` and `match` with --known."""
+
+import json
+
+import cv2
+import pytest
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.runtime.recognise.hints import TOLD_REACH_M
+
+pytestmark = pytest.mark.slow
+
+PLACES = 6
+A_METRE_DEG = 1 / 111_195  # of latitude
+
+
+def picture(place, height_ratio):
+    middle_px = round(384 * height_ratio / 2)
+    seen = textured(place, 800, 800)[400 - middle_px : 400 + middle_px, 400 - middle_px : 400 + middle_px]
+    return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_LINEAR)
+
+
+def make(folder, turned_deg=(None,) * PLACES, height_m=(None,) * PLACES, height_ratio=1.0, places_known=True):
+    """A set of places 200 m apart, mapped from 100 m, and a query over each. `turned_deg` is what positions.csv says
+    of the heading of each query, truly that of its place, less that of the place; None: nothing."""
+    rows, truth = ["file,lat,lon,yaw_deg,height_m"], ["query_file,ref_files"]
+    for side in ("query", "ref"):
+        (folder / side).mkdir(parents=True)
+    for place in range(PLACES):
+        where = f"{50 + 200 * place * A_METRE_DEG:.7f},8"
+        cv2.imwrite(str(folder / "ref" / f"r{place}.png"), picture(place, 1.0))
+        cv2.imwrite(
+            str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(picture(place, height_ratio), alpha=0.8)
+        )
+        rows.append(f"r{place}.png,{where},{50 * place},100" if places_known else f"r{place}.png,,,,")
+        turned, height = turned_deg[place], height_m[place]
+        rows.append(f"q{place}.png,{where},{'' if turned is None else 50 * place + turned},{height or ''}")
+        truth.append(f"q{place}.png,r{place}.png")
+    (folder / "positions.csv").write_text("\n".join(rows) + "\n")
+    (folder / "ground_truth.csv").write_text("\n".join(truth) + "\n")
+    return folder
+
+
+def run_json(capsys, *argv):
+    assert main([*map(str, argv), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def evaluated(capsys, folder, *argv):
+    flags = ("--data", folder, "--techniques", "cohog", "--camera", "nadir")
+    return run_json(capsys, "eval", *flags, *argv)["techniques"]["cohog"]
+
+
+def refused(capsys, *argv):
+    """The one sentence with which a command fails as wrong usage does."""
+    assert main([str(word) for word in argv]) == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_heading_rules_out_other_rotations_of_each_query_by_itself(capsys, tmp_path):
+    folder = make(tmp_path / "set", turned_deg=(90, 90, 90, 0, 0, None))
+    without = evaluated(capsys, folder)
+    assert (without["known"], without["accepted"]) == (None, PLACES)
+    told = evaluated(capsys, folder, "--known", "heading")
+    assert (told["known"], told["accepted"], told["accepted_wrong"]) == ("heading", 3, 0)
+
+
+def test_a_height_is_that_of_the_table_else_that_of_the_map(capsys, tmp_path):
+    low = make(tmp_path / "low", height_ratio=0.5)
+    assert evaluated(capsys, low)["accepted"] == PLACES
+    assert evaluated(capsys, low, "--known", "height")["accepted"] == 0
+    tagged = make(tmp_path / "tagged", height_ratio=0.5, height_m=(50, 50, 50, 100, 100, None))
+    assert evaluated(capsys, tagged, "--known", "height")["accepted"] == 4, "of one query no height is known"
+
+
+def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
+    folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
+    path = tmp_path / "m.gpkg"
+    build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
+    assert main([str(word) for word in build]) == 0
+    capsys.readouterr()
+    match = ("match", path, "--images", folder / "query")
+    without = run_json(capsys, *match)
+    assert all(each["accepted"] and "hints" not in each for each in without)
+    found = run_json(capsys, *match, "--known", "reach, heading")
+    assert [each["hints"]["heading"] for each in found] == [True] * 5 + [False]
+    assert {each["hints"]["reach_m"] for each in found} == {TOLD_REACH_M}
+    assert [each["accepted"] for each in found] == [True] * 3 + [False, False, True]
+    bare = make(tmp_path / "bare")
+    assert "yaw_deg" in refused(capsys, "match", path, "--images", bare / "query", "--known", "heading")
+
+
+@pytest.mark.parametrize(
+    ("known", "places_known", "more", "said"),
+    [
+        ("heading", True, (), "No query has what `heading` needs: write yaw_deg into positions.csv"),
+        ("height,reach", False, (), "No place has what `reach` needs: write lat and lon"),
+        ("height,speed", True, (), "`known` names `speed`: use some of heading, height, reach"),
+        ("height", True, ("--sequence", "2"), "2 queries are matched together"),
+    ],
+)
+def test_what_cannot_be_known_gets_a_sentence(capsys, tmp_path, known, places_known, more, said):
+    folder = make(tmp_path / "set", places_known=places_known)
+    assert said in refused(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)
+
+
+@pytest.mark.process
+def test_a_plan_says_of_each_row_what_is_known_and_a_set_that_lacks_it_stops_no_other(capsys, tmp_path):
+    make(tmp_path / "set")
+    (tmp_path / "plan.yaml").write_text(
+        "sets: {set: {folder: set, camera: nadir}}\n"
+        "rows: {low: {technique: cohog, known: height}, turned: {technique: cohog, known: heading}}\n"
+    )
+    words = ["eval", "--sets", tmp_path / "plan.yaml", "--out", tmp_path / "out", "--workers", "1"]
+    assert "of each row" in refused(capsys, *words, "--known", "reach")
+    assert main([str(word) for word in words]) == 1
+    assert "set, turned was not measured: No query has what `heading` needs" in capsys.readouterr().err
+    (row,) = json.loads((tmp_path / "out" / "results.json").read_text())["results"]
+    assert (row["row"], row["known"]) == ("low", "height")
+    assert "Known of each query of low: height." in (tmp_path / "out" / "index.html").read_text()
