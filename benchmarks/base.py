@@ -23,8 +23,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path.append(str(REPOSITORY / "tests"))  # the tests' tools: cameras on loopback, large maps, flights as processes
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
-TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28")
-FROM_THE_AIR = ("aerial_", "kite_")  # how the names of such sets begin
+TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash")
+FROM_THE_AIR = ("aerial_", "kite_", "sat_")  # how the names of such sets begin
 Row = dict[str, Any]
 
 
@@ -138,6 +138,11 @@ def find_sets(data: Path = DATA, names: Iterable[str] | None = None, camera: str
         what = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
         raise UsageError(f"There are {what} in {data}: name the right folder with EDGEVPR_DATA.")
     return [folder for name, folder in found.items() if name in wanted and camera in (None, camera_of(name))]
+
+
+def registered() -> list[Path]:
+    """Return the folders of the sets from the air whose pictures were laid on each other (pairs_overlap.csv)."""
+    return [folder for folder in find_sets(camera="nadir") if (folder / "pairs_overlap.csv").exists()]
 
 
 def edgevpr(*arguments: object) -> Any:

@@ -43,7 +43,7 @@ class Pictures:
 
 
 def main() -> None:
-    rows = [row for folder in base.find_sets(camera="nadir") for row in measured(folder)]
+    rows = [row for folder in base.registered() for row in measured(folder)]
     found = {**base.made_by(), "rows": rows}
     base.write("height_and_tilt", found, page(found))
 

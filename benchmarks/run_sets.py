@@ -21,12 +21,17 @@ import sets_page
 import yaml
 
 from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved
 from edgevpr.core.text import progress
+from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.asking import MatchOptions
-from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate
+from edgevpr.lab.evaluate.knowing import lacking
 from edgevpr.runtime.preflight.accuracy import PATH as ACCURACY
+from edgevpr.techniques import create
 from edgevpr.techniques.session import file_sha256
 
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
@@ -35,7 +40,9 @@ JOINED_ROWS = ("cohog", "cohog, exact")
 # What is not measured, and why.
 LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
 # Rows that no board is offered: other weights, another way to match, or a comparison with everything.
-NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights")
+NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "known")
+# Of a set whose sites have no positions on Earth: where they are said to be, how far apart, and the size of a pixel.
+_FIRST_SITE, _SITES_APART_M, _PIXEL_M = (37.0, 36.0), 20_000.0, 0.5
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
 _POINTS = 100  # of a curve that is kept
 
@@ -55,6 +62,7 @@ NETWORKS = ("alexnet", "amosnet", "hybridnet", "netvlad", "rmac", "region_vlad",
 VECTORS = ("hog", "calc", *NETWORKS)
 VARIANTS = (
     Variant("cohog", "cohog"),
+    Variant("cohog, known", "cohog", options=MatchOptions(known="heading,height")),
     Variant("cohog, exact", "cohog", options=MatchOptions(exact=True)),
     Variant("cohog, thesis", "cohog", {"matching": "thesis"}, MatchOptions(exact=True)),
     Variant("cohog, followed", "cohog", options=MatchOptions(follow=True)),
@@ -81,6 +89,12 @@ def main(argv: list[str] | None = None) -> None:
     wanted = find_variants(args.variants.split(";") if args.variants else None)
     args.out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
+        folders = [
+            folder
+            if not (folder / "sites.csv").exists()
+            else placed(folder, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-placed-"))))
+            for folder in folders
+        ]
         from_the_air = [folder for folder in folders if base.camera_of(folder.name) == "nadir"]
         if len(from_the_air) > 1:
             folders.append(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-joined-"))) / JOINED)
@@ -99,6 +113,23 @@ def main(argv: list[str] | None = None) -> None:
     if args.out.resolve() == base.RESULTS:  # figures of other sets, or of a trial, do not travel
         write_accuracy(sets_page.read_sets(args.out))
     sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
+
+
+def placed(folder: Path, work: Path) -> Path:
+    """Make a copy in `work` of a set that says in sites.csv where its pictures lie in those of their sites. It gets a
+    positions.csv: within a site positions are true to the pixel, where the sites lie on Earth is invented."""
+    out, sites, tags = work / folder.name, [], {}
+    out.mkdir()
+    for name in ("query", "ref", "ground_truth.csv"):
+        (out / name).symlink_to((folder / name).resolve())
+    for row in base.read_csv(folder / "sites.csv"):
+        if row["site"] not in sites:
+            sites.append(row["site"])
+        site = moved(*_FIRST_SITE, _SITES_APART_M * sites.index(row["site"]), 0.0)
+        position = Position(*moved(*site, _PIXEL_M * float(row["x_px"]), -_PIXEL_M * float(row["y_px"])))
+        tags[row["file"]] = GeoTag(position=position, heading_deg=float(row["yaw_deg"]))
+    write_positions(out / "positions.csv", tags)
+    return out
 
 
 def join(folders: list[Path], out: Path) -> None:
@@ -140,6 +171,8 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
     rows: dict[str, Any] = base.read(path.stem, path.parent).get("techniques", {})
+    if not (wanted := [variant for variant in wanted if can_be_asked(variant, folder, dataset)]):
+        return
     for variant in wanted:
 
         def shown(items, total, label, variant=variant):
@@ -158,6 +191,12 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
     content["techniques"] = {row["technique"]: row for row in in_order}
     base.write_json(path.stem, content, path.parent)
+
+
+def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
+    """Return True if a set says what a variant is told of each query."""
+    known, sequence = variant.options.known, variant.options.sequence
+    return not (known and lacking(known, dataset, create(variant.technique, settings(variant, folder)).spec, sequence))
 
 
 def thinned(curve: list[tuple[float, float]]) -> list[tuple[float, float]]:

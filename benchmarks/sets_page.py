@@ -19,7 +19,9 @@ _NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame", " candidates")
 _ABOUT = """\
 `cohog` is as it flies: a scan of 144 bytes a place (looking down 200), then the displacement vote over the best places;
 in the aerial sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24 rotations of the
-query). *aerial_joined* is all sets from the air as one map, those that were tuned on too. `cohog, exact` votes over all
+query). `cohog, known` is told heading and height of every query (`--known heading,height`), where a set has headings.
+In sat_marash, tiles of pictures from space, they are exact; where its sites lie on Earth is invented. *aerial_joined*
+is all sets from the air as one map, those that were tuned on too. `cohog, exact` votes over all
 places, under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector
 is kept in half precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and
 limits of acceptance were chosen on the sets marked *tune*. Some figures of cohog were fixed after other sets had been

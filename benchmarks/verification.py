@@ -48,7 +48,7 @@ _COLUMNS = {
 
 
 def main() -> None:
-    folders, found = base.find_sets(camera="nadir"), {**base.made_by(), "sets": []}
+    folders, found = base.registered(), {**base.made_by(), "sets": []}
     asked = {each.name: [(path.name, read_image(path)) for path in list_images(each / "query")] for each in folders}
     for folder in folders:
         found["sets"].append(_of_set(folder, asked))

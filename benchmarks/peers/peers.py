@@ -29,6 +29,7 @@ from edgevpr.lab.evaluate import evaluate
 from edgevpr.techniques import create
 
 SETS = "aerial_brighton", "aerial_copr", "aerial_swindale", "kite_ochota", "grief_stromovka_seasons", "nordland_tiny"
+LEARNT_ON = "corridor", "aerial_caliterra", "aerial_garfield28"
 OURS = "cohog (edgevpr)"
 _COSTS = {
     "t_e ms": "{t_encode_ms:.1f}",
@@ -53,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", default=",".join(SETS), metavar="A,B")
     folders = base.find_sets(names=parser.parse_args().sets.split(","))
-    references = [path for folder in base.find_sets(names=base.TUNED_ON) for path in sorted((folder / "ref").iterdir())]
+    references = [path for folder in base.find_sets(names=LEARNT_ON) for path in sorted((folder / "ref").iterdir())]
     training = [grey(path) for path in references]
     found = {"rows": {}} | base.read("peers") | base.made_by()
     with TemporaryDirectory(prefix="edgevpr-peers-") as name:

@@ -8,6 +8,9 @@ import pytest
 import run_sets
 from pictures import textured
 
+from edgevpr.core.geodesy import distance_m
+from edgevpr.frames.positions import read_positions
+
 
 def measure(data, out, *arguments):
     run_sets.main(["--data", str(data), "--out", str(out), *arguments])
@@ -41,6 +44,24 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     assert "| technique | RAM B/place | meadow (report, 4) |" in page
     assert "| cohog | 144 | 1.00 |" in page
     assert "* grief_stromovka_monthly: five places only" in page
+
+
+def test_a_set_of_sites_gets_positions_and_what_is_known_is_measured_where_there_are_headings(tmp_path):
+    make_set(tmp_path / "data" / "meadow")
+    make_set(tmp_path / "data" / "sat_town")
+    rows = [f"{side}{n}.png,{'ab'[n // 2]},1,{240 * n},90,0" for side in ("query", "ref") for n in range(4)]
+    (tmp_path / "data" / "sat_town" / "sites.csv").write_text("\n".join(["file,site,time,x_px,y_px,yaw_deg", *rows]))
+    measure(tmp_path / "data", tmp_path / "out", "--variants", "cohog, known")
+    assert not (tmp_path / "out" / "meadow.json").exists(), "it has no headings"
+    found = json.loads((tmp_path / "out" / "sat_town.json").read_text())["techniques"]["cohog, known"]
+    assert (found["known"], found["parameters"]["camera"]) == ("heading,height", "nadir")
+
+    placed = run_sets.placed(tmp_path / "data" / "sat_town", tmp_path)
+    tags = [read_positions(placed / "positions.csv")[f"ref{n}.png"] for n in range(4)]
+    at = [(tag.position.lat_deg, tag.position.lon_deg) for tag in tags]
+    assert distance_m(*at[0], *at[1]) == pytest.approx(120, abs=0.1)
+    assert distance_m(*at[0], *at[2]) > 10_000
+    assert tags[0].heading_deg == 0
 
 
 def test_a_row_or_a_set_that_is_not_there_gets_a_sentence(tmp_path):
