@@ -164,6 +164,7 @@ class Technique(Protocol):
         mean: np.ndarray | None,
         turned_deg: np.ndarray | None = None,
         height_ratio: float | None = None,
+        in_reach: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Score all places of the index, given as `rows` (N, *row.shape). Returns the scores, float32 (N,), and the
         score of each hypothesis that `match` can try, float32 (N, H), -inf if it is ruled out (None: no choice).
@@ -171,7 +172,8 @@ class Technique(Protocol):
         `mean`: mean coarse part of the map, for a technique that packs (else None).
         `turned_deg`: expected `FineMatch.rotation_deg` of each place, float (N,), NaN: unknown. Other rotations are
         ruled out. None: nothing is expected. Given only to a technique with `spec.heading_within_deg`.
-        `height_ratio`: expected `FineMatch.height_ratio` (None: 1). Given only to one with `spec.height_ratios`."""
+        `height_ratio`: expected `FineMatch.height_ratio` (None: 1). `in_reach`, bool (N,): places that are looked at
+        closer (None: all). Both are given only to one with `spec.height_ratios`."""
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
         """Compare the query with the fine part of one place under `hypotheses` (None: all). These are numbers from 0 to

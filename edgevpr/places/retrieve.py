@@ -34,7 +34,7 @@ Glance = tuple[float, Choice]  # approximate score, and the slot with its best h
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
-_TRIED_EACH = 6  # hypotheses per place
+_TRIED_EACH = 3  # hypotheses per place
 _MANY = 3  # unreadable places in one query, from which on the file may be at fault
 # In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
 # one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
@@ -106,7 +106,7 @@ def scan(query: Query) -> Scan:
     technique, index, expected = query.technique, query.index, query.expected
     hint: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
-        hint["height_ratio"] = expected.height_ratio
+        hint |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
     return Scan(*technique.coarse_scores(query.descriptor, index.rows, index.mean, **hint))
 
 
@@ -294,21 +294,18 @@ def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, c
     """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
     (None: all), in the order of the map file, in which a memory card reads them fastest.
 
-    With `by_hypothesis` float32 (N, H) (see `Scan`), the best pairs of a place and a hypothesis are chosen instead:
-    `count` times six or, if that is less, a third of the mean number of possible hypotheses per place. One place gets
-    six hypotheses at most, or more if there are too few places.
+    With `by_hypothesis` float32 (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen
+    instead. One place gets three hypotheses at most, or more if there are too few places.
     """
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_largest(scores[slots], count))].tolist()]
-    possible = np.isfinite(by_hypothesis[slots]).sum(axis=1).mean()
-    tries = round(count * max(1.0, min(_TRIED_EACH, possible / 3)))
-    slots = slots[np.sort(_largest(scores[slots], tries))]
+    slots = slots[np.sort(_largest(by_hypothesis[slots].max(axis=1), count))]
     each = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-each, axis=1, kind="stable"), axis=1)
-    each = np.where(of_place < max(_TRIED_EACH, tries // len(slots)), each, -np.inf)
+    each = np.where(of_place < max(_TRIED_EACH, count // len(slots)), each, -np.inf)
     tried = np.zeros(each.shape, bool)
-    tried.flat[_largest(each.ravel(), tries)] = True
+    tried.flat[_largest(each.ravel(), count)] = True
     tried &= np.isfinite(each)
     return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
 

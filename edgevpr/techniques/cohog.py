@@ -4,11 +4,12 @@ A place is 31x31 overlapping blocks, also called regions, each described by the 
 uses only its *good* blocks, those of high entropy. Each of them finds its most similar block in the place. In the
 thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the
 displacement of the picture, and the score is the share of votes that agree (see `displacement`). With a forward camera
-the score of the scan counts too.
+the score of the scan counts too; with a nadir camera, one that looks straight down, how well the layouts of query and
+place agree on that displacement (see `layout`).
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
-places that are compared in full: 144 bytes with a forward camera (see `placecode`), 200 bytes with a nadir camera, one
-that looks straight down (see `placewords`).
+places that are compared in full: 144 bytes with a forward camera (see `placecode`), 1120 bytes with a nadir camera (see
+`layout`).
 """
 
 from collections.abc import Collection, Sequence
@@ -17,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask, Singles
+from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
 from edgevpr.core.errors import UsageError
-from edgevpr.techniques import placecode, placewords
+from edgevpr.techniques import layout, placecode
 from edgevpr.techniques.displacement import align, displacement, share, support
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
@@ -33,7 +34,8 @@ from edgevpr.techniques.gradients import (
     slow_patterns,
     unit_rows,
 )
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, WITHIN_QUARTER, ViewRegions, Views, hypothesis, scale_of
+from edgevpr.techniques.layout import ROTATIONS
+from edgevpr.techniques.views import HEIGHT_RATIOS, ViewRegions, Views, hypothesis, scale_of
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
@@ -50,12 +52,14 @@ _ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _MATCHINGS = ("displacement", "thesis")
-_CANDIDATES = {"forward": 42, "nadir": 50}
-# Places compared in full, those with the best `glance`. On corridor, the seasons and nordland_tiny 12 of 42, and on all
-# aerial sets and the kite joined into one map 20 of 300 pairs, find as many places as all of them compared in full (of
-# the 994 of nordland_tiny four fewer).
-_IN_FULL = {"forward": 12, "nadir": 20}
-_VOTING_BESIDE = 0.4  # share of the usual pairs (place, rotation) that vote, from another height than the map's
+# Places or, looking down, pairs of a place and a rotation.
+_CANDIDATES = {"forward": 42, "nadir": 40}
+# Places compared in full ahead, those with the best `glance`, which looks at one of so many good regions. On corridor,
+# the seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of
+# nordland_tiny four fewer).
+_IN_FULL, _GLANCE = 12, 4
+_BINS_DOWN = 8  # orientations of the regions whose patterns make a layout
+_LAYOUT_AGREES = 0.3  # agreement of the layouts of query and place at which the share of votes alone is the score
 _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
 
@@ -68,8 +72,7 @@ class CoHog:
 
     With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
     the same ground. A query is tried under hypotheses: five heights (with `matching` "thesis" one) in 24 rotations each
-    (see `views`). `words` is the name of the file of visual words. The map records all parameters but `matching`: both
-    ways of matching read the same map.
+    (see `views`). The map records all parameters but `matching`: both ways of matching read the same map.
     """
 
     w1: int = 512
@@ -79,7 +82,6 @@ class CoHog:
     entropy: str = "shannon"
     camera: str = "forward"
     matching: str = "displacement"
-    words: str = "ground_words"
 
     def __post_init__(self) -> None:
         self._require_parameters()
@@ -96,7 +98,6 @@ class CoHog:
         self._views: Views | None = None
         heights: dict[str, Any] = {}
         if self._is_nadir:
-            self._vocabulary = placewords.load(self.words)
             # The thesis's score does not tell which of two heights is right.
             whole = range(len(HEIGHT_RATIOS) * ROTATIONS)
             self._hypotheses = whole if self._votes else whole[as_it_is : as_it_is + ROTATIONS]
@@ -104,15 +105,14 @@ class CoHog:
             if self._votes:
                 heights |= {"cells": self.w1 // self.w2, "height_ratios": HEIGHT_RATIOS}
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
-        recorded = ("w1", "w2", "bins", "gt", "entropy", "camera", *(("words",) if self._is_nadir else ()))
         self.spec = TechniqueSpec(
             name="cohog",
-            parameters={key: getattr(self, key) for key in recorded},
-            coarse=PartSpec((placewords.SIDE**2,), placewords.DTYPE) if self._is_nadir else code,
+            parameters={key: getattr(self, key) for key in ("w1", "w2", "bins", "gt", "entropy", "camera")},
+            coarse=PartSpec((layout.NBYTES,), "|u1") if self._is_nadir else code,
             fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
             packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
             scan_counts=self._votes and not self._is_nadir,
-            in_full=_IN_FULL[self.camera] if self._votes else None,
+            in_full=_IN_FULL if self._votes and not self._is_nadir else None,
             **heights,
         )
 
@@ -127,15 +127,15 @@ class CoHog:
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
-        if self.camera == "nadir" and bins != placewords.BINS:
-            raise UsageError(f"cohog looking down uses {placewords.BINS} bins, which its words are of, and not {bins}.")
+        if self.camera == "nadir" and bins != _BINS_DOWN:
+            raise UsageError(f"cohog looking down uses {_BINS_DOWN} bins, and not {bins}.")
         if self.gt > 1:
             raise UsageError(f"cohog: gt is {self.gt:g}; it is a share of the largest entropy, 0 to 1.")
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good.
 
-        Returns coarse uint8 (12, 12, bins), or uint16 (100,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
+        Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
         float32 (blocks, 4 bins) and good bool (blocks,). The good regions are the rows of matrix A of thesis 6.2.3.
         """
         if self._is_nadir:
@@ -146,8 +146,8 @@ class CoHog:
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
-            at = placewords.named(self._side)
-            coarse = placewords.of_place(self._vocabulary, self._patterns(regions[at]), good.ravel()[at])
+            # In float64 a rounded number of the layout is the same on every processor.
+            coarse = layout.of_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
             coarse = np.rint(255 * placecode.grid(_middle(blocks, seen))).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -179,44 +179,41 @@ class CoHog:
         mean: Singles | None,
         turned_deg: Doubles | None = None,
         height_ratio: float | None = None,
+        in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
         """Score all places. With a forward camera `rows` are place codes uint8 (N, B), compared under shifts. With a
-        nadir camera they are words uint16 (N, 100), compared from the one of five heights that is nearest to
+        nadir camera they are layouts uint8 (N, 1120), compared from the one of five heights that is nearest to
         `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera since each place was mapped:
-        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all).
+        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Only places `in_reach`, bool
+        (N,), are looked at closer (None: all).
 
         Returns scores float32 (N,) in 0..1 and, with a nadir camera, the score of each hypothesis, float32 (N, 120): 24
         rotations from each height, -inf if not tried.
         """
-        views = self._views_of(query)
         if not self._is_nadir:
+            views = self._views_of(query)
             blocks, _ = views.blocks(1.0, 0)
             middle = placecode.seen_grid(_middle(blocks, views.seen), _middle(views.seen, views.seen))
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
             hypotheses = placecode.hypotheses(*middle, mean_grid)
             return np.clip(placecode.scan_ahead(hypotheses, rows), 0, 1), None
-        expected, needed = None, set(range(WITHIN_QUARTER))
+        expected = None
         if turned_deg is not None:
             steps = np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
-            if len(expected) and expected.min() >= 0:
-                needed = {int(turn) % WITHIN_QUARTER for near in (-1, 0, 1) for turn in np.unique(expected) + near}
-        ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
-        patterns = {turn: self.good_patterns(query, turn, ratio) for turn in sorted(needed)}
-        sides = views.side_of(ratio), self._side
-        words = placewords.of_query(self._vocabulary, patterns, WITHIN_QUARTER, sides)
-        of_ratio = placewords.scan(words, rows, expected, 1.0 if ratio == 1.0 else _VOTING_BESIDE)
+        first = HEIGHT_RATIOS.index(nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)) * ROTATIONS
+        of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, expected, in_reach)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
-        first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         scores[:, first : first + ROTATIONS] = of_ratio
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
-    def good_patterns(self, query: Descriptor, turn: int, ratio: float = 1.0) -> tuple[Singles, Ints]:
-        """Return, for the good regions of a view of the query (see `views`), their patterns, float32 (G, 20) (see
-        `slow_patterns`), and their numbers on the view's grid, int (G,). `turn` is the view's rotation in steps of 15
-        degrees, `ratio` its height ratio."""
-        view = self._views_of(query).regions(ratio, turn, self._patterns)
-        return view.regions, view.numbers
+    def _field(self, query: Descriptor, number: int, grid: layout.Grid) -> Singles:
+        """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
+        fields = self._views_of(query).fields
+        if (number, grid.side) not in fields:
+            view = self._views_of(query).regions(*hypothesis(number), self._patterns)
+            fields[number, grid.side] = layout.field(grid, view.regions, view.numbers, (view.side, self._side))
+        return fields[number, grid.side]
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
@@ -224,11 +221,17 @@ class CoHog:
         query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
         counts, and `align` refines its shift, rotation and height."""
         reference = self._reference(fine)
-        matches = {each: self._matched(self._view(query, each), reference) for each in self._tried(hypotheses)}
+        if not self._is_nadir:
+            return self._matched(self._view(query, self._hypotheses[0]), reference)
+        tried, place = self._hypotheses if hypotheses is None else hypotheses, None
+        if self._votes:
+            known = np.flatnonzero(reference.any(axis=1))
+            place = layout.field(layout.FINE, reference[known], known, (self._side, self._side))
+        matches = {each: self._matched(self._view(query, each), reference) for each in tried}
+        if place is not None:
+            matches = {each: self._laid(query, each, match, place) for each, match in matches.items()}
         best = max(matches, key=lambda each: matches[each].score)
         match = matches[best]
-        if not self._is_nadir:
-            return match
         ratio, turn = hypothesis(best)
         scale = scale_of(self._side + 1, ratio)
         match = replace(match, rotation_deg=360 * turn / ROTATIONS, height_ratio=scale)
@@ -250,22 +253,21 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score of `match` from a quarter of the good regions or, at other heights, about as many, to find
-        the places that are worth a full comparison. Returns two things: the estimated score, and a list with the number
-        of the hypothesis that reached it (None: a forward camera, which has no hypotheses)."""
-        reference = self._reference(fine)
-        scores = {}
-        for number in self._tried(hypotheses):
-            view = self._view(query, number)
-            numbers, regions = view.numbers[:: view.step], view.regions[:: view.step]
-            nearest = (regions @ reference.T).argmax(axis=1)
-            agree = share(numbers, nearest, (view.side, self._side), _VOTES_COUNT[self.camera])
-            scores[number] = agree * view.worth_at_glance
-        best = max(scores, key=lambda number: scores[number])
-        return scores[best], [best] if self._is_nadir else None
+        """Estimate the score of `match`, with a forward camera, from a quarter of the good regions, to find the places
+        that are worth a full comparison. Returns the estimated score, and None: there are no hypotheses."""
+        view, reference = self._view(query, self._hypotheses[0]), self._reference(fine)
+        numbers, regions = view.numbers[::_GLANCE], view.regions[::_GLANCE]
+        nearest = (regions @ reference.T).argmax(axis=1)
+        return share(numbers, nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
 
-    def _tried(self, hypotheses: Sequence[int] | None) -> Sequence[int]:
-        return hypotheses if hypotheses is not None and self._is_nadir else self._hypotheses
+    def _laid(self, query: Descriptor, number: int, match: FineMatch, place: Singles) -> FineMatch:
+        """Return a match under the hypothesis `number` with its score times how well the layout of the query agrees
+        with that of the place, `place` (C, n, n), on the shift of the match."""
+        if match.shift_cells is None:
+            return match
+        dx, dy = match.shift_cells
+        laid = layout.agreement(self._field(query, number, layout.FINE), place, (dx / self._side, dy / self._side))
+        return replace(match, score=min(1.0, match.score * laid / _LAYOUT_AGREES))
 
     def _reference(self, fine: Bytes) -> Singles:
         """Restore the blocks of a place from its stored `fine` part, which holds their square roots, as vectors that

@@ -17,19 +17,14 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Ints, Mask, Singles
 from edgevpr.core.contract import Picture
-from edgevpr.techniques.placewords import QUARTERS, turned_blocks
+from edgevpr.techniques.layout import ROTATIONS
 
 # Each is about 1.4 times the one before: the votes of a view still agree where the height is 1.2 times off.
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
-ROTATIONS = 24  # 15 degrees apart
+QUARTERS = 4
 WITHIN_QUARTER = ROTATIONS // QUARTERS
-# A glance takes one of so many good regions, if a view has as many as that from the mapped height. A larger view needs
-# more of them, since each region shows less of a place.
-_GLANCE = {0.5: 4, 0.7: 4, 1.0: 4, 1.42: 2, 2.0: 2}
 _BY_CHANCE = 0.72  # the share that agrees by chance falls with this power of the number of regions
 _LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
-# At a glance the views differ less by how many regions they have than by the room that their votes scatter in.
-_GLANCE_BY_CHANCE = {0.5: 0.53, 0.7: 0.73, 1.0: 1.0, 1.42: 1.8, 2.0: 2.4}
 
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of a
 # number of pixels. Returns blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
@@ -40,15 +35,12 @@ Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 class ViewRegions:
     """The good regions of a view, to be compared with a place: their `numbers` int (G,), row by row on a grid of `side`
     x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `worth`: factor by which the share
-    of agreeing votes is multiplied to give the score (see above). For the estimate by `CoHog.glance` only every
-    `step`-th region votes, and the factor is `worth_at_glance`."""
+    of agreeing votes is multiplied to give the score (see above)."""
 
     numbers: Ints
     regions: Singles
     side: int
     worth: float
-    step: int
-    worth_at_glance: float
 
 
 def hypothesis(number: int) -> tuple[float, int]:
@@ -80,6 +72,7 @@ class Views:
         self._encoded = {(1.0, 0): square}
         self._scaled: dict[float, tuple[Array, Array]] = {}
         self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
+        self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
@@ -109,8 +102,6 @@ class Views:
             regions=described(blocks[good]),
             side=side,
             worth=worth,
-            step=max(1, round(_GLANCE[ratio] * (len(good) / self._side) ** 2)),
-            worth_at_glance=_GLANCE_BY_CHANCE[ratio],
         )
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
@@ -135,3 +126,17 @@ class Views:
             grey = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
             allowed = cv2.warpAffine(allowed, matrix, (side, side), flags=cv2.INTER_NEAREST)
         return grey, allowed.astype(bool), cell_px
+
+
+def turned_blocks(blocks: Singles, quarters: int) -> Singles:
+    """Turn the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
+    orientations must be a multiple of 4. The result equals the blocks of the turned picture, but for rounding."""
+    for _ in range(quarters % QUARTERS):
+        blocks = np.rot90(_turned_block(blocks))
+    return np.ascontiguousarray(blocks)
+
+
+def _turned_block(blocks: Singles) -> Singles:
+    """Turn each of the blocks (..., 4 L) counter-clockwise by a quarter turn; orientations turn from x to y (down)."""
+    cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
+    return np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1).reshape(blocks.shape)

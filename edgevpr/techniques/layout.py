@@ -1,0 +1,222 @@
+"""The coarse stage of `cohog` for a camera that looks straight down: a place is the *layout* of its structures.
+
+The patterns of a picture's good regions (see `slow_patterns`) are averaged in the cells of a square grid. What the
+cells around have in common is subtracted: it tells of the light and of the kind of ground, but not of the place. The
+square root of each cell's strength is kept, so that a few strong edges do not decide alone. Such a field of vectors
+changes less over the seasons than single regions do, since a cell holds many of them.
+
+A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift by whole cells under which
+enough of the place is covered. The score is the correlation of the two fields where they overlap, divided by what two
+independent fields of that strength would scatter by, so that small and large overlaps compare.
+
+There are two grids. All places are compared by the coarse one, under every second rotation. Only the pairs of a place
+and a rotation that come out best are compared by the fine one. A place keeps both in RAM, in 4 bits a number.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from edgevpr.core.arrays import Array, Bools, Bytes, Ints, Singles
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A grid of `side` x `side` cells over a place, and the numbers of the `channels`, those of the patterns that are
+    averaged: the ones that vary most from cell to cell."""
+
+    side: int
+    channels: tuple[int, ...]
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers the field of a place has."""
+        return self.side**2 * len(self.channels)
+
+
+COARSE = Grid(8, (0, 1, 2, 3, 4, 7, 8, 13))
+FINE = Grid(12, (0, 1, 2, 3, 4, 7, 8, 9, 12, 13, 15, 17))
+NBYTES = (COARSE.numbers + FINE.numbers) // 2  # of a place
+ROTATIONS = 24
+_AROUND = 0.25  # standard deviation of what counts as around a cell, as a share of the place's side
+_LEAST_SEEN = 0.1  # share of a cell that good regions must cover
+_LEAST_STRENGTH = 0.01  # of a cell; weaker ones are noise
+_LEVELS = 7  # of a stored number, on either side of 0
+_LARGEST_KEPT = 99  # percentile of a place's numbers that becomes the highest level
+_LEAST_OVERLAP = {8: 0.43, 12: 0.35}  # share of the place that the query covers, by the side of the grid
+_LEAST_OF_LARGER = 0.75  # the same, for a query that shows more ground than a place
+_LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_LOOKED_CLOSER = 3000  # pairs of a place and a rotation that are compared by the fine grid
+_ROWS_AT_ONCE = 512
+_TINY = 1e-9
+
+# Gives the field of the query under a rotation, in steps of 15 degrees, on a grid.
+Fields = Callable[[int, Grid], Singles]
+
+_NOTHING = 0x88  # a byte of two numbers that are 0
+
+# The two numbers of each byte, the low half first.
+_HALVES = np.stack(np.divmod(np.arange(256), 16)[::-1], axis=1).astype(np.float32) - (_LEVELS + 1)
+
+
+def field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) -> Array:
+    """Lay the patterns of good regions on a grid. `patterns` (G, 20) are those of the regions with these `numbers`, int
+    (G,), row by row of `sides[0]` x `sides[0]` regions; a place has `sides[1]` along a side, and the same middle.
+    Returns the field (C, m, m) of C channels. m is `grid.side` or, for a picture of more ground, larger by an even
+    number."""
+    side, of_place = sides
+    whole = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
+    whole[numbers, :-1] = patterns[:, grid.channels]
+    whole[numbers, -1] = 1
+    pooled = _both_ways(_pooling(side, of_place, grid.side), whole.reshape(side, side, -1).transpose(2, 0, 1))
+    values, weight = pooled[:-1], pooled[-1]
+    values = values - weight * (values.sum(axis=(1, 2)) / max(float(weight.sum()), _TINY))[:, None, None]
+    near = _near(len(weight), _AROUND * grid.side)
+    values -= weight * _both_ways(near, values) / np.maximum(_both_ways(near, weight), _TINY)
+    values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _LEAST_STRENGTH))
+    values *= weight > _LEAST_SEEN
+    return values
+
+
+def of_place(patterns: Array, good: Bools, side: int) -> Bytes:
+    """Return the coarse part of a place, uint8 (NBYTES,), from the patterns (side * side, 20) of all its regions, of
+    which those are used that are `good`, bool (side * side,)."""
+    numbers = np.flatnonzero(good)
+    stored = []
+    for grid in (COARSE, FINE):
+        values = field(grid, patterns[numbers], numbers, (side, side)).ravel()
+        largest = max(float(np.percentile(np.abs(values), _LARGEST_KEPT)), _TINY)
+        levels = np.clip(np.rint(values * (_LEVELS / largest)), -_LEVELS, _LEVELS).astype(np.uint8) + (_LEVELS + 1)
+        stored.append(levels[::2] | levels[1::2] << 4)
+    packed: Bytes = np.concatenate(stored).astype(np.uint8)
+    return packed
+
+
+def scan(fields: Fields, rows: Bytes, expected: Ints | None = None, likely: Bools | None = None) -> Singles:
+    """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
+
+    `expected` int (N,) is the rotation, in steps, under which each place is expected if headings are known. Then only
+    this rotation and the two beside it are scored, and the others are -inf. Below 0, or if `expected` is None, all are.
+    `likely` bool (N,) tells which places may be compared by the fine grid (None: all). A pair that is compared by the
+    fine grid has a score of 0 to 1; any other has its score by the coarse grid, less 1.
+    """
+    scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
+    turns = np.full(len(rows), -1) if expected is None else expected
+    of_coarse = rows[:, : COARSE.numbers // 2]
+    for turn in np.unique(turns):
+        group = slice(None) if expected is None else np.flatnonzero(turns == turn)
+        tried = np.arange(0, ROTATIONS, 2) if turn < 0 else np.arange(turn - 1, turn + 2) % ROTATIONS
+        found = _compared(COARSE, [fields(int(each), COARSE) for each in tried], of_coarse[group])
+        if turn < 0:
+            found = np.stack([found, (found + np.roll(found, -1, axis=1)) / 2], axis=2).reshape(len(found), -1)
+            tried = np.arange(ROTATIONS)
+        scores[np.arange(len(rows))[group][:, None], tried] = found
+    scores -= 1
+    chances = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
+    best = np.argpartition(-chances, min(_LOOKED_CLOSER, chances.size) - 1, axis=None)[:_LOOKED_CLOSER]
+    slots, turned = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
+    for turn in np.unique(turned):
+        there = np.sort(slots[turned == turn])
+        found = _compared(FINE, [fields(int(turn), FINE)], rows[there, COARSE.numbers // 2 :])
+        scores[there, turn] = np.clip(found[:, 0], 0, 1)
+    return scores
+
+
+def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
+    """Return the score (see `scan`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n, n), if
+    the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side; or by up to a cell beside,
+    whichever is best."""
+    n = place.shape[1]
+    dx, dy = (round(each * n) for each in shift)
+    padded = np.pad(query, ((0, 0), (n, n), (n, n)))
+    first = (padded.shape[1] - n) // 2
+    steps = [(first - dy - y, first - dx - x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    inside = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
+    if not inside:
+        return 0.0
+    laid = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
+    return float(np.clip(_scored(laid, _strength(query), place).max(), 0, 1))
+
+
+def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
+    """Compare R fields of the query with N places, uint8 (N, B): the best score over all shifts, float32 (N, R). The
+    scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
+    laid = [_shifted(each, grid.side) for each in queries]
+    asked = np.concatenate(laid)
+    scatter = (asked**2).sum(axis=1)
+    least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
+    asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
+    best = np.empty((len(packed), len(queries)), np.float32)
+    for start in range(0, len(packed), _ROWS_AT_ONCE):
+        part = packed[start : start + _ROWS_AT_ONCE]
+        # Wide pictures leave the same cells of every place empty.
+        filled = (part != _NOTHING).any(axis=0)
+        places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
+        found = (places @ asked[:, np.repeat(filled, 2)].T).reshape(len(part), len(queries), -1).max(axis=2)
+        strength = np.einsum("nd,nd->n", places, places)
+        best[start : start + len(part)] = found / np.sqrt(strength + _TINY)[:, None]
+    return best
+
+
+def _scored(laid: Singles, strength: float, place: Singles) -> Singles:
+    """Return the score of each of S shifted fields of a query, `laid` (S, C, n, n), on a place (C, n, n): (S,).
+    `strength` is that of the field before it was shifted."""
+    of_place = (place**2).sum(axis=0)
+    scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
+    scatter = np.maximum(scatter, _LEAST_SCATTER**2 * strength * of_place.sum())
+    found: Singles = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * len(of_place))
+    return found
+
+
+def _strength(field: Array) -> float:
+    """Return the mean square of the length of the vectors in the cells of a field (C, m, m)."""
+    return float((field**2).sum() / field[0].size)
+
+
+def _shifted(query: Singles, n: int) -> Singles:
+    """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
+    padded = np.pad(query, ((0, 0), (n, n), (n, n)))
+    windows = sliding_window_view(padded, (n, n), axis=(1, 2))  # (C, K, K, n, n)
+    y, x = _shifts(query.shape[1], n)
+    return np.ascontiguousarray(windows[:, y, x].transpose(1, 0, 2, 3)).reshape(len(y), -1)
+
+
+@lru_cache
+def _shifts(m: int, n: int) -> tuple[Ints, Ints]:
+    """Return where the windows of `n` cells begin, on a query of `m` cells with a border of n on every side, under
+    which the query covers enough of a place: int (S,), int (S,)."""
+    first = np.arange(m + n + 1)
+    covered = np.minimum(first + n, m + n) - np.maximum(first, n)
+    least = _LEAST_OVERLAP[n] if m == n else _LEAST_OF_LARGER
+    y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= least * n * n)
+    return y, x
+
+
+@lru_cache
+def _pooling(side: int, of_place: int, cells: int) -> Singles:
+    """Return the weights, float32 (m, side), by which `side` regions in a row are averaged in m cells with the same
+    middle, of which `cells` are as long as the `of_place` regions of a place."""
+    pitch = of_place / cells
+    m = cells + 2 * max(0, int(np.ceil((side / pitch - cells) / 2 - _TINY)))
+    begins = (np.arange(m)[:, None] - m / 2) * pitch
+    region = np.arange(side) - side / 2
+    overlap = np.minimum(begins + pitch, region + 1) - np.maximum(begins, region)
+    weights: Singles = (overlap.clip(0) / pitch).astype(np.float32)
+    return weights
+
+
+@lru_cache
+def _near(cells: int, sd: float) -> Singles:
+    """Return Gaussian weights of the distances between cells in a row, float32 (cells, cells)."""
+    away = np.subtract.outer(np.arange(cells), np.arange(cells))
+    weights: Singles = np.exp(-(away**2) / (2 * sd**2)).astype(np.float32)
+    return weights
+
+
+def _both_ways(weights: Singles, values: Array) -> Array:
+    """Apply `weights` (m, n) along both sides of `values` (..., n, n): (..., m, m)."""
+    summed: Array = weights @ values @ weights.T
+    return summed
