@@ -267,7 +267,7 @@ class CoHog:
             return match
         dx, dy = match.shift_cells
         laid = layout.agreement(self._field(query, number, layout.FINE), place, (dx / self._side, dy / self._side))
-        return replace(match, score=min(1.0, match.score * laid / _LAYOUT_AGREES))
+        return replace(match, score=min(1.0, match.score * laid / _LAYOUT_AGREES), layout=laid)
 
     def _reference(self, fine: Bytes) -> Singles:
         """Restore the blocks of a place from its stored `fine` part, which holds their square roots, as vectors that
