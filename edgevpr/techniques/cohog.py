@@ -46,14 +46,14 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # or on aerial_caliterra (nadir) reached both values, nor did any query of two other sites in the map of
 # aerial_caliterra. The thesis's score has no safe threshold: its margin rejects those queries of other sites, and most
 # right matches too.
-_ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.08, 0.03), "thesis": (0.0, 0.02)}
+_ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.05, 0.03), "thesis": (0.0, 0.02)}
 # Least quality. On the tuning sets, accepted pictures that show nothing had .39 or less, and real ones, washed out or
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
 _MATCHINGS = ("displacement", "thesis")
 # Places or, looking down, pairs of a place and a rotation.
-_CANDIDATES = {"forward": 42, "nadir": 40}
+_CANDIDATES = {"forward": 42, "nadir": 30}
 # Places compared in full ahead, those with the best `glance`, which looks at one of so many good regions. On corridor,
 # the seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of
 # nordland_tiny four fewer).

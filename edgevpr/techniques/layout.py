@@ -47,9 +47,10 @@ _LEAST_STRENGTH = 0.01  # of a cell; weaker ones are noise
 _LEVELS = 7  # of a stored number, on either side of 0
 _LARGEST_KEPT = 99  # percentile of a place's numbers that becomes the highest level
 _LEAST_OVERLAP = {8: 0.43, 12: 0.35}  # share of the place that the query covers, by the side of the grid
-_LEAST_OF_LARGER = 0.75  # the same, for a query that shows more ground than a place
+_LEAST_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
 _LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
-_LOOKED_CLOSER = 3000  # pairs of a place and a rotation that are compared by the fine grid
+# Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
+_LOOKED_CLOSER = 1000, 2000
 _ROWS_AT_ONCE = 512
 _TINY = 1e-9
 
@@ -116,7 +117,8 @@ def scan(fields: Fields, rows: Bytes, expected: Ints | None = None, likely: Bool
         scores[np.arange(len(rows))[group][:, None], tried] = found
     scores -= 1
     chances = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
-    best = np.argpartition(-chances, min(_LOOKED_CLOSER, chances.size) - 1, axis=None)[:_LOOKED_CLOSER]
+    count = min(_LOOKED_CLOSER[int(turns.min() < 0)], chances.size)
+    best = np.argpartition(-chances, count - 1, axis=None)[:count]
     slots, turned = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
     for turn in np.unique(turned):
         there = np.sort(slots[turned == turn])
@@ -146,16 +148,19 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
     laid = [_shifted(each, grid.side) for each in queries]
     asked = np.concatenate(laid)
-    scatter = (asked**2).sum(axis=1)
+    scatter = np.einsum("sd,sd->s", asked, asked)
     least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
+    was, kept = None, asked.T
     for start in range(0, len(packed), _ROWS_AT_ONCE):
         part = packed[start : start + _ROWS_AT_ONCE]
         # Wide pictures leave the same cells of every place empty.
         filled = (part != _NOTHING).any(axis=0)
+        if was is None or (filled != was).any():
+            was, kept = filled, np.ascontiguousarray(asked[:, np.repeat(filled, 2)].T)
         places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
-        found = (places @ asked[:, np.repeat(filled, 2)].T).reshape(len(part), len(queries), -1).max(axis=2)
+        found = (places @ kept).reshape(len(part), len(queries), -1).max(axis=2)
         strength = np.einsum("nd,nd->n", places, places)
         best[start : start + len(part)] = found / np.sqrt(strength + _TINY)[:, None]
     return best
@@ -190,7 +195,7 @@ def _shifts(m: int, n: int) -> tuple[Ints, Ints]:
     which the query covers enough of a place: int (S,), int (S,)."""
     first = np.arange(m + n + 1)
     covered = np.minimum(first + n, m + n) - np.maximum(first, n)
-    least = _LEAST_OVERLAP[n] if m == n else _LEAST_OF_LARGER
+    least = _LEAST_OVERLAP[n] if m == n else _LEAST_OF_LARGER[n]
     y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= least * n * n)
     return y, x
 
