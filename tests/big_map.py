@@ -10,7 +10,6 @@ import numpy as np
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places import geopackage
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.techniques import placewords
 
 _SPACING_DEG = 0.0005  # of latitude: 56 m
 _INSERT = """
@@ -44,10 +43,7 @@ def _rows(spec: TechniqueSpec, places: int, rng: np.random.Generator) -> Iterato
 
 
 def _blob(part: PartSpec, rng: np.random.Generator) -> bytes:
-    """Random words for a part of words, integers over the whole range for another integer part, and a random vector of
-    length 1 for one of floats."""
-    if part.dtype == placewords.DTYPE:
-        return rng.permutation(placewords.NONE)[: part.shape[0]].astype(part.dtype).tobytes()
+    """Integers over the whole range for an integer part, and a random vector of length 1 for one of floats."""
     if np.dtype(part.dtype).kind != "f":
         return rng.bytes(part.nbytes)
     vector = rng.random(part.shape, np.float32)

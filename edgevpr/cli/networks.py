@@ -33,11 +33,6 @@ def _add_train(trainings: Any) -> None:
     words.add_argument("--out", metavar="DIR", help="folder to write to (default: your models folder)")
     words.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     add_json(words)
-    ground = command(trainings, "ground", train_ground, "learn the words by which cohog names places, looking down")
-    _add_images(ground)
-    ground.add_argument("--out", required=True, metavar="FILE.npz", help="the file to make")
-    ground.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
-    add_json(ground)
 
 
 def _add_images(parser: ArgumentParser) -> None:
@@ -75,15 +70,6 @@ def train_words(args: Namespace) -> int:
     unusable: list[ImageError] = []
     wanted = words.WordsWanted(args.model, args.kind, args.count, args.whiten)
     show(words.train_words(args.images, wanted, path_of(args.out), args.seed, unusable), args.json)
-    return exit_code(unusable)
-
-
-def train_ground(args: Namespace) -> int:
-    """Run `train ground`: learn the words of regions of the ground, and print how well they fit."""
-    from edgevpr.lab.training.words import train_ground
-
-    unusable: list[ImageError] = []
-    show(train_ground(args.images, Path(args.out), args.seed, unusable), args.json)
     return exit_code(unusable)
 
 

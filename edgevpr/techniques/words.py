@@ -48,7 +48,7 @@ class Words:
     whitening: Whitening | None = None
 
 
-def read_words(name: str, command: str) -> tuple[bytes, dict[str, Array], Singles]:
+def _read(name: str, command: str) -> tuple[bytes, dict[str, Array], Singles]:
     """Read the file of words `name` in a folder of models. Returns its bytes, its arrays by name, and its words,
     float32. Raises ModelError, which ends with the `command` that makes the file, if it is missing or damaged."""
     path = find_model(name)
@@ -64,10 +64,10 @@ def read_words(name: str, command: str) -> tuple[bytes, dict[str, Array], Single
 
 def load_words(model: str, kind: str, count: int) -> Words:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-    Raises ModelError as `read_words` does, and if they were learned on another network (see `Card.fingerprint`)."""
+    Raises ModelError as `_read` does, and if they were learned on another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
     command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
-    content, arrays, words = read_words(name, command)
+    content, arrays, words = _read(name, command)
     learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != wanted:
         raise ModelError(

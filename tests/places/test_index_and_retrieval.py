@@ -187,7 +187,7 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     index = load_index(place_map, technique, 10_000)
     query = technique.encode(43)
     few = rank(technique, query, place_map, index, 14)
-    assert sum(len(hypotheses) for hypotheses in technique.tried) == 14  # for each place a third of what is possible
+    assert sum(len(hypotheses) for hypotheses in technique.tried) == 14
     assert len(few.slots) > 4
     assert [2] in technique.tried
     technique.tried.clear()
@@ -262,23 +262,23 @@ def tried(by_hypothesis, count, among=None):
     return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))
 
 
-def test_of_many_places_the_best_hypotheses_of_all_are_tried_six_for_each_candidate():
+def test_of_many_places_the_best_hypotheses_of_all_are_tried():
     by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
-    found = tried(by_hypothesis, 10)
+    found = tried(by_hypothesis, 60)
     assert sum(len(each) for each in found.values()) == 60
     least = min(by_hypothesis[slot, each].min() for slot, each in found.items())
     left = by_hypothesis.copy()
     for slot, each in found.items():
         left[slot, each] = 0
     assert left.max() <= least
-    assert len(found) > 10
+    assert len(found) > 20
 
 
-@pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (9, 6), (10, 6), (60, 6)])
+@pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (19, 3), (20, 3), (60, 3)])
 def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, most):
     by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
     by_hypothesis[0] += 1
-    found = tried(by_hypothesis, 10)
+    found = tried(by_hypothesis, 60)
     assert len(found[0]) == most
     assert sum(len(each) for each in found.values()) == min(60, places * most)
 
@@ -288,7 +288,7 @@ def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it
     by_hypothesis[:, 3:] = -np.inf
     by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
     found = tried(by_hypothesis, 10)
-    assert sum(len(each) for each in found.values()) == 10  # one of three, for each of ten
+    assert sum(len(each) for each in found.values()) == 10
     assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
     by_hypothesis[:] = -np.inf
     assert not tried(by_hypothesis, 10)

@@ -48,9 +48,8 @@ def test_only_the_rotation_expected_and_those_beside_it_are_possible(town):
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]
     everything, by_rotation = technique.coarse_scores(places[0], rows, None, **AS_MAPPED)
     assert sets[7] == possible(by_rotation)[7] == list(range(0, 360, 15))
-    assert (scores <= everything).all()
-    assert scores[0] == everything[0]
-    assert scores[7] == everything[7]
+    assert (scores <= everything + 1e-6).all()
+    np.testing.assert_allclose(scores[[0, 7]], everything[[0, 7]], atol=1e-6)
 
 
 @pytest.mark.parametrize("wrong_deg", [0.0, 12.0, -12.0])

@@ -1,11 +1,8 @@
-"""`edgevpr train words` and `train ground`: visual words, learned by k-means from one's own pictures.
+"""`edgevpr train words`: visual words, learned by k-means from one's own pictures.
 
 The file that `techniques.words.load_words` reads holds `words` float16 (K, D), rounded to steps of 1/256 so that ten
 thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If
 asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
-
-For words of the ground (see `techniques.placewords`) the regions of the pictures, under several headings, are turned by
-quarter turns until their main directions agree. So a word stands for four: itself, and itself turned.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,12 +13,10 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image, Ints, Singles
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.files import model_folders, require_folder, write_whole
+from edgevpr.core.files import model_folders, write_whole
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.lab.training.pictures import read_pictures
-from edgevpr.techniques import placewords
-from edgevpr.techniques.cohog import CoHog
 from edgevpr.techniques.regions import describe, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.words import local_descriptors, nearest, sharpness_of, vlad
@@ -33,9 +28,6 @@ _ROUNDS = 10
 _STEP = 256
 _ALIKE = 1e-9  # variance of vectors of length 1 that are the same but for rounding
 _LEAST_VARIANCE = 1e-3  # of the largest: a smaller variance is mostly noise, which whitening must not amplify
-_HEADINGS = (0, 2, 4)  # of the ground, in steps of 15 degrees
-_GROUND_POINTS = 90_000
-_GROUND_ROUNDS = 12
 _JUDGED = 5000  # of the points: enough to tell how well the words fit
 _BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
 
@@ -54,9 +46,8 @@ class WordsWanted:
 
 @dataclass(frozen=True, slots=True)
 class WordsResult:
-    """Result of a training of words: the file, the numbers of pictures and of descriptors (of regions, for words of the
-    ground) it was learned from, and the mean square distance of a descriptor to its nearest word (2: nothing in
-    common)."""
+    """Result of a training of words: the file, the numbers of pictures and of descriptors it was learned from, and the
+    mean square distance of a descriptor to its nearest word (2: nothing in common)."""
 
     file: str
     pictures: int
@@ -84,12 +75,11 @@ def train_words(
         raise UsageError(f"{path} is there already: delete it, or give another --out.")
     backbone = open_backbone(wanted.model, "features")
 
-    def described(picture: Image) -> Iterator[Singles]:
+    def described(picture: Image) -> Singles:
         features = backbone.run(picture)
         if wanted.kind == "vlad":
-            yield local_descriptors(features)
-        else:
-            yield describe(features, find_regions(features, REGIONS[wanted.kind]))
+            return local_descriptors(features)
+        return describe(features, find_regions(features, REGIONS[wanted.kind]))
 
     rng = np.random.default_rng(seed)
     points, pictures = _gathered(folders, described, max(_POINTS, _POINTS_PER_WORD * count), rng, unusable)
@@ -112,47 +102,21 @@ def train_words(
     return _written(path, arrays, points, words, pictures)
 
 
-def train_ground(folders: Sequence[str], out: Path, seed: int, unusable: list[ImageError]) -> WordsResult:
-    """Learn 256 words of the ground and write them to `out` (.npz). Each stands for four, itself and its quarter turns.
-
-    Raises UsageError for a file that exists already or too few regions, SourceError for a folder without images.
-    """
-    if out.suffix != ".npz" or out.exists():
-        raise UsageError(f"--out {out}: give a name that ends in .npz, of a file that is not there.")
-    require_folder(out)
-    technique = CoHog(camera="nadir")
-
-    def described(picture: Image) -> Iterator[Singles]:
-        query = technique.encode(picture)
-        for turn in _HEADINGS:
-            yield technique.good_patterns(query, turn)[0]
-
-    rng = np.random.default_rng(seed)
-    points, pictures = _gathered(folders, described, _GROUND_POINTS / len(_HEADINGS), rng, unusable)
-    if len(points) < 2 * placewords.COUNT:
-        raise UsageError(f"{pictures} usable images give {len(points)} regions, too few to learn from: give more.")
-    learning = kmeans(aligned(points), placewords.COUNT, _GROUND_ROUNDS, rng)
-    *_, centres = progress(learning, _GROUND_ROUNDS, "learning")
-    words = (centres / np.linalg.norm(centres, axis=1, keepdims=True)).astype(np.float16)
-    turned = placewords.turned_words(words.astype(np.float32))
-    return _written(out, {"words": words}, points, turned, pictures)
-
-
 def _gathered(
     folders: Sequence[str],
-    described: Callable[[Image], Iterator[Singles]],
-    wanted: float,
+    described: Callable[[Image], Singles],
+    wanted: int,
     rng: np.random.Generator,
     unusable: list[ImageError],
 ) -> tuple[Singles, int]:
-    """Collect descriptors of the pictures in `folders`: from each array (n, D) that `described` yields for a picture,
-    so many random rows that all pictures give about `wanted`. Returns them, float32 (N, D), and the number of
-    pictures."""
-    share = int(-(-wanted // sum(len(list_images(name)) for name in folders)))
-    pictures, points = 0, [np.empty((0, 1), np.float32)]
-    for pictures, picture in enumerate(read_pictures(folders, "describing", unusable), start=1):  # noqa: B007
-        points += [found[rng.permutation(len(found))[:share]] for found in described(picture)]
-    return np.concatenate(points[1:] or points), pictures
+    """Collect descriptors of the pictures in `folders`: of those of each picture, `described` (n, D), so many random
+    ones that all pictures give about `wanted`. Returns them, float32 (N, D), and the number of pictures."""
+    share = -(-wanted // sum(len(list_images(name)) for name in folders))
+    points = []
+    for picture in read_pictures(folders, "describing", unusable):
+        found = described(picture)
+        points.append(found[rng.permutation(len(found))[:share]])
+    return np.concatenate(points or [np.empty((0, 1), np.float32)]), len(points)
 
 
 def _written(path: Path, arrays: dict[str, Array], points: Singles, words: Singles, pictures: int) -> WordsResult:
@@ -164,15 +128,6 @@ def _written(path: Path, arrays: dict[str, Array], points: Singles, words: Singl
     some = points[:: max(1, len(points) // _JUDGED)]
     distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
     return WordsResult(str(path), pictures, len(points), float(distance))
-
-
-def aligned(patterns: Singles) -> Singles:
-    """Turn `patterns` float32 (N, 20) by quarter turns to bring their main direction within 45 degrees of orientation
-    0."""
-    # The second and third pattern are the cosine and sine of the first frequency over the orientations.
-    quarters = np.rint(np.arctan2(patterns[:, 2], patterns[:, 1]) / (np.pi / 2)).astype(np.intp) % placewords.QUARTERS
-    turned = placewords.turned_words(patterns).reshape(len(patterns), placewords.QUARTERS, -1)
-    return turned[np.arange(len(patterns)), quarters]
 
 
 def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -> Iterator[Singles]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from edgevpr import techniques
 from edgevpr.core.config import Config
-from edgevpr.core.contract import Technique
+from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError, ModelError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
@@ -107,8 +107,14 @@ def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
 def _label(technique: Technique) -> str:
     """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
     spec = technique.spec
-    other = ", thesis" if spec.name == "cohog" and not spec.in_full else ""
+    other = "" if spec.name != "cohog" or _votes(spec) else ", thesis"
     return techniques.labelled(spec.name, spec.form) + other
+
+
+def _votes(spec: TechniqueSpec) -> bool:
+    """Tell whether a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it has a
+    glance, looking ahead, or several heights, looking down."""
+    return bool(spec.in_full or spec.height_ratios)
 
 
 def _camera(technique: Technique) -> str | None:
@@ -119,7 +125,7 @@ def _camera(technique: Technique) -> str | None:
 
 def _costs_on(technique: Technique, board: Board) -> TechniqueCosts:
     """Measure the costs of a technique here, and convert them to `board`."""
-    work = counted_work(technique.spec.name, technique.spec.parameters) if technique.spec.in_full else None
+    work = counted_work(technique.spec.name, technique.spec.parameters) if _votes(technique.spec) else None
     return on_board(probe(technique), load_board("this"), board, work)
 
 

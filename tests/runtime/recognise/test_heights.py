@@ -43,9 +43,9 @@ def recogniser(opened, monkeypatch, prior=None):
     technique, place_map, index, meter = opened
     heights, scan = [], type(technique).coarse_scores
 
-    def coarse_scores(query, rows, mean, turned_deg=None, height_ratio=None):
-        heights.append(height_ratio)
-        return scan(technique, query, rows, mean, turned_deg, height_ratio)
+    def coarse_scores(query, rows, mean, **hints):
+        heights.append(hints["height_ratio"])
+        return scan(technique, query, rows, mean, **hints)
 
     monkeypatch.setattr(technique, "coarse_scores", coarse_scores, raising=False)
     rule = accept_rule(technique, load_config(None).match)

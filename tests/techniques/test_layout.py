@@ -1,0 +1,134 @@
+"""Layouts of places: how they move with the picture, what of them is stored, and that a place is found however seen."""
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.core.errors import UsageError
+from edgevpr.techniques import layout
+from edgevpr.techniques.cohog import CoHog
+from edgevpr.techniques.layout import COARSE, FINE, NBYTES
+
+SIDE_PX = 256
+PLACES = 6
+SHIFTS_PX = ((0, 0), (40, 0), (-30, 30), (0, -60))
+NOTHING = 0x88
+
+
+def view(seed, turned_deg=0.0, right_px=0, down_px=0):
+    """The ground of a place, from above, under a camera that has turned clockwise and moved."""
+    ground = textured(seed, 3 * SIDE_PX, 3 * SIDE_PX)
+    middle = np.array([1.5 * SIDE_PX - 0.5 + right_px, 1.5 * SIDE_PX - 0.5 + down_px])
+    moved = cv2.getRotationMatrix2D(middle.tolist(), turned_deg, 1)
+    moved[:, 2] += (SIDE_PX - 1) / 2 - middle
+    return cv2.warpAffine(ground, moved, (SIDE_PX, SIDE_PX))
+
+
+@pytest.fixture(scope="module")
+def town():
+    technique = CoHog(camera="nadir")
+    return technique, np.stack([technique.encode(view(seed)).coarse for seed in range(PLACES)])
+
+
+def spot(side, top, left, seed=0):
+    """Patterns (144, 20) of a square of good regions, and their numbers."""
+    patterns = np.random.default_rng(seed).normal(size=(144, 20))
+    numbers = np.add.outer(np.arange(top, top + 12) * side, np.arange(left, left + 12)).ravel()
+    return patterns / np.linalg.norm(patterns, axis=1, keepdims=True), numbers
+
+
+def unpacked(row):
+    """The fields of a stored place, in levels of -7 to 7."""
+    levels = np.stack([row & 15, row >> 4], axis=1).ravel().astype(int) - 8
+    coarse, fine = np.split(levels, [COARSE.numbers])
+    return coarse.reshape(-1, 8, 8), fine.reshape(-1, 12, 12)
+
+
+def test_the_field_moves_with_the_picture():
+    here = layout.field(COARSE, *spot(32, 4, 8), (32, 32))  # cells of four regions
+    assert np.abs(here).max() > 0.1
+    moved = layout.field(COARSE, *spot(32, 12, 12), (32, 32))
+    np.testing.assert_allclose(moved, np.roll(here, (2, 1), axis=(1, 2)), atol=1e-6)
+
+
+def test_a_picture_of_more_ground_has_the_same_field_in_its_middle():
+    here = layout.field(COARSE, *spot(32, 4, 8), (32, 32))
+    more = layout.field(COARSE, *spot(48, 12, 16), (48, 32))
+    assert more.shape == (8, 12, 12)
+    np.testing.assert_allclose(more[:, 2:-2, 2:-2], here, atol=1e-6)
+
+
+def test_a_place_is_stored_in_levels_of_its_largest_numbers():
+    patterns = np.random.default_rng(1).normal(size=(31 * 31, 20))
+    good = np.arange(31 * 31) > 300
+    row = layout.of_place(patterns, good, 31)
+    assert (row.shape, row.dtype, NBYTES) == ((1120,), np.uint8, 1120)
+    numbers = np.flatnonzero(good)
+    for grid, levels in zip((COARSE, FINE), unpacked(row), strict=True):
+        values = layout.field(grid, patterns[numbers], numbers, (31, 31))
+        step = np.percentile(np.abs(values), 99) / 7
+        kept = np.abs(values) < 7 * step
+        assert np.abs(levels * step - values)[kept].max() <= 0.5 * step * (1 + 1e-6)
+        np.testing.assert_array_equal(levels[~kept], 7 * np.sign(values[~kept]))
+    assert layout.of_place(patterns, good, 31).tobytes() == row.tobytes()
+
+
+def test_layouts_agree_on_the_shift_between_them():
+    ground = np.random.default_rng(3).normal(size=(12, 20, 20)).astype(np.float32)
+    ground /= np.linalg.norm(ground, axis=0)
+    place, query = ground[:, 4:16, 4:16], ground[:, 6:18, 3:15]  # the camera is a cell to the left, and two below
+    there = layout.agreement(query, place, (-1 / 12, 2 / 12))
+    assert there == pytest.approx(np.sqrt(11 * 10) / 12), "as many of all cells as are seen"
+    assert layout.agreement(query, place, (0, 2 / 12)) == there  # up to a cell beside
+    assert layout.agreement(query, place, (3 / 12, -2 / 12)) < 0.3
+    assert layout.agreement(query, place, (1.5, 0)) == 0
+    assert layout.agreement(np.zeros_like(query), place, (0, 0)) == 0
+
+
+@pytest.mark.parametrize("step", range(layout.ROTATIONS))
+def test_a_turned_and_moved_camera_finds_the_place_and_its_rotation(town, step):
+    technique, rows = town
+    query = technique.encode(view(step % PLACES, 15 * step, *SHIFTS_PX[step % len(SHIFTS_PX)]))
+    scores, by_hypothesis = technique.coarse_scores(query, rows, None)
+    assert scores.argmax() == step % PLACES
+    assert by_hypothesis[step % PLACES].argmax() % layout.ROTATIONS == step
+
+
+def test_only_likely_places_are_looked_at_closer(town):
+    technique, rows = town
+    query = technique.encode(view(1))
+    _, by_hypothesis = technique.coarse_scores(query, rows, None)
+    likely = np.arange(PLACES) % 2 == 0
+    scores, restricted = technique.coarse_scores(query, rows, None, in_reach=likely)
+    np.testing.assert_allclose(restricted[likely], by_hypothesis[likely], atol=1e-6)
+    unlikely = restricted[~likely]
+    assert (unlikely[np.isfinite(unlikely)] < 0).all()
+    assert scores[1] == 0
+    assert unlikely.max() == restricted[1].max(), "by the coarse grid the place comes first of them"
+
+
+def test_rows_of_any_bytes_have_finite_scores(town):
+    technique, rows = town
+    damaged = np.random.default_rng(2).integers(0, 256, (4, NBYTES), np.uint8)
+    damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
+    scores, by_hypothesis = technique.coarse_scores(technique.encode(view(2)), damaged, None)
+    assert np.isfinite(scores).all()
+    assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * len(damaged)
+
+
+def test_a_picture_without_a_good_region_has_no_layout_and_is_like_no_place(town):
+    technique, rows = town
+    empty = technique.encode(np.full((SIDE_PX, SIDE_PX), 90, np.uint8))
+    assert (empty.coarse == NOTHING).all()
+    with_empty = np.stack([*rows[:2], empty.coarse])
+    assert (technique.coarse_scores(empty, with_empty, None)[0] == 0).all()
+    scores, by_hypothesis = technique.coarse_scores(technique.encode(view(0)), with_empty, None)
+    assert scores.argmax() == 0
+    assert scores[2] == 0
+    assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * 3
+
+
+def test_looking_down_takes_the_orientations_that_layouts_are_made_of():
+    with pytest.raises(UsageError, match="uses 8 bins"):
+        CoHog(camera="nadir", bins=12)
