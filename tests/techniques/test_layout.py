@@ -109,7 +109,7 @@ def test_only_likely_places_are_looked_at_closer(town):
 
 
 def test_rows_of_any_bytes_have_finite_scores(town):
-    technique, rows = town
+    technique, _ = town
     damaged = np.random.default_rng(2).integers(0, 256, (4, NBYTES), np.uint8)
     damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
     scores, by_hypothesis = technique.coarse_scores(technique.encode(view(2)), damaged, None)

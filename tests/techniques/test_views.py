@@ -6,7 +6,8 @@ import pytest
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis
+from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis, turned_blocks
 
 pytestmark = pytest.mark.slow
 
@@ -39,6 +40,15 @@ def test_a_hypothesis_is_a_height_and_a_rotation():
     assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
     nearest = [nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
     assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
+
+
+def test_turned_blocks_are_those_of_the_turned_picture():
+    image = seen(4)
+    blocks = normalised_blocks(oriented_cells(image, 16, 8, signed=True))
+    for quarters in range(-3, 5):
+        turned = np.ascontiguousarray(np.rot90(image, quarters))
+        expected = normalised_blocks(oriented_cells(turned, 16, 8, signed=True))
+        np.testing.assert_allclose(turned_blocks(blocks, quarters), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("turned_deg", [0, 130])
