@@ -4,7 +4,7 @@ function returns the lines of one result; JSON has the same values by their name
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import aligned, shown
+from edgevpr.core.text import aligned, nines, shown
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import MadeMap
@@ -159,5 +159,5 @@ def _said(query: dict[str, Any] | None) -> str:
         return "no query"
     if not query["accepted"]:
         return f"refused ({query['reason']})"
-    sure = "" if query["confidence"] is None else f" with {query['confidence']:.4f}"
+    sure = "" if query["confidence"] is None else f" with {nines(query['confidence'])}"
     return f"place {query['place']} accepted{sure}"

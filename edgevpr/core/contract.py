@@ -128,7 +128,6 @@ class FineMatch:
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
     `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
-    `layout`: how well (0..1) the layouts of query and place agree on this shift.
     `support`: further measures of the agreement with this shift."""
 
     score: float = field(kw_only=False)
@@ -137,7 +136,6 @@ class FineMatch:
     rotation_deg: float | None = None
     height_ratio: float | None = None
     coverage: float | None = None
-    layout: float | None = None
     support: Support | None = None
 
 

@@ -182,3 +182,11 @@ def figure(width_in: float, height_in: float) -> "Figure":
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def nines(probability: float) -> str:
+    """Show a probability with four digits or, close to 1, with as many as tell it from 1, at most 15: `0.9812`,
+    `0.9999997`."""
+    least_wrong = 1e-15
+    digits = min(15, max(4, 1 - math.floor(math.log10(max(1 - probability, least_wrong)))))
+    return f"{min(probability, 1 - least_wrong):.{digits}f}"

@@ -15,7 +15,7 @@ from statistics import median
 from types import MappingProxyType
 
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import shown
+from edgevpr.core.text import nines, shown
 from edgevpr.review.html import (
     UNKNOWN,
     Points,
@@ -269,7 +269,7 @@ def _moment(number: int, query: LoggedQuery, why: str, frames: Album, references
     found = "no place was found"
     if query.place is not None:
         found = f"place {query.place} ({query.reference_image or 'without a name'}), score {figure(query.score)}"
-    sure = "" if query.confidence is None else f", confidence {query.confidence:.4f}"
+    sure = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
     verdict = f"{'accepted' if query.accepted else 'refused'}: {query.reason}"
     pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
     pair = "".join(

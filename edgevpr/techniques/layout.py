@@ -33,7 +33,7 @@ class Grid:
 
     @property
     def numbers(self) -> int:
-        """How many numbers the field of a place has."""
+        """The number of numbers in the field of a place."""
         return self.side**2 * len(self.channels)
 
 
@@ -78,8 +78,8 @@ def field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) ->
     near = _near(len(weight), _AROUND * grid.side)
     values -= weight * _both_ways(near, values) / np.maximum(_both_ways(near, weight), _TINY)
     values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _LEAST_STRENGTH))
-    values *= weight > _LEAST_SEEN
-    return values
+    laid: Array = values * (weight > _LEAST_SEEN)
+    return laid
 
 
 def of_place(patterns: Array, good: Bools, side: int) -> Bytes:

@@ -8,7 +8,6 @@ show the same shift between query and place. Larger figures speak for the match,
 * lead: `agree` minus the largest `agree` of a place elsewhere
 * lead_around: the same for the logarithm of the score, averaged over a place and its neighbours in the index (ahead)
 * coverage: logarithm of the share of the place's regions that agree, each counted once
-* layout: logarithm of `FineMatch.layout` (down)
 * mutual: logarithm of the share of regions that are each other's most similar (ahead)
 * mutual_best: 1 if this share is larger at no place elsewhere, else 0 (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
@@ -35,8 +34,7 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
-_BARE = ("agree", "lead", "coverage", "layout")
-_LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
+_LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
 OF_MAP = {AHEAD: ("mutual", "coverage", "back", "likeness"), **_LOOKING_DOWN}
 OF_PLACE = {AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"), **_LOOKING_DOWN}
@@ -181,7 +179,6 @@ def _evidence_down(
         "agree": _log_share(score[best]),
         "lead": _lead(score, best, away),
         "coverage": _log_share(matches[best].coverage or 0.0),
-        "layout": _log_share(matches[best].layout or 0.0),
     }
     if proof is not None:
         evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)

@@ -12,6 +12,7 @@ import numpy as np
 
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
+from edgevpr.core.text import nines
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
@@ -210,9 +211,9 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = f"confidence {confidence:.4f}, {needed:.4f} needed: {described(evidence)}"
+    figures = f"confidence {nines(confidence)}, {nines(needed)} needed: {described(evidence)}"
     if followed is not None:
-        figures = f"{followed:.4f} sure by the flight so far; {figures}"
+        figures = f"{nines(followed)} sure by the flight so far; {figures}"
     by_itself = confidence >= needed
     by_flight = followed is not None and followed >= max(needed, _SURE_BY_FLIGHT)
     if not (by_itself or by_flight):

@@ -8,6 +8,7 @@ from sureness import NEEDED, sure_rule
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.text import nines
 from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
@@ -40,7 +41,7 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     rule = sure_rule(lambda evidence: confidence)
     verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
-    assert verdict.reason.startswith(f"confidence {confidence:.4f}, 0.9000 needed: 2.01 times as many regions agree")
+    assert verdict.reason.startswith(f"confidence {nines(confidence)}, 0.9000 needed: 2.01 times as many regions agree")
     assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
     )
