@@ -186,7 +186,9 @@ def figure(width_in: float, height_in: float) -> "Figure":
 
 def nines(probability: float) -> str:
     """Show a probability with four digits or, close to 1, with as many as tell it from 1, at most 15: `0.9812`,
-    `0.9999997`."""
-    least_wrong = 1e-15
-    digits = min(15, max(4, 1 - math.floor(math.log10(max(1 - probability, least_wrong)))))
-    return f"{min(probability, 1 - least_wrong):.{digits}f}"
+    `0.99999970`."""
+    wrong = max(1 - probability, 1e-15)
+    if not wrong < 1:  # NaN as well
+        return f"{probability:.4f}"
+    digits = min(15, max(4, 1 - math.floor(math.log10(wrong))))
+    return f"{1 - wrong:.{digits}f}"
