@@ -20,25 +20,25 @@ _ABOUT = """\
 `cohog` is as it flies: a scan of 144 bytes a place (looking down 1120), then the displacement vote over the best
 places; in the aerial sets its camera looks straight down (`--camera nadir`: the picture laid into a square, 24
 rotations of the query). `cohog, known` is told heading and height of every query (`--known heading,height`), where a
-set has headings. In sat_marash, tiles of pictures from space, they are exact; where its sites lie on Earth is
-invented. *aerial_joined* is all sets from the air as one map, those that were tuned on too. `cohog, exact` votes over
-all places, under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector is kept in half
-precision; as `8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and limits of acceptance
-were chosen on the sets marked *tune*. Some figures of cohog were fixed after other sets had been seen, and are to be
-judged with that in mind: of a place code the least overlap (half), its size (12x12 cells) and its Fourier series; how
-many places are compared ahead (42), with aerial_swindale; how many of them a glance leaves to be compared in full
-(12), and that it looks at a quarter of the regions, with all sets; that the scan counts in the score, ahead, with
-grief_stromovka_seasons and nordland_tiny; what a vote counts that is off the peak (ahead 1, 1, 0.75, 0.5) and how many
-patterns of a region are compared (20 of 32), both with grief_stromovka_seasons; how many landmarks prove a place (10)
-and from which score on some must agree (0.2), with all sets from the air; how far an unknown tilt is thought to be (3
-degrees), and that from other heights two fifths of the usual pairs are compared from each, with aerial_swindale; and
-the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped weights of calc, on which the
-networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training: what networks reach there is
-not clean. A sequence wants a flight along the mapped way; only corridor, grief_stromovka_seasons and nordland_tiny are
-such. The pictures of nordland_tiny have 64x32 pixels, which every technique enlarges: it is here for its thousand
-places. Of a network other than the shipped one nothing is accepted before the user says from when on. The truth of the
-aerial sets was computed by image registration: it favours pairs that local features can match, and says nothing of
-others. The JSON files beside this page hold every figure.
+set has headings. In sat_marash, tiles of pictures from space, they are exact; where its sites lie on Earth is invented.
+*aerial_joined* is all sets from the air as one map, those that were tuned on too. `cohog, exact` votes over all places,
+under all rotations. `cohog, thesis` scores as published, on the whole picture. A vector is kept in half precision; as
+`8bit` or `1bit` it is less the map's mean, a byte or a bit a number. Parameters and limits of acceptance were chosen on
+the sets marked *tune*. Some figures of cohog were fixed after other sets had been seen, and are to be judged with that
+in mind: of a place code the least overlap (half), its size (12x12 cells) and its Fourier series; how many places are
+compared ahead (42), with aerial_swindale; how many of them a glance leaves to be compared in full (12), and that it
+looks at a quarter of the regions, with all sets; that the scan counts in the score, ahead, with grief_stromovka_seasons
+and nordland_tiny; what a vote counts that is off the peak (ahead 1, 1, 0.75, 0.5) and how many patterns of a region are
+compared (20 of 32), both with grief_stromovka_seasons; how many landmarks prove a place (10) and from which score on
+some must agree (0.2), with all sets from the air; how far an unknown tilt is thought to be (3 degrees), and that from
+other heights two fifths of the usual pairs are compared from each, and how much a dim picture is stretched and
+smoothed, with aerial_swindale; and the margin of `cohog, thesis` (0.02, with pictures of foreign sites). The shipped
+weights of calc, on which the networks run, have seen the pictures of aerial_caliterra and aerial_brighton in training:
+what networks reach there is not clean. A sequence wants a flight along the mapped way; only corridor,
+grief_stromovka_seasons and nordland_tiny are such. The pictures of nordland_tiny have 64x32 pixels, which every
+technique enlarges: it is here for its thousand places. Of a network other than the shipped one nothing is accepted
+before the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs
+that local features can match, and says nothing of others. The JSON files beside this page hold every figure.
 """
 
 

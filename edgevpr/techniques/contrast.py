@@ -1,0 +1,102 @@
+"""Contrast of pictures taken in little light or in fog, for `cohog`.
+
+The entropy of dim ground is that of a blank wall: few grey levels are left. Such a picture is *stretched* to more of
+them, and the more it is stretched, the more it is smoothed before, since the sensor's noise grows with it. A picture
+with contrast enough is not touched, so ordinary maps hold what they always held. A picture with next to none is not
+touched either: stretched noise must not pass for ground.
+
+All is rounded alike on every processor (see `gradients`): means of whole grey levels are exact, and products and sums
+are computed one by one.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Array, Mask, Singles
+from edgevpr.techniques.gradients import levels
+
+_BLOCKS_ALONG = 64  # the contrast is that of the means of so many blocks along a side: they hold little of the noise
+_OUTSIDE = 0.01  # share of the blocks that may be darker than the range, and share that may be brighter
+# Least contrast of ground, in grey levels: this, or what noise of 3 levels has in means of few pixels.
+_LEAST = 4.0
+_NOISE = 3 * 4.65  # between the hundredths of a normal distribution
+_MOST_SIGMA = 1.4
+_ROUNDS = 4  # of smoothing: fewer cannot reach that much
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """The rule by which dim pictures are stretched, in grey levels: those of less contrast than `kept`, at half of it
+    or less to `wanted`, which is at most four times `kept`. `sigma_pixels` is the sigma of the blur for each doubling
+    of the contrast, in pixels of the picture as it came."""
+
+    kept: float
+    wanted: float
+    sigma_pixels: float
+
+
+def stretched(grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], contrast: Contrast) -> Singles:
+    """Return a square picture, stretched if its contrast is below `contrast.kept`.
+
+    Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
+    of allowed pixels. `grey` is float32 (side, side), 0 to 255; the same array is returned where its contrast is enough
+    or too low to be that of ground. `allowed` is bool (side, side) (None: all). `pixel_px` is the width and height, in
+    pixels of the square, of a pixel of the picture as it came. Returns float32 (side, side), 0 to 255.
+    """
+    low, high = _ends(grey, allowed)
+    found = high - low
+    of_noise = _NOISE * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_ALONG / len(grey)
+    if not max(_LEAST, of_noise) <= found < contrast.kept:
+        return grey
+    lacks = contrast.kept / found
+    gain = min(lacks * lacks * lacks, contrast.wanted / found)  # from 1 on: no jump
+    # Nothing of a bright display may bleed into the ground beside it.
+    picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
+    sigma_pixels = min(_MOST_SIGMA, contrast.sigma_pixels * math.log2(gain))
+    across, down = (min(max(1, round(each)), len(grey) // 4) for each in pixel_px)
+    _smooth(picture, sigma_pixels, across)
+    _smooth(picture.T, sigma_pixels, down)
+    picture -= np.float32(low)
+    picture *= np.float32(gain)
+    picture += np.float32(min(low, 255 - contrast.wanted))
+    clipped: Singles = np.clip(picture, 0, 255, out=picture)
+    return clipped
+
+
+def _ends(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
+    """Return the ends of the range of grey levels (see `stretched`): (0, 0) where no block is allowed."""
+    means = _block_means(levels(grey))
+    if allowed is not None:
+        means = means[_block_means(allowed.view(np.uint8)) > 0.999]
+    if not means.size:
+        return 0.0, 0.0
+    outside = int(_OUTSIDE * means.size)
+    ordered = np.sort(means, axis=None)
+    return float(ordered[outside]), float(ordered[-1 - outside])
+
+
+def _block_means(whole: Array) -> Array:
+    """Average whole numbers, uint8 (side, side), over square blocks: float32 (n, n). Sums of whole numbers are exact in
+    any order."""
+    block_px = max(1, len(whole) // _BLOCKS_ALONG)
+    n = len(whole) // block_px
+    part = whole[: n * block_px, : n * block_px].astype(np.float32)
+    return cv2.resize(part, (n, n), interpolation=cv2.INTER_AREA)
+
+
+def _smooth(grey: Array, sigma_pixels: float, pixel_px: int) -> None:
+    """Smooth (H, W) in place along its rows, by `sigma_pixels` pixels of `pixel_px` each: each round averages every
+    pixel with the two that are `pixel_px` away."""
+    beside = np.float32(sigma_pixels * sigma_pixels / (2 * _ROUNDS))
+    middle = np.float32(1) - 2 * beside
+    sides, step = np.empty_like(grey), pixel_px
+    for _ in range(_ROUNDS):
+        np.add(grey[:, : -2 * step], grey[:, 2 * step :], out=sides[:, step:-step])
+        np.add(grey[:, :1], grey[:, step : 2 * step], out=sides[:, :step])
+        np.add(grey[:, -2 * step : -step], grey[:, -1:], out=sides[:, -step:])
+        sides *= beside
+        grey *= middle
+        grey += sides

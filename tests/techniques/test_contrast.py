@@ -1,0 +1,82 @@
+"""Ground in little light or in fog is stretched until it says something; ordinary pictures and noise are not."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.techniques import create
+from edgevpr.techniques.contrast import Contrast, stretched
+from edgevpr.techniques.gradients import grey_square
+
+CAMERAS = ("forward", "nadir")
+WORSE = {"dark": lambda picture: 0.15 * picture, "fog": lambda picture: 0.15 * picture + 170}
+DOUBLED = Contrast(100, 200, 0.3)
+PIXEL_PX = (512 / 640, 512 / 480)
+
+
+def noisy(picture, sigma, seed=1):
+    """What a sensor makes of it: uint8."""
+    noise = sigma * np.random.default_rng(seed).normal(size=np.shape(picture))
+    return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
+
+
+def ramp(low, high):
+    """A square picture of all grey levels between two, float32 (512, 512)."""
+    return np.tile(np.linspace(low, high, 512, dtype=np.float32), (512, 1))
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("worse", WORSE)
+def test_ground_in_little_light_and_in_fog_is_found(camera, worse):
+    technique = create("cohog", {"camera": camera})
+    places = [technique.encode(textured(seed, 480, 640)).fine for seed in range(3)]
+    query = technique.encode(noisy(WORSE[worse](textured(1, 480, 640)), 1.5))
+    scores = [technique.match(query, place).score for place in places]
+    assert query.quality >= 0.8
+    assert scores[1] > max(technique.min_score, 2 * scores[0], 2 * scores[2])
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("size", [(480, 640), (120, 160)])
+@pytest.mark.parametrize("level", [0, 10, 170])
+def test_sensor_noise_does_not_become_ground(camera, size, level):
+    technique = create("cohog", {"camera": camera})
+    for sigma in (0, 1, 3):
+        assert technique.encode(noisy(np.full(size, level), sigma)).quality < technique.min_quality
+
+
+def test_a_picture_with_contrast_enough_is_not_touched():
+    picture = ramp(50, 160)
+    assert stretched(picture, None, PIXEL_PX, DOUBLED) is picture
+
+
+def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
+    inner = slice(8, -8)  # the ends of the range may be cut off
+    nearly = ramp(50, 50 + 101)
+    assert abs(stretched(nearly, None, PIXEL_PX, DOUBLED) - nearly)[:, inner].max() < 3
+    ranges = [np.ptp(stretched(ramp(20, 20 + levels), None, PIXEL_PX, DOUBLED)) for levels in (95, 90, 80, 70, 15)]
+    assert ranges[:4] == sorted(ranges[:4])
+    assert ranges[-1] == pytest.approx(200, abs=8), "never to more than what is wanted"
+
+
+def test_what_is_masked_changes_nothing_of_what_is_not():
+    dim = grey_square(noisy(0.15 * textured(1, 480, 640), 1), 512)
+    allowed = np.ones((512, 512), bool)
+    allowed[200:300, 100:400] = False
+    changed = np.where(allowed, dim, np.float32(255))
+    found, other = (stretched(each, allowed, PIXEL_PX, DOUBLED) for each in (dim, changed))
+    assert found is not dim
+    np.testing.assert_array_equal(found[allowed], other[allowed])
+    assert not np.array_equal(stretched(changed, None, PIXEL_PX, DOUBLED)[allowed], found[allowed])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 4000), (4000, 1), (13, 17)])
+def test_a_picture_of_any_shape_is_stretched_or_left(size):
+    for camera in CAMERAS:
+        quality = create("cohog", {"camera": camera}).encode(noisy(np.full(size, 40), 9)).quality
+        assert 0 <= quality <= 1
+
+
+def test_nothing_allowed_is_nothing_stretched():
+    dim = ramp(0, 20)
+    assert stretched(dim, np.zeros((512, 512), bool), PIXEL_PX, DOUBLED) is dim
