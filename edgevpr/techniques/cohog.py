@@ -221,7 +221,9 @@ class CoHog:
         """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
         fields = self._views_of(query).fields
         if (number, grid.side) not in fields:
-            view = self._views_of(query).regions(*hypothesis(number), self._patterns)
+            # The vote compares patterns too, and keeps them: the thesis's score compares whole blocks.
+            own = self._votes and self._view(query, number)
+            view = own or self._views_of(query).regions(*hypothesis(number), self._patterns)
             fields[number, grid.side] = layout.field(grid, view.regions, view.numbers, (view.side, self._side))
         return fields[number, grid.side]
 
