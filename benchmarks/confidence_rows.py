@@ -1,12 +1,14 @@
 """Evidence of every query of every set in the map of every set: what `confidence.py` fits and judges."""
 
 import pickle
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import base
 import numpy as np
+import run_sets
 import walks
 from base import DATA
 
@@ -52,7 +54,13 @@ def queries_of(name: str, is_own: bool) -> list[Path]:
 
 def rows_of(name: str) -> Iterator[Row]:
     """Ask the map of one set everything."""
-    folder, dataset = DATA / name, walks.dataset_of(DATA / name)
+    with tempfile.TemporaryDirectory() as work:
+        is_placed = (DATA / name / "sites.csv").exists()
+        yield from _rows(name, run_sets.placed(DATA / name, Path(work)) if is_placed else DATA / name)
+
+
+def _rows(name: str, folder: Path) -> Iterator[Row]:
+    dataset = walks.dataset_of(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
         rule = accept_rule(technique, walks.config().match)

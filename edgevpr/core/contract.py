@@ -128,7 +128,10 @@ class FineMatch:
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
     `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
-    `support`: further measures of the agreement with this shift."""
+    `support`: further measures of the agreement with this shift.
+    `stands_out`: by how much the structures of both pictures agree more at this shift than at any other, in standard
+    deviations (see `techniques.overlay`).
+    `votes`: share (0..1) of the query's regions that agree with this shift, where `score` counts more than these."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
@@ -137,6 +140,8 @@ class FineMatch:
     height_ratio: float | None = None
     coverage: float | None = None
     support: Support | None = None
+    stands_out: float | None = None
+    votes: float | None = None
 
 
 class Technique(Protocol):

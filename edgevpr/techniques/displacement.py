@@ -10,14 +10,15 @@ second measure. Regions are numbered row by row.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Ints, Singles
-from edgevpr.core.contract import Support
+from edgevpr.core.contract import FineMatch, Support
+from edgevpr.techniques.views import ViewRegions
 
 _ALONG = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
 _RANKED = 4  # one of so many regions is ranked: ranks cost more than all the rest
@@ -84,6 +85,37 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
 def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
     """Return only the `share` of the result of `displacement` for these arguments, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
+
+
+def voted(view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool) -> FineMatch:
+    """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
+    is that of `displacement`, and `with_support` tells whether the match gets its `support`."""
+    best = (view.regions @ reference.T).argmax(axis=1)
+    found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
+    asks_all = with_support and len(best)
+    return FineMatch(
+        min(1.0, found.share * view.worth),
+        shift_cells=found.shift_cells,
+        covariance_cells2=found.covariance_cells2,
+        coverage=found.agreeing / len(reference),
+        support=support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None,
+    )
+
+
+def fitted(view: ViewRegions, reference: Singles, match: FineMatch) -> FineMatch:
+    """Return the match of a view with shift, rotation and height as `align` finds them; as it is if that fails."""
+    best = (view.regions @ reference.T).argmax(axis=1)
+    around = match.shift_cells or (0.0, 0.0)
+    found = align((view.numbers, view.side), (best, math.isqrt(len(reference))), around)
+    if found is None:
+        return match
+    return replace(
+        match,
+        shift_cells=found.shift_cells,
+        covariance_cells2=found.covariance_cells2,
+        rotation_deg=((match.rotation_deg or 0.0) + found.turn_deg) % 360,
+        height_ratio=(match.height_ratio or 1.0) * found.scale,
+    )
 
 
 def support(

@@ -53,6 +53,19 @@ def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
     return cells.reshape(SIDE, SIDE, bins), (seen.ravel()[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
+def middle(per_block: Array, seen: Bools) -> Array:
+    """Cut out the middle square, at least 12 wide, of values per block, so that it holds no border of the picture.
+    `seen`, bool (n, n), is True for blocks that belong to the picture."""
+    n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
+    start = (len(seen) - n) // 2
+    return per_block[start : start + n, start : start + n]
+
+
+def middle_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
+    """Make the `seen_grid` of the `middle` of a picture."""
+    return seen_grid(middle(blocks, seen), middle(seen, seen))
+
+
 def special(grids: Floats, mean: Floats) -> Array:
     """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
     Fourier series: float32 of the shape of `grids`."""

@@ -70,6 +70,7 @@ class Views:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
+        self._halved: tuple[Array, Mask] | None = None
         self._scaled: dict[float, tuple[Array, Array]] = {}
         self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
@@ -103,6 +104,18 @@ class Views:
             side=side,
             worth=worth,
         )
+
+    def halved(self) -> tuple[Array, Mask]:
+        """Return the picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and
+        bool (side, side), True for allowed pixels."""
+        side = (self._side + 1) * max(2, self._cell_px // 2)
+        if self._halved is None:
+            grey, allowed = self._picture.grey, self._picture.allowed
+            if grey is None or allowed is None:
+                raise ValueError("a picture that is not kept cannot be turned")
+            small = cv2.resize(allowed.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST)
+            self._halved = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA), small.astype(bool)
+        return self._halved
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
         """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three

@@ -4,7 +4,8 @@ There are three kinds: for a camera that looks ahead (AHEAD), and for one that l
 (DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if they
 show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
 
-* agree: logarithm of the share of regions that agree; ahead, of its geometric mean over query and place
+* agree: logarithm of the share of regions that agree; ahead, of its geometric mean over query and place; down, times
+  how well the layouts agree (`FineMatch.votes`)
 * lead: `agree` minus the largest `agree` of a place elsewhere
 * lead_around: the same for the logarithm of the score, averaged over a place and its neighbours in the index (ahead)
 * coverage: logarithm of the share of the place's regions that agree, each counted once
@@ -12,6 +13,7 @@ show the same shift between query and place. Larger figures speak for the match,
 * mutual_best: 1 if this share is larger at no place elsewhere, else 0 (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
 * back, likeness: logarithm of `Support.back`, and `Support.likeness` (ahead)
+* stands_out: `FineMatch.stands_out` (down)
 * landmarks: logarithm of one more than the number of landmarks that agree as expected (down)
 """
 
@@ -34,7 +36,8 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
-_LOOKING_DOWN = {DOWN: ("agree", "lead", "coverage", "landmarks"), DOWN_BARE: ("agree", "lead", "coverage")}
+_BARE = ("agree", "lead", "coverage", "stands_out")
+_LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
 OF_MAP = {AHEAD: ("mutual", "coverage", "back", "likeness"), **_LOOKING_DOWN}
 OF_PLACE = {AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"), **_LOOKING_DOWN}
@@ -174,11 +177,12 @@ def _evidence_ahead(matches: dict[int, FineMatch], best: int, away: frozenset[in
 def _evidence_down(
     matches: dict[int, FineMatch], best: int, away: frozenset[int], proof: Agreement | None
 ) -> dict[str, float]:
-    score = {slot: match.score for slot, match in matches.items()}
+    votes = {slot: match.score if match.votes is None else match.votes for slot, match in matches.items()}
     evidence = {
-        "agree": _log_share(score[best]),
-        "lead": _lead(score, best, away),
+        "agree": _log_share(votes[best]),
+        "lead": _lead(votes, best, away),
         "coverage": _log_share(matches[best].coverage or 0.0),
+        "stands_out": matches[best].stands_out or 0.0,
     }
     if proof is not None:
         evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)

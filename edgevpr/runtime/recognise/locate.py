@@ -26,6 +26,7 @@ _OF_SCATTER = 0.25  # share of the covariance of single votes that their mean ha
 _LIKE_THE_BEST = 0.5  # of the best score: matches with at least that score are used too
 _DISAGREES = 4.0  # standard deviations: places that differ by more are not used
 _CONTRADICTS = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
+_OUTWEIGHS = 0.4  # share of the scores of agreeing places; contradicting ones with more make the position doubtful
 HEARD = 12  # places looked at; in a dense map so many show the same ground
 _SAYING = 5  # of these determine the position
 
@@ -110,27 +111,23 @@ def located(
     best = _by_vote(found[0], cells)
     if best is None:
         return None
-    least = _LIKE_THE_BEST * found[0].match.score
-    others = (_by_vote(candidate, cells) for candidate in found[1:] if not candidate.match.score < least)
-    heard = [best, *(lies for lies in others if lies and _shows_the_same(lies, best))]
+    laid = [(candidate.match.score, _by_vote(candidate, cells)) for candidate in found]
+    heard = [(score, lies) for score, lies in laid if lies and _shows_the_same(lies, best)]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
-        heard.insert(0, _by_landmarks(best, proof))
-    first, *more = (_said(lies, best.position, view.aside or (0.0, 0.0)) for lies in heard)
-    agreeing, against_m = [first], 0.0
-    for said in more:
-        if first.agrees_with(said):
-            agreeing.append(said)
-        else:
-            against_m = max(against_m, float(np.hypot(*(said.at_m - first.at_m))))
-    at_m, covariance = _joined(agreeing[:_SAYING])
+        heard.insert(0, (heard[0][0], _by_landmarks(best, proof)))
+    said = [(score, _said(lies, best.position, view.aside or (0.0, 0.0))) for score, lies in heard]
+    first, least = said[0][1], _LIKE_THE_BEST * found[0].match.score
+    agreeing = [(score, each) for score, each in said if first.agrees_with(each)]
+    at_m, covariance = _joined([each for score, each in agreeing if score >= least][:_SAYING])
     way, footprint_m = first.lies, best.pose.footprint_m
     if view.lean_m is not None:
         at_m = at_m + view.lean_m
     elif view.aside is None:
         covariance += (UNTOLD_TILT * footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
-    objection = None
-    if against_m > _CONTRADICTS * footprint_m:
-        objection = f"places of the same ground say positions that are {against_m:.0f} m apart"
+    objection, apart_m = None, [(score, float(np.hypot(*(each.at_m - first.at_m)))) for score, each in said]
+    against = [(score, off_m) for score, off_m in apart_m if score >= least and off_m > _CONTRADICTS * footprint_m]
+    if sum(score for score, _ in against) > _OUTWEIGHS * sum(score for score, _ in agreeing):
+        objection = f"places of the same ground say positions that are {max(against)[1]:.0f} m apart"
     lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
         position=Position(lat_deg, lon_deg, best.position.alt_m),
@@ -138,7 +135,7 @@ def located(
         heading_deg=(best.pose.up_deg + way.rotation_deg) % 360,
         height_ratio=way.height_ratio and way.height_ratio * view.zoom,
         footprint_m=footprint_m * (way.height_ratio or 1.0),
-        places=tuple(dict.fromkeys(said.lies.place_id for said in agreeing)),
+        places=tuple(dict.fromkeys(each.lies.place_id for _, each in agreeing)),
         objection=objection,
     )
 

@@ -1,0 +1,78 @@
+"""The last look of `cohog` with a camera that looks straight down: the query is laid exactly over a place.
+
+The vote (see `displacement`) and the fit of its pairs say where the query lies on the place, how it is turned, and how
+large it is. If they are right, the structures of both pictures coincide everywhere, those of changed ground as well:
+few single regions are still each other's most similar ones, but all of them together agree. If they are wrong, only
+what made them look right agrees: a road, or the edge of a field. It agrees nearly as well if the query is pushed along.
+
+So the query's picture is turned, scaled and shifted as the match says, and described again. The *structure* of a
+picture is the patterns of its regions less what those around have in common (see `layout`). The agreement of the two
+structures is their correlation over what independent ones would scatter by. What counts is how far it stands out: how
+much larger it is where the query should lie than at any shift of some cells.
+"""
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Array, Bools, Mask, Singles
+from edgevpr.core.contract import FineMatch
+
+_AROUND_CELLS = 3.0  # standard deviation of what counts as around a region
+_LEAST_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
+_ROOM, _MISSES, _PEAK = 7, 2, 2  # cells: shifts compared; by which a match may miss; that belong to the same peak
+_LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_TINY = 1e-9
+
+
+def laid(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> tuple[Array, Mask]:
+    """Turn, scale and shift a query's picture, float32 (side, side), as its match with a place says, so that it lies
+    over the place's, which has `cells` cells along a side. `allowed`, bool of the same shape, is True for pixels that
+    may be used. Returns both as they lie over the place."""
+    side = len(grey)
+    middle = np.full(2, (side - 1) / 2)
+    turned = np.deg2rad(match.rotation_deg or 0.0)
+    turn = (match.height_ratio or 1.0) * np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
+    shift = middle + np.array(match.shift_cells) * (side / cells) - turn @ middle
+    matrix = np.column_stack([turn, shift])
+    there: Array = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
+    seen: Array = cv2.warpAffine(allowed.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_NEAREST)
+    return there, seen.astype(bool)
+
+
+def structure(patterns: Array, seen: Bools) -> Singles:
+    """Return the structure of a picture, float32 (n, n, P), from the patterns of its regions (n * n, P), of which those
+    count that are `seen`, bool (n, n)."""
+    weight = seen.astype(np.float32)
+    values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
+    near = _around(values) / np.maximum(_around(weight), _TINY)[..., None]
+    values -= near * weight[..., None]
+    strength = np.sqrt((values**2).sum(axis=2))
+    found: Singles = values / np.sqrt(np.maximum(strength, _LEAST_STRENGTH))[..., None]
+    return found
+
+
+def stands_out(query: Singles, place: Singles) -> float:
+    """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, stands out
+    from that at other shifts, in standard deviations of independent structures."""
+    agree = _agreements(query, place, _ROOM)
+    first, last = _ROOM - _MISSES, _ROOM + _MISSES + 1
+    at_y, at_x = np.divmod(int(agree[first:last, first:last].argmax()), last - first)
+    y, x = at_y + first, at_x + first
+    peak = float(agree[y, x])
+    agree[max(0, y - _PEAK) : y + _PEAK + 1, max(0, x - _PEAK) : x + _PEAK + 1] = -np.inf
+    return peak - float(agree.max())
+
+
+def _agreements(query: Singles, place: Singles, room: int) -> Singles:
+    """Return the agreement of two structures at all shifts up to `room` cells, (2 room + 1, 2 room + 1)."""
+    border = ((room, room), (room, room))
+    common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
+    of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
+    scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
+    least = _LEAST_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
+    found: Singles = common / np.sqrt(np.maximum(scatter, least) + _TINY)
+    return found
+
+
+def _around(values: Singles) -> Singles:
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), _AROUND_CELLS, borderType=cv2.BORDER_CONSTANT))

@@ -1,0 +1,86 @@
+"""The last look: a query laid exactly over a place stands out there, and nowhere where only a part of it agrees."""
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.core.contract import FineMatch
+from edgevpr.techniques import overlay
+from edgevpr.techniques.cohog import CoHog
+
+SIDE_PX, CELLS, REGIONS = 256, 32, 31
+ALLOWED = np.ones((SIDE_PX, SIDE_PX), bool)
+SEEN = np.ones((REGIONS, REGIONS), bool)
+
+
+def ground_of(seed):
+    coarse = np.random.default_rng(seed).uniform(0, 255, (40, 40)).astype(np.float32)
+    return cv2.resize(coarse, (2 * SIDE_PX, 2 * SIDE_PX), interpolation=cv2.INTER_CUBIC).clip(0, 255)
+
+
+def view(ground, turned_deg=0.0, right_px=0.0, down_px=0.0, height=1.0):
+    """What a camera sees that has turned clockwise, moved and risen."""
+    middle = np.array([SIDE_PX - 0.5 + right_px, SIDE_PX - 0.5 + down_px])
+    moved = cv2.getRotationMatrix2D(middle.tolist(), turned_deg, 1 / height)
+    moved[:, 2] += (SIDE_PX - 1) / 2 - middle
+    return cv2.warpAffine(ground, moved, (SIDE_PX, SIDE_PX))
+
+
+def patterns(seed):
+    found = np.random.default_rng(seed).normal(size=(REGIONS**2, 20)).astype(np.float32)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("turned_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
+def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height):
+    ground = ground_of(1)
+    match = FineMatch(
+        0.1,
+        shift_cells=(right_px * CELLS / SIDE_PX, down_px * CELLS / SIDE_PX),
+        rotation_deg=turned_deg,
+        height_ratio=height,
+    )
+    laid, seen = overlay.laid(view(ground, turned_deg, right_px, down_px, height), ALLOWED, match, CELLS)
+    assert 0.4 < seen.mean() < 1
+    inside = cv2.erode(seen.astype(np.uint8), np.ones((5, 5))).astype(bool)
+    assert np.corrcoef(laid[inside], view(ground)[inside])[0, 1] > 0.98
+
+
+def test_the_same_structure_stands_out_also_a_cell_or_two_beside():
+    place = overlay.structure(patterns(1), SEEN)
+    assert overlay.stands_out(place, place) > 10
+    moved = np.roll(place, (2, -1), axis=(0, 1))
+    assert overlay.stands_out(moved, place) == pytest.approx(overlay.stands_out(place, place), rel=0.2)
+
+
+def test_another_structure_does_not_stand_out():
+    place = overlay.structure(patterns(0), SEEN)
+    others = [overlay.stands_out(overlay.structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
+    assert max(others) < 2
+
+
+def test_what_agrees_when_pushed_along_does_not_stand_out():
+    row = patterns(3)[:REGIONS]
+    road = overlay.structure(np.repeat(row, REGIONS, axis=0), SEEN)  # each row is of one pattern
+    assert overlay.stands_out(road, road) < 2
+    furrows = overlay.structure(np.tile(row[:4], (REGIONS * REGIONS // 4 + 1, 1))[: REGIONS**2], SEEN)
+    assert overlay.stands_out(furrows, furrows) < 3
+
+
+def test_regions_that_are_not_seen_say_nothing():
+    some = np.zeros_like(SEEN)
+    some[:4, :4] = True
+    place = overlay.structure(patterns(1), SEEN)
+    assert overlay.stands_out(overlay.structure(patterns(1), some), place) < overlay.stands_out(place, place) / 2
+    assert overlay.stands_out(overlay.structure(patterns(1), np.zeros_like(SEEN)), place) == 0
+
+
+def test_a_match_of_changed_ground_stands_out():
+    technique = CoHog(camera="nadir")
+    places = [np.dstack([view(ground_of(seed))] * 3).astype(np.uint8) for seed in range(4)]
+    changed = view(ground_of(0), 33, 20, -12) * 0.6 + np.random.default_rng(0).normal(40, 12, (SIDE_PX, SIDE_PX))
+    query = technique.encode(np.dstack([changed.clip(0, 255)] * 3).astype(np.uint8))
+    matches = [technique.match(query, technique.encode(place).fine) for place in places]
+    assert matches[0].stands_out > 4 > 2 > max(match.stands_out for match in matches[1:])
+    assert matches[0].score > 3 * max(match.score for match in matches[1:])
+    assert matches[0].rotation_deg == pytest.approx(33, abs=3)
