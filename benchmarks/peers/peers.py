@@ -136,7 +136,7 @@ easy to tell ways apart. The seasons of grief_stromovka_seasons and nordland_tin
 aerial_swindale ORB and SIFT with the ratio test miss one in ten, which so few queries hardly tell from none, and the
 others much more. On kite_ochota SIFT-VLAD finds as many (and more among the first five), and the published
 CoHOG and SIFT nearly as many. Encoding takes it a few milliseconds, as ORB, a sixth of the published way and less than
-a tenth of SIFT. A place takes 144 or 200 bytes, where the others take thousands; only its own codes in FAISS are as
+a tenth of SIFT. A place takes 144 or 1120 bytes, where the others take thousands; only its own codes in FAISS are as
 small, and those alone find much less.
 
 Where it is not: matching. It compares places in full, and looking down also their landmarks, for a tenth to a fifth of

@@ -107,14 +107,12 @@ class Support:
     """Agreement of all regions of query and place with one displacement: the shift that `FineMatch.shift_cells` gives.
 
     `back`: share (0..1) of the place's regions whose most similar region of the query lies at this displacement.
-    `mutual`: share (0..1) where, in addition, the query's region finds the place's region as its most similar one.
     `likeness`: mean cosine similarity of each region of the query to the most similar one of the place, anywhere.
     `log_rank`: for each region of the query, the place's regions are ranked by similarity; mean natural logarithm of
     the rank (from 1) of the region at this displacement.
     """
 
     back: float
-    mutual: float
     likeness: float
     log_rank: float
 
@@ -129,8 +127,8 @@ class FineMatch:
     `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
     `support`: further measures of the agreement with this shift.
-    `stands_out`: by how much the structures of both pictures agree more at this shift than at any other, in standard
-    deviations (see `techniques.overlay`).
+    `structure`: how well the structures of both pictures agree at this shift, and with a camera that looks straight
+    down, how much better than at others, in standard deviations (see `techniques.overlay`).
     `votes`: share (0..1) of the query's regions that agree with this shift, where `score` counts more than these."""
 
     score: float = field(kw_only=False)
@@ -140,7 +138,7 @@ class FineMatch:
     height_ratio: float | None = None
     coverage: float | None = None
     support: Support | None = None
-    stands_out: float | None = None
+    structure: float | None = None
     votes: float | None = None
 
 

@@ -76,19 +76,21 @@ class Scan:
     by_hypothesis: Singles | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
     """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
     (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score.
     Places compared in part only (see `Technique.glance`) come after those compared in full.
     `unread` int (U,): slots of places that cannot be read from the file, but that the query may show as well, because
     the scan scored their row in the index (see `Scan`) at least as high as the best place's, or among the three best.
+    `tried`: share (0..1) of the rotations under which the query could match that were not ruled out.
     """
 
     slots: Ints
     scores: Singles
     compared: dict[int, FineMatch]
     unread: Ints = field(default_factory=lambda: np.empty(0, np.intp))
+    tried: float = 1.0
 
     @property
     def compared_slots(self) -> list[int]:
@@ -151,10 +153,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
     slots, found = slots[order], found[order]
     last = sorted((glance for glance in looks.passed_over if glance[1][0] not in looks.scores), key=lambda it: -it[0])
     return Ranking(
-        np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
-        np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
-        looks.matches,
-        _unread(scanned.scores, readable, slots[0]),
+        slots=np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
+        scores=np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
+        compared=looks.matches,
+        unread=_unread(scanned.scores, readable, slots[0]),
+        tried=_tried(scanned.by_hypothesis, slots, len(spec.height_ratios)),
     )
 
 
@@ -248,7 +251,13 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
     scores |= {slot: min(last[slot], least) for slot in sorted(last, key=lambda slot: -last[slot])}
     unread = np.union1d(one.unread, other.unread).astype(np.intp)
-    return Ranking(np.array(list(scores), np.intp), np.array(list(scores.values()), np.float32), compared, unread)
+    return Ranking(
+        slots=np.array(list(scores), np.intp),
+        scores=np.array(list(scores.values()), np.float32),
+        compared=compared,
+        unread=unread,
+        tried=min(1.0, one.tried + other.tried),
+    )
 
 
 def elsewhere(index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = ()) -> Bools:
@@ -322,6 +331,14 @@ def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
         likely = min(_LIKELY, len(scores))
         slots = slots[scores[slots] >= min(scores[best], np.partition(scores, -likely)[-likely])]
     return slots
+
+
+def _tried(by_hypothesis: Singles | None, slots: Ints, heights: int) -> float:
+    """Return the share of the rotations from one of the `heights` that were tried at `slots` (see `Ranking`)."""
+    if by_hypothesis is None:
+        return 1.0
+    tried = np.isfinite(by_hypothesis[slots]).mean(axis=1) * max(heights, 1)
+    return float(np.minimum(tried, 1.0).mean())
 
 
 def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:

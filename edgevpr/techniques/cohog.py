@@ -47,7 +47,7 @@ _VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # or on aerial_caliterra (nadir) reached both values, nor did any query of two other sites in the map of
 # aerial_caliterra. The thesis's score has no safe threshold: its margin rejects those queries of other sites, and most
 # right matches too.
-_ACCEPT = {"forward": (0.07, 0.035), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
+_ACCEPT = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
 # Least quality. On the tuning sets, accepted pictures that show nothing had .39 or less, and real ones, washed out or
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
@@ -67,9 +67,12 @@ _BINS_DOWN = 8  # orientations of the regions whose patterns make a layout
 # sat_marash have .18 to .38, those of one season up to .5. At .35 one foreign picture was accepted in the map of
 # aerial_caliterra, from .4 on none in the maps of sat_marash, kite_ochota, aerial_swindale and aerial_caliterra.
 _LAYOUT_AGREES = 0.45
-# A match that stands out by the second figure keeps its score, and its share is less for one that stands out by less.
-# Foreign pictures seldom do by more than the first.
-_STANDS_OUT = 1.0, 3.0
+# What counts as around a region in the structure of a picture (see `overlay`). Ahead, things are larger.
+_AROUND_CELLS = {"forward": 5.0, "nadir": 3.0}
+# A match whose structures agree by the second figure keeps its score; below the first one they count as this much.
+# Foreign pictures have at most 4.9 ahead, and 2.7 looking down. In corridor all that lies ahead is built alike, and up
+# to 15 is reached at wrong places too.
+_STRUCTURE = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
 _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
 
@@ -237,16 +240,18 @@ class CoHog:
         query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
         counts, and `align` refines its shift, rotation and height."""
         reference = self._reference(fine)
-        if not self._is_nadir:
-            return self._matched(self._view(query, self._hypotheses[0]), reference)
-        best, match = self._likest(query, reference, hypotheses)
-        if not self._votes or match.shift_cells is None:
+        if self._is_nadir:
+            best, match = self._likest(query, reference, hypotheses)
+        else:
+            best, match = self._hypotheses[0], self._matched(self._view(query, self._hypotheses[0]), reference)
+        if match.shift_cells is None:
             return match
-        match = fitted(self._view(query, best), reference, match)
-        stands_out = self._stands_out(query, reference, match)
-        least, most = _STANDS_OUT
-        counts = min(max(stands_out, least), most) / most
-        return replace(match, score=match.score * counts, votes=match.score, stands_out=stands_out)
+        if self._is_nadir:
+            match = fitted(self._view(query, best), reference, match)
+        structure = self._agreement(query, reference, match)
+        least, most = _STRUCTURE[self.camera]
+        counts = min(max(structure, least), most) / most
+        return replace(match, score=match.score * counts, votes=match.score, structure=structure)
 
     def _likest(self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None) -> tuple[int, FineMatch]:
         """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
@@ -263,15 +268,23 @@ class CoHog:
         scale = scale_of(self._side + 1, ratio)
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale)
 
-    def _stands_out(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
-        """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place."""
-        grey, allowed = self._views_of(query).halved()
-        blocks, seen = self._all_blocks(
-            *overlay.laid(grey, allowed, match, self._side + 1), len(grey) // (self._side + 1)
-        )
-        asked = overlay.structure(self._patterns(blocks.reshape(-1, 4 * self.bins)), seen)
+    def _agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
+        """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
+        how well their structures agree, or with a nadir camera, how far this stands out."""
+        views, cells = self._views_of(query), self._side + 1
         known = reference.any(axis=1).reshape(self._side, self._side)
-        return overlay.stands_out(asked, overlay.structure(reference, known))
+        place = overlay.structure(reference, known, _AROUND_CELLS[self.camera])
+        if self._is_nadir:
+            grey, allowed = views.halved()
+            laid = overlay.laid(grey, allowed, match, cells)
+            return overlay.stands_out(self._structure(*self._all_blocks(*laid, len(grey) // cells)), place)
+        if views.structure is None:
+            views.structure = self._structure(views.blocks(1.0, 0)[0], views.seen)
+        return overlay.agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
+
+    def _structure(self, blocks: Singles, seen: Bools) -> Singles:
+        """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
+        return overlay.structure(self._patterns(blocks.reshape(-1, 4 * self.bins)), seen, _AROUND_CELLS[self.camera])
 
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None

@@ -16,7 +16,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Ints, Singles
+from edgevpr.core.arrays import Array, Ints, Singles
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.techniques.views import ViewRegions
 
@@ -128,16 +128,10 @@ def support(
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
     step_x, step_y = (round(step) for step in shift_cells)
-
-    def along(query: Ints, place: Ints) -> Bools:
-        y, x = np.divmod(place, side)
-        off: Ints = np.maximum(abs(x - of_x[query] - step_x), abs(y - of_y[query] - step_y))
-        return off <= _ALONG
-
-    mutual = (back[best] == np.arange(len(asking))) & along(np.arange(len(asking)), best)
+    y, x = np.divmod(np.arange(len(reference)), side)
+    off = np.maximum(abs(x - of_x[back] - step_x), abs(y - of_y[back] - step_y))
     return Support(
-        back=float(along(back, np.arange(len(reference))).mean()),
-        mutual=float(np.count_nonzero(mutual)) / len(reference),
+        back=float((off <= _ALONG).mean()),
         likeness=float(np.einsum("ij,ij->i", regions, reference[best]).mean()),
         log_rank=_log_rank(regions[::_RANKED], reference, of_x[::_RANKED] + step_x, of_y[::_RANKED] + step_y, side),
     )

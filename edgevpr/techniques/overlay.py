@@ -1,14 +1,15 @@
-"""The last look of `cohog` with a camera that looks straight down: the query is laid exactly over a place.
+"""The last look of `cohog`: the query is laid over a place as its match says.
 
-The vote (see `displacement`) and the fit of its pairs say where the query lies on the place, how it is turned, and how
-large it is. If they are right, the structures of both pictures coincide everywhere, those of changed ground as well:
-few single regions are still each other's most similar ones, but all of them together agree. If they are wrong, only
-what made them look right agrees: a road, or the edge of a field. It agrees nearly as well if the query is pushed along.
+If the match is right, the structures of both pictures coincide, those of changed ground as well: few single regions are
+still each other's most similar ones, but all of them together agree. The *structure* of a picture is the patterns of
+its regions less what those around have in common (see `layout`). The *agreement* of two structures is their correlation
+over what independent ones would scatter by.
 
-So the query's picture is turned, scaled and shifted as the match says, and described again. The *structure* of a
-picture is the patterns of its regions less what those around have in common (see `layout`). The agreement of the two
-structures is their correlation over what independent ones would scatter by. What counts is how far it stands out: how
-much larger it is where the query should lie than at any shift of some cells.
+With a camera that looks ahead, the agreement at the shift that was voted for counts (see `displacement`). With a camera
+that looks straight down, the query's picture is first turned, scaled and shifted by the fit of the pairs that agree,
+and described again. There, a wrong match has a road or the edge of a field in common with the place, which agrees
+nearly as well if the query is pushed along it. So it counts how far the agreement stands out: how much larger it is
+where the query should lie than at any shift of some cells.
 """
 
 import cv2
@@ -17,7 +18,6 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Mask, Singles
 from edgevpr.core.contract import FineMatch
 
-_AROUND_CELLS = 3.0  # standard deviation of what counts as around a region
 _LEAST_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
 _ROOM, _MISSES, _PEAK = 7, 2, 2  # cells: shifts compared; by which a match may miss; that belong to the same peak
 _LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
@@ -39,12 +39,12 @@ def laid(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> tuple[Arra
     return there, seen.astype(bool)
 
 
-def structure(patterns: Array, seen: Bools) -> Singles:
+def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
     """Return the structure of a picture, float32 (n, n, P), from the patterns of its regions (n * n, P), of which those
-    count that are `seen`, bool (n, n)."""
+    count that are `seen`, bool (n, n). `around_cells` is the standard deviation of what counts as around a region."""
     weight = seen.astype(np.float32)
     values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
-    near = _around(values) / np.maximum(_around(weight), _TINY)[..., None]
+    near = _around(values, around_cells) / np.maximum(_around(weight, around_cells), _TINY)[..., None]
     values -= near * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
     found: Singles = values / np.sqrt(np.maximum(strength, _LEAST_STRENGTH))[..., None]
@@ -63,6 +63,18 @@ def stands_out(query: Singles, place: Singles) -> float:
     return peak - float(agree.max())
 
 
+def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) -> float:
+    """Return the agreement of two structures (n, n, P), in standard deviations of independent ones, with the query's
+    middle at the shift (dx, dy) from that of the place, or up to two cells beside."""
+    n = len(place)
+    dx, dy = (min(max(round(each), _MISSES - n), n - _MISSES) for each in shift_cells)
+    laid_over = np.zeros_like(query)
+    laid_over[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)] = query[
+        max(0, -dy) : n + min(0, -dy), max(0, -dx) : n + min(0, -dx)
+    ]
+    return float(_agreements(laid_over, place, _MISSES).max())
+
+
 def _agreements(query: Singles, place: Singles, room: int) -> Singles:
     """Return the agreement of two structures at all shifts up to `room` cells, (2 room + 1, 2 room + 1)."""
     border = ((room, room), (room, room))
@@ -74,5 +86,5 @@ def _agreements(query: Singles, place: Singles, room: int) -> Singles:
     return found
 
 
-def _around(values: Singles) -> Singles:
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), _AROUND_CELLS, borderType=cv2.BORDER_CONSTANT))
+def _around(values: Singles, cells: float) -> Singles:
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), cells, borderType=cv2.BORDER_CONSTANT))

@@ -72,6 +72,7 @@ class Views:
         self._encoded = {(1.0, 0): square}
         self._halved: tuple[Array, Mask] | None = None
         self._scaled: dict[float, tuple[Array, Array]] = {}
+        self.structure: Singles | None = None  # of the unchanged view (see `overlay`)
         self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 

@@ -48,7 +48,7 @@ def ranked(scores, slots=None):
         slot: FineMatch(float(scores[slot]), shift_cells=(float(slot), 1.0), rotation_deg=30.0)
         for slot in slots.tolist()
     }
-    return Ranking(slots, scores[slots].astype(np.float32), matches)
+    return Ranking(slots=slots, scores=scores[slots].astype(np.float32), compared=matches)
 
 
 def dense(ranking, places):

@@ -10,7 +10,9 @@ def ranking(compared, rest=(), unread=()):
     slots = [*compared, *(slot for slot, _ in rest)]
     scores = [*compared.values(), *(score for _, score in rest)]
     matches = {slot: FineMatch(score) for slot, score in compared.items()}
-    return Ranking(np.array(slots), np.array(scores, np.float32), matches, np.array(unread, np.intp))
+    return Ranking(
+        slots=np.array(slots), scores=np.array(scores, np.float32), compared=matches, unread=np.array(unread, np.intp)
+    )
 
 
 def test_of_a_place_that_both_compared_the_better_match_counts():

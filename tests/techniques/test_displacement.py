@@ -88,7 +88,7 @@ def test_a_region_that_many_resemble_agrees_once():
 
 
 def support_by_hand(asking, regions, reference, step):
-    """Every region in turn: back, mutual, likeness and log rank of a step."""
+    """Every region in turn: back, likeness and log rank of a step."""
     side = math.isqrt(len(reference))
     best = [max(range(len(reference)), key=lambda r: float(regions[q] @ reference[r])) for q in range(len(asking))]
     back = [max(range(len(asking)), key=lambda q: float(regions[q] @ reference[r])) for r in range(len(reference))]
@@ -108,7 +108,6 @@ def support_by_hand(asking, regions, reference, step):
         log_ranks.append(math.log(1 + sum(float(regions[q] @ each) > there for each in reference)))
     return (
         sum(along(back[r], r) for r in range(len(reference))) / len(reference),
-        sum(back[best[q]] == q and along(q, best[q]) for q in range(len(asking))) / len(reference),
         sum(float(regions[q] @ reference[best[q]]) for q in range(len(asking))) / len(asking),
         sum(log_ranks) / len(log_ranks) if log_ranks else math.log(len(reference)),
     )
@@ -126,13 +125,13 @@ def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
     best = (regions @ reference.T).argmax(axis=1)
     found = support(asking, regions, reference, best, step)
     expected = support_by_hand(asking.tolist(), regions, reference, step)
-    assert (found.back, found.mutual, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
+    assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_picture_supports_its_own_step_entirely():
     regions = np.eye(100, dtype=np.float32)
     asking = np.arange(100)
     own = support(asking, regions, regions, asking, (0.0, 0.0))
-    assert (own.back, own.mutual, own.likeness, own.log_rank) == (1.0, 1.0, 1.0, 0.0)
+    assert (own.back, own.likeness, own.log_rank) == (1.0, 1.0, 0.0)
     moved = support(asking, regions, regions, asking, (5.0, 0.0))
-    assert (moved.back, moved.mutual) == (0.0, 0.0)
+    assert moved.back == 0.0

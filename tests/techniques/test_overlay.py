@@ -1,5 +1,7 @@
 """The last look: a query laid exactly over a place stands out there, and nowhere where only a part of it agrees."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from edgevpr.techniques.cohog import CoHog
 SIDE_PX, CELLS, REGIONS = 256, 32, 31
 ALLOWED = np.ones((SIDE_PX, SIDE_PX), bool)
 SEEN = np.ones((REGIONS, REGIONS), bool)
+
+structure = partial(overlay.structure, around_cells=3.0)
 
 
 def ground_of(seed):
@@ -47,32 +51,41 @@ def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height
 
 
 def test_the_same_structure_stands_out_also_a_cell_or_two_beside():
-    place = overlay.structure(patterns(1), SEEN)
+    place = structure(patterns(1), SEEN)
     assert overlay.stands_out(place, place) > 10
     moved = np.roll(place, (2, -1), axis=(0, 1))
     assert overlay.stands_out(moved, place) == pytest.approx(overlay.stands_out(place, place), rel=0.2)
 
 
 def test_another_structure_does_not_stand_out():
-    place = overlay.structure(patterns(0), SEEN)
-    others = [overlay.stands_out(overlay.structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
+    place = structure(patterns(0), SEEN)
+    others = [overlay.stands_out(structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
     assert max(others) < 2
 
 
 def test_what_agrees_when_pushed_along_does_not_stand_out():
     row = patterns(3)[:REGIONS]
-    road = overlay.structure(np.repeat(row, REGIONS, axis=0), SEEN)  # each row is of one pattern
+    road = structure(np.repeat(row, REGIONS, axis=0), SEEN)  # each row is of one pattern
     assert overlay.stands_out(road, road) < 2
-    furrows = overlay.structure(np.tile(row[:4], (REGIONS * REGIONS // 4 + 1, 1))[: REGIONS**2], SEEN)
+    furrows = structure(np.tile(row[:4], (REGIONS * REGIONS // 4 + 1, 1))[: REGIONS**2], SEEN)
     assert overlay.stands_out(furrows, furrows) < 3
 
 
 def test_regions_that_are_not_seen_say_nothing():
     some = np.zeros_like(SEEN)
     some[:4, :4] = True
-    place = overlay.structure(patterns(1), SEEN)
-    assert overlay.stands_out(overlay.structure(patterns(1), some), place) < overlay.stands_out(place, place) / 2
-    assert overlay.stands_out(overlay.structure(patterns(1), np.zeros_like(SEEN)), place) == 0
+    place = structure(patterns(1), SEEN)
+    assert overlay.stands_out(structure(patterns(1), some), place) < overlay.stands_out(place, place) / 2
+    assert overlay.stands_out(structure(patterns(1), np.zeros_like(SEEN)), place) == 0
+
+
+def test_structures_agree_only_at_the_shift_that_is_asked_for():
+    place = structure(patterns(1), SEEN)
+    query = np.roll(place, (3, 9), axis=(0, 1))  # its middle lies to the left of the place's, and above
+    there = overlay.agreement(query, place, (-9.0, -3.0))
+    assert there > 10 > 3 > overlay.agreement(query, place, (9.0, 3.0))
+    assert overlay.agreement(query, place, (-8.0, -1.4)) == pytest.approx(there, rel=0.1)
+    assert overlay.agreement(query, place, (400.0, -400.0)) < 3
 
 
 def test_a_match_of_changed_ground_stands_out():
@@ -81,6 +94,16 @@ def test_a_match_of_changed_ground_stands_out():
     changed = view(ground_of(0), 33, 20, -12) * 0.6 + np.random.default_rng(0).normal(40, 12, (SIDE_PX, SIDE_PX))
     query = technique.encode(np.dstack([changed.clip(0, 255)] * 3).astype(np.uint8))
     matches = [technique.match(query, technique.encode(place).fine) for place in places]
-    assert matches[0].stands_out > 4 > 2 > max(match.stands_out for match in matches[1:])
+    assert matches[0].structure > 4 > 2 > max(match.structure for match in matches[1:])
     assert matches[0].score > 3 * max(match.score for match in matches[1:])
     assert matches[0].rotation_deg == pytest.approx(33, abs=3)
+
+
+def test_ahead_the_structures_weigh_the_score():
+    technique = CoHog()
+    seen = [np.dstack([view(ground_of(seed))] * 3).astype(np.uint8) for seed in (0, 1)]
+    places, query = [technique.encode(picture) for picture in seen], technique.encode(seen[0])
+    same, other = (technique.match(query, place.fine) for place in places)
+    assert same.structure > 6 > 4 > other.structure
+    assert same.score == same.votes
+    assert other.score < other.votes

@@ -30,7 +30,9 @@ from edgevpr.runtime.recognise.salience_gate import Gate
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]  # yields the items, of that number, and shows it with a label
-_NOTHING_FOUND = Ranking(np.empty(0, np.intp), np.empty(0, np.float32), {})  # e.g. of a discarded query
+_NOTHING_FOUND = Ranking(
+    slots=np.empty(0, np.intp), scores=np.empty(0, np.float32), compared={}
+)  # e.g. of a discarded query
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,6 +29,10 @@ _MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
 # queries were accepted over grief_michigan_monthly, of five places.
 _NOT_ADAPTED = 0.1
 _LEAST = 1e-15  # least chance, so that its logarithm exists
+# Power of the share of rotations tried, as a factor of a chance: 1 if rotations were independent, but streets and
+# furrows have directions. Of 2,015 foreign and mirrored pictures, asked with random headings in the maps of sat_marash
+# and aerial_garfield28, 3 had a chance below 1 % without this factor, and 12 one below 30 %.
+_OF_ROTATIONS = 2 / 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +97,13 @@ class Model:
     made_of: str
 
     def chance(self, evidence: Evidence) -> float:
-        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite."""
+        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
+        the heading is known, `tried` says that fewer rotations than a map was measured with had the chance to match."""
         logits = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not all(map(math.isfinite, logits)):
             return 1.0
-        return min(1.0, self.scale.off_map.beyond(logits[0]) + self.scale.off_place.beyond(logits[1]))
+        chance = self.scale.off_map.beyond(logits[0]) + self.scale.off_place.beyond(logits[1])
+        return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _OF_ROTATIONS))
 
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match is right, 0..1."""

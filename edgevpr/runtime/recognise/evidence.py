@@ -4,17 +4,14 @@ There are three kinds: for a camera that looks ahead (AHEAD), and for one that l
 (DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if they
 show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
 
-* agree: logarithm of the share of regions that agree; ahead, of its geometric mean over query and place; down, times
-  how well the layouts agree (`FineMatch.votes`)
+* agree: logarithm of what `share_of` returns, the share of regions that agree
 * lead: `agree` minus the largest `agree` of a place elsewhere
-* lead_around: the same for the logarithm of the score, averaged over a place and its neighbours in the index (ahead)
 * coverage: logarithm of the share of the place's regions that agree, each counted once
-* mutual: logarithm of the share of regions that are each other's most similar (ahead)
-* mutual_best: 1 if this share is larger at no place elsewhere, else 0 (ahead)
+* structure: `FineMatch.structure`
+* likeness: `Support.likeness` (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
-* back, likeness: logarithm of `Support.back`, and `Support.likeness` (ahead)
-* stands_out: `FineMatch.stands_out` (down)
 * landmarks: logarithm of one more than the number of landmarks that agree as expected (down)
+* tried: `Ranking.tried`, which no model weighs (see `Model.chance`)
 """
 
 import json
@@ -36,15 +33,14 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
-_BARE = ("agree", "lead", "coverage", "stands_out")
+_BARE = ("agree", "lead", "coverage", "structure")
 _LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
-OF_MAP = {AHEAD: ("mutual", "coverage", "back", "likeness"), **_LOOKING_DOWN}
-OF_PLACE = {AHEAD: ("agree", "lead", "lead_around", "mutual_best", "coverage", "rank_gap"), **_LOOKING_DOWN}
+OF_MAP = {AHEAD: ("coverage", "likeness", "structure"), **_LOOKING_DOWN}
+OF_PLACE = {AHEAD: ("lead", "coverage", "rank_gap", "structure"), **_LOOKING_DOWN}
 WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, where its spec is not at hand (see `kinds_of`)
 _LEAST = 1e-3  # least share, so that its logarithm exists
 _BY_CHANCE = 0.07  # share that pictures of foreign ground reach; stands for a place elsewhere if there is none
-_BESIDE = 0.5  # weight of each neighbour in the index
 FEWEST_PLACES = 30  # a map with fewer is not calibrated
 _HARDLY = 0.5  # mean confidence below which a place is hardly recognisable
 _CHECKSUM_DIGITS = 8
@@ -148,45 +144,30 @@ def evidence_of(
     slots = np.array(list(matches))
     best = int(slots[0])
     away = frozenset(slots[elsewhere(index, best, slots, neighbour_m, same if down else ())].tolist())
-    return _evidence_down(matches, best, away, proof) if down else _evidence_ahead(matches, best, away)
-
-
-def votes_of(match: FineMatch) -> float:
-    """Return the share of regions that agree on a shift: ahead, its geometric mean over query and place."""
-    return match.score if match.support is None else math.sqrt(match.score * match.support.back)
-
-
-def _evidence_ahead(matches: dict[int, FineMatch], best: int, away: frozenset[int]) -> dict[str, float]:
-    support = {slot: match.support for slot, match in matches.items() if match.support}
-    agree = {slot: votes_of(match) for slot, match in matches.items()}
-    around = _with_neighbours({slot: match.score for slot, match in matches.items()})
-    most_mutual = max(support, key=lambda slot: support[slot].mutual)
-    return {
-        "agree": _log_share(agree[best]),
-        "lead": _lead(agree, best, away),
-        "lead_around": _lead(around, best, away),
-        "coverage": _log_share(matches[best].coverage or 0.0),
-        "mutual": _log_share(support[best].mutual),
-        "mutual_best": float(most_mutual not in away),
-        "rank_gap": support[best].log_rank - min(each.log_rank for each in support.values()),
-        "back": _log_share(support[best].back),
-        "likeness": support[best].likeness,
-    }
-
-
-def _evidence_down(
-    matches: dict[int, FineMatch], best: int, away: frozenset[int], proof: Agreement | None
-) -> dict[str, float]:
-    votes = {slot: match.score if match.votes is None else match.votes for slot, match in matches.items()}
+    agree = {slot: share_of(match) for slot, match in matches.items()}
+    rivals = (agree[slot] for slot in away)
     evidence = {
-        "agree": _log_share(votes[best]),
-        "lead": _lead(votes, best, away),
+        "agree": _log_share(agree[best]),
+        "lead": _log_share(agree[best]) - _log_share(max(rivals, default=_BY_CHANCE)),
         "coverage": _log_share(matches[best].coverage or 0.0),
-        "stands_out": matches[best].stands_out or 0.0,
+        "structure": matches[best].structure or 0.0,
+        "tried": ranking.tried,
     }
-    if proof is not None:
+    if not down:
+        support = {slot: match.support for slot, match in matches.items() if match.support}
+        evidence["rank_gap"] = support[best].log_rank - min(each.log_rank for each in support.values())
+        evidence["likeness"] = support[best].likeness
+    elif proof is not None:
         evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
     return evidence
+
+
+def share_of(match: FineMatch) -> float:
+    """Return the share of regions that agree on a shift. Ahead it is the geometric mean of the score and of the same
+    share of the place; down, `FineMatch.votes`, which counts how well the layouts agree, too."""
+    if match.support is not None:
+        return math.sqrt(match.score * match.support.back)
+    return match.score if match.votes is None else match.votes
 
 
 def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
@@ -231,23 +212,6 @@ def read_calibration(text: str) -> MapCalibration:
     found["models"] = {kind: model_of(model) for kind, model in found["models"].items()}
     found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
     return MapCalibration(**found)
-
-
-def _lead(share: dict[int, float], best: int, away: frozenset[int]) -> float:
-    """Return the logarithm of the ratio of the best place's share to the largest share of a place elsewhere. `share`
-    maps slots to shares of agreeing regions, `best` is the slot of the best place, and `away` are the slots of places
-    elsewhere."""
-    return _log_share(share[best]) - _log_share(max((share[slot] for slot in away), default=_BY_CHANCE))
-
-
-def _with_neighbours(share: dict[int, float]) -> dict[int, float]:
-    """Average the share of each place with those of the places before and after it in the index. `share` and the result
-    map the places' slots to shares."""
-    least = min(share.values())  # stands for a place that was not compared
-    return {
-        slot: (own + _BESIDE * (share.get(slot - 1, least) + share.get(slot + 1, least))) / (1 + 2 * _BESIDE)
-        for slot, own in share.items()
-    }
 
 
 def _log_share(share: float) -> float:

@@ -18,7 +18,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Posterior, Proposals, moved
 from edgevpr.runtime.recognise.confidence import Evidence
-from edgevpr.runtime.recognise.evidence import votes_of
+from edgevpr.runtime.recognise.evidence import share_of
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
 
@@ -191,7 +191,7 @@ def _proposals(
         covariance[0] = matrix_of(where.covariance_m2)
         heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
-    votes = np.array([votes_of(ranking.compared[slot]) for slot in slots.tolist()])
+    votes = np.array([share_of(ranking.compared[slot]) for slot in slots.tolist()])
     near = np.hypot(*(at - at[0]).T) <= survey.scale.near
     near[0] = True  # even if its position is unknown
     confidence = sure.confidence(evidence)
@@ -208,7 +208,7 @@ def _proposals(
 
 def _shares(votes: Doubles) -> Doubles:
     """Divide a probability among K places: return the share (K,) of each, with a sum of 1. `votes` (K,) are the shares
-    of regions that agree at each place (see `votes_of`)."""
+    of regions that agree at each place (see `share_of`)."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

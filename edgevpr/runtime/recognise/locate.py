@@ -36,7 +36,7 @@ class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
     pictures, and `footprint_m` the length on the ground of the longest side (None: unknown). `places` are the numbers
-    of the places used. `objection` is the reason not to trust the position (None: no reason)."""
+    of the places that agree on it. `objection` is the reason not to trust the position (None: no reason)."""
 
     position: Position
     covariance_m2: Covariance
@@ -105,8 +105,9 @@ def located(
     metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is unknown, it is
     about the middle. `proof` is the agreement of the landmarks of the best place, which gives another shift.
 
-    Not used are places with a score below half of the best one's, and places that do not show the same ground. Of the
-    others, those whose position contradicts the first are excluded, and the first five determine the position.
+    Of the places that show the same ground, those whose position agrees with the first are used: all of them are named,
+    and the first five with at least half of the best one's score determine the position. Those with such a score whose
+    position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
     """
     best = _by_vote(found[0], cells)
     if best is None:

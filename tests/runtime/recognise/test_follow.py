@@ -64,7 +64,9 @@ class Flight:
         if self.has_poses:
             number = int(self.index.place_ids[best])
             where = Located(position=at(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
-        return self.follower.heard(Ranking(slots, scores, compared), self.index, evidence, sure, where)
+        return self.follower.heard(
+            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, sure, where
+        )
 
     def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, **more):
         self.go_on(elapsed_s, velocity_m_s)
@@ -163,7 +165,9 @@ def test_a_map_in_order_has_no_estimate(bare_map):
 def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
     where = Located(position=at(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
-    ranking = Ranking(slots, np.array([0.3, 0.3], np.float32), {20: FineMatch(0.3), 40: FineMatch(0.3)})
+    ranking = Ranking(
+        slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
+    )
     follower = Follower(posed_map, fastest_m_s=None, is_live=True)
     sure = told(lambda evidence: 0.6, lambda evidence: 0.9)
     followed = follower.heard(ranking, IN_METRES, {"lead": 1.0}, sure, where)

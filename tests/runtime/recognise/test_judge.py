@@ -24,7 +24,9 @@ def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
     index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
     slots = np.array([0, 10, 20])[: len(scores)]
     compared = dict(zip(slots.tolist(), matches or map(FineMatch, scores), strict=True))
-    return judge(Findings(Ranking(slots, np.array(scores, np.float32), compared), **more), index, rule)
+    return judge(
+        Findings(Ranking(slots=slots, scores=np.array(scores, np.float32), compared=compared), **more), index, rule
+    )
 
 
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():

@@ -29,7 +29,7 @@ def flown(velocity, start, leaves=18, seed=3):
         here = np.exp(-away) if query < leaves else 0.0
         scores = (0.3 + 0.4 * here + 0.02 * noise.random(PLACES)).astype(np.float32)
         slots = np.argsort(-scores)
-        ranking = Ranking(slots, scores[slots], {})
+        ranking = Ranking(slots=slots, scores=scores[slots], compared={})
         ranking = sequence.follow(ranking, index, float(query))
         verdict = judge(Findings(ranking), index, RULE, sequence)
         found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
@@ -73,7 +73,7 @@ def test_the_newest_query_must_still_see_the_place(queries, least, goes_on):
     index.place_ids[:] = np.arange(PLACES)
     for query, (slot, score) in enumerate(queries):
         slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
-        sequence.follow(Ranking(slots, scores, {}), index, float(query))
+        sequence.follow(Ranking(slots=slots, scores=scores, compared={}), index, float(query))
     assert sequence.goes_on(near, min_score=least) == goes_on
 
 

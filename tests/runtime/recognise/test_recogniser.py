@@ -22,7 +22,7 @@ from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettin
 from edgevpr.techniques import create
 
 PLACES = 6
-RULE = AcceptRule(min_score=0.07, min_margin=0.03, neighbour_m=50.0)
+RULE = AcceptRule(min_score=0.07, min_margin=0.06, neighbour_m=50.0)
 
 
 def frame(number, t_mono_s=0.0):
