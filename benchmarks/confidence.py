@@ -114,7 +114,7 @@ def model_without(name: str, rows: Rows) -> Model:
     model = shipped_model(kind, [site(rows[of], kind, site_of(name)) for of in others], "other sites")
     if len({row.query for row in rows[name] if row.kind == THERE}) < FEWEST_PLACES:
         return model
-    return adapted(model, site(rows[name], kind).answers, name)
+    return adapted(model, kind, site(rows[name], kind).answers, name)
 
 
 def judged(rows: Sequence[Row], model: Model) -> base.Row:

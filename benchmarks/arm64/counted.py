@@ -19,9 +19,7 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
         small, large = (parts[f"{name}: encode, and scan {places} places"] - encode for places in (SMALL, LARGE))
         scan_per_place = (large - small) / (LARGE - SMALL)
         technique = create("cohog", {"camera": camera})
-        # Where no glance chooses, all candidates are compared in full: that cost is one of each of them.
-        full = technique.spec.in_full or 0
-        full *= parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"]
+        full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         work = {
             "encode": encode,
             "match_per_place": (parts[f"{name}: a query"] - encode - large - full) / technique.candidates,

@@ -33,7 +33,7 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
-_BARE = ("agree", "lead", "coverage", "structure")
+_BARE = ("lead", "coverage", "structure")
 _LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
 OF_MAP = {AHEAD: ("coverage", "likeness", "structure"), **_LOOKING_DOWN}
