@@ -58,7 +58,7 @@ _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outsid
 # corridor and sat_marash, with grief_stromovka_seasons and nordland_tiny in view. Ahead, at 5 the pictures drawn by
 # chance decided whether 21 or 44 queries of corridor were accepted.
 _PULL_OF_MAP = 20.0
-_PULL_OF_PLACE = {AHEAD: 60.0, DOWN: 5.0, DOWN_BARE: 5.0}
+_PULL_OF_PLACE = {AHEAD: 10.0, DOWN: 5.0, DOWN_BARE: 5.0}
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 
@@ -218,8 +218,8 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
 
 
 def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str) -> Model:
-    """Return a copy of the confidence model `model`, of this kind of evidence, fitted to the answers of a map. Answers without evidence are
-    ignored. `made_of`: a note, kept in the model, on the data that it was fitted to."""
+    """Return a copy of the confidence model `model`, of this kind of evidence, fitted to the answers of a map. Answers
+    without evidence are ignored. `made_of`: a note, kept in the model, on the data that it was fitted to."""
     known = [answer for answer in answers if answer.evidence]
     right = [answer for answer in known if answer.right]
     nowhere, wrong, left_out = (
