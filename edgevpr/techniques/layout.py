@@ -46,7 +46,7 @@ _LEAST_SEEN = 0.1  # share of a cell that good regions must cover
 _LEAST_STRENGTH = 0.01  # of a cell; weaker ones are noise
 _LEVELS = 7  # of a stored number, on either side of 0
 _LARGEST_KEPT = 99  # percentile of a place's numbers that becomes the highest level
-_LEAST_OVERLAP = {8: 0.43, 12: 0.35}  # share of the place that the query covers, by the side of the grid
+_LEAST_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
 _LEAST_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
 _LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
@@ -152,17 +152,17 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
-    was, kept = None, asked.T
+    was, kept = None, asked
     for start in range(0, len(packed), _ROWS_AT_ONCE):
         part = packed[start : start + _ROWS_AT_ONCE]
         # Wide pictures leave the same cells of every place empty.
         filled = (part != _NOTHING).any(axis=0)
         if was is None or (filled != was).any():
-            was, kept = filled, np.ascontiguousarray(asked[:, np.repeat(filled, 2)].T)
+            was, kept = filled, np.ascontiguousarray(asked[:, np.repeat(filled, 2)])
         places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
-        found = (places @ kept).reshape(len(part), len(queries), -1).max(axis=2)
+        found = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
         strength = np.einsum("nd,nd->n", places, places)
-        best[start : start + len(part)] = found / np.sqrt(strength + _TINY)[:, None]
+        best[start : start + len(part)] = (found / np.sqrt(strength + _TINY)).T
     return best
 
 

@@ -197,6 +197,19 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     assert few.scores[0] == everything.scores[0]
 
 
+def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
+    _, place_map = ruler_map
+
+    class Known(Turned):
+        def coarse_scores(self, query, rows, mean):
+            scores, each = super().coarse_scores(query, rows, mean)
+            return scores, np.where([True, False, True], each, -np.inf)
+
+    for technique, tried in ((Turned(), 1.0), (Known(), 2 / 3), (Ruler(), 1.0)):
+        index = load_index(place_map, technique, 10_000)
+        assert rank(technique, technique.encode(43), place_map, index, 14).tried == pytest.approx(tried)
+
+
 class Hasty(Ruler):
     """A ruler with wrong first impressions: at a glance each number is five larger than it is."""
 

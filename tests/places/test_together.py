@@ -1,5 +1,7 @@
 """Two looks at the same places for one query, joined to one ranking."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from edgevpr.core.contract import FineMatch
@@ -28,3 +30,9 @@ def test_of_a_place_that_both_compared_the_better_match_counts():
 def test_a_rival_of_the_first_look_stays_a_rival():
     both = together(ranking({1: 0.2, 8: 0.19}), ranking({1: 0.21, 6: 0.02}))
     assert both.slots.tolist() == [1, 8, 6]
+
+
+def test_two_looks_have_tried_the_rotations_of_both():
+    known, all_of_them = (replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
+    assert together(known, known).tried == 0.25
+    assert together(known, all_of_them).tried == 1.0

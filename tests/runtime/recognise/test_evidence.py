@@ -145,3 +145,14 @@ def test_a_model_of_other_evidence_cannot_be_used():
     named = replace(model.of_place, names=("colour", *model.of_place.names[1:]))
     with pytest.raises(ValueError, match="colour"):
         require_usable(DOWN, replace(model, of_place=named))
+
+
+def test_with_a_known_heading_as_much_evidence_comes_less_often_by_chance():
+    matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
+    all_of_them, known = (
+        evidence_of(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreement(3), (), down=True)
+        for tried in (1.0, 1 / 8)
+    )
+    model = prior(DOWN)
+    assert 0 < model.chance(known) == pytest.approx(model.chance(all_of_them) / 4)
+    assert model.confidence(known) > model.confidence(all_of_them)
