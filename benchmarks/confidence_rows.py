@@ -60,6 +60,7 @@ def rows_of(name: str) -> Iterator[Row]:
 
 
 def _rows(name: str, folder: Path) -> Iterator[Row]:
+    """Ask the map of the set `name`, which lies in `folder`."""
     dataset = walks.dataset_of(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):

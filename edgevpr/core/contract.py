@@ -129,7 +129,7 @@ class FineMatch:
     `support`: further measures of the agreement with this shift.
     `structure`: how well the structures of both pictures agree at this shift, and with a camera that looks straight
     down, how much better than at others, in standard deviations (see `techniques.overlay`).
-    `votes`: share (0..1) of the query's regions that agree with this shift, where `score` counts more than these."""
+    `votes`: `score` before it counted the structures."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
