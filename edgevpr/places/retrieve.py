@@ -309,7 +309,7 @@ def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, c
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_largest(scores[slots], count))].tolist()]
-    slots = slots[np.sort(_largest(by_hypothesis[slots].max(axis=1), count))]
+    slots = slots[np.sort(_largest(by_hypothesis.max(axis=1)[slots], count))]
     each = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-each, axis=1, kind="stable"), axis=1)
     each = np.where(of_place < max(_TRIED_EACH, count // len(slots)), each, -np.inf)

@@ -70,8 +70,7 @@ _LAYOUT_AGREES = 0.45
 # What counts as around a region in the structure of a picture (see `overlay`). Ahead, things are larger.
 _AROUND_CELLS = {"forward": 5.0, "nadir": 3.0}
 # A match whose structures agree by the second figure keeps its score; below the first one they count as this much.
-# Foreign pictures have at most 4.9 ahead, and 2.7 looking down. In corridor all that lies ahead is built alike, and up
-# to 15 is reached at wrong places too.
+# Foreign pictures have at most 4.9 ahead and 2.7 looking down; in corridor, built alike all along, wrong places 9.9.
 _STRUCTURE = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
 _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
@@ -218,7 +217,9 @@ class CoHog:
         if turned_deg is not None:
             steps = np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS
             expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
-        first = HEIGHT_RATIOS.index(nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)) * ROTATIONS
+        ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
+        self._views_of(query).keep(ratio)
+        first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, expected, in_reach)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         scores[:, first : first + ROTATIONS] = of_ratio
@@ -240,15 +241,14 @@ class CoHog:
         query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
         counts, and `align` refines its shift, rotation and height. Last, the score is the less, the less the structures
         of query and place agree (see `overlay`)."""
-        reference = self._reference(fine)
+        reference, best = self._reference(fine), self._hypotheses[0]
         if self._is_nadir:
             best, match = self._likest(query, reference, hypotheses)
         else:
-            best, match = self._hypotheses[0], self._matched(self._view(query, self._hypotheses[0]), reference)
+            match = self._matched(self._view(query, best), reference)
         if match.shift_cells is None:
             return match
-        if self._is_nadir:
-            match = fitted(self._view(query, best), reference, match)
+        match = fitted(self._view(query, best), reference, match) if self._is_nadir else match
         structure = self._agreement(query, reference, match)
         least, most = _STRUCTURE[self.camera]
         counts = min(max(structure, least), most) / most

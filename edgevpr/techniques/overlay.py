@@ -12,6 +12,8 @@ nearly as well if the query is pushed along it. So it counts how far the agreeme
 where the query should lie than at any shift of some cells.
 """
 
+import math
+
 import cv2
 import numpy as np
 
@@ -54,7 +56,7 @@ def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
 def stands_out(query: Singles, place: Singles) -> float:
     """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, stands out
     from that at other shifts, in standard deviations of independent structures."""
-    agree = _agreements(query, place, _ROOM)
+    agree = _agreements(query, place)
     first, last = _ROOM - _MISSES, _ROOM + _MISSES + 1
     at_y, at_x = np.divmod(int(agree[first:last, first:last].argmax()), last - first)
     y, x = at_y + first, at_x + first
@@ -67,23 +69,32 @@ def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) 
     """Return the agreement of two structures (n, n, P), in standard deviations of independent ones, with the query's
     middle at the shift (dx, dy) from that of the place, or up to two cells beside."""
     n = len(place)
-    dx, dy = (min(max(round(each), _MISSES - n), n - _MISSES) for each in shift_cells)
-    laid_over = np.zeros_like(query)
-    laid_over[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)] = query[
-        max(0, -dy) : n + min(0, -dy), max(0, -dx) : n + min(0, -dx)
-    ]
-    return float(_agreements(laid_over, place, _MISSES).max())
+    of_query, of_place, least = _strengths(query, place)
+    x, y = (min(max(round(each), _MISSES - n), n - _MISSES) for each in shift_cells)
+    best = 0.0
+    for dy in range(y - _MISSES, y + _MISSES + 1):
+        for dx in range(x - _MISSES, x + _MISSES + 1):
+            asked = np.s_[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)]
+            known = np.s_[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
+            scatter = max(float(np.einsum("ij,ij", of_query[asked], of_place[known])), least)
+            best = max(best, float(np.einsum("ijk,ijk", query[asked], place[known])) / math.sqrt(scatter + _TINY))
+    return best
 
 
-def _agreements(query: Singles, place: Singles, room: int) -> Singles:
-    """Return the agreement of two structures at all shifts up to `room` cells, (2 room + 1, 2 room + 1)."""
-    border = ((room, room), (room, room))
+def _agreements(query: Singles, place: Singles) -> Array:
+    """Return the agreement of two structures at all shifts up to `_ROOM` cells, (2 `_ROOM` + 1, 2 `_ROOM` + 1)."""
+    border = ((_ROOM, _ROOM), (_ROOM, _ROOM))
     common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
-    of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
+    of_query, of_place, least = _strengths(query, place)
     scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
-    least = _LEAST_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
-    found: Singles = common / np.sqrt(np.maximum(scatter, least) + _TINY)
+    found: Array = common / np.sqrt(np.maximum(scatter, least) + _TINY)
     return found
+
+
+def _strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:
+    """Return the squared strengths of two structures in each cell, (n, n), and the least scatter of their agreement."""
+    of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
+    return of_query, of_place, _LEAST_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
 
 
 def _around(values: Singles, cells: float) -> Singles:

@@ -76,6 +76,13 @@ class Views:
         self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 
+    def keep(self, ratio: float) -> None:
+        """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
+        self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
+        self._scaled = {each: picture for each, picture in self._scaled.items() if each == ratio}
+        self.cached = {key: view for key, view in self.cached.items() if hypothesis(key)[0] == ratio}
+        self.fields = {key: field for key, field in self.fields.items() if hypothesis(key[0])[0] == ratio}
+
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
         float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
