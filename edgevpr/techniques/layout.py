@@ -50,7 +50,7 @@ _LEAST_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers,
 _LEAST_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
 _LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
-_LOOKED_CLOSER = 600, 1000
+_LOOKED_CLOSER = 1000, 2000
 _ROWS_AT_ONCE = 256
 _TINY = 1e-9
 
