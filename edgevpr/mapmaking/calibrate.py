@@ -58,7 +58,7 @@ _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outsid
 # corridor and sat_marash, with grief_stromovka_seasons and nordland_tiny in view. Ahead, at 5 the pictures drawn by
 # chance decided whether 21 or 44 queries of corridor were accepted.
 _PULL_OF_MAP = 20.0
-_PULL_OF_PLACE = {AHEAD: 10.0, DOWN: 5.0, DOWN_BARE: 5.0}
+_PULL_OF_PLACE = {AHEAD: 20.0, DOWN: 5.0, DOWN_BARE: 5.0}
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 

@@ -25,9 +25,10 @@ Evidence = Mapping[str, float]
 
 _MAX_FILE_BYTES = 100_000
 _MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
-# Factor to the share of matches that may be wrong, for a model that is not adapted to its map: without it foreign
-# queries were accepted over grief_michigan_monthly, of five places.
-_NOT_ADAPTED = 0.1
+# Factors to the share of matches that may be wrong: a chance is an estimate. Without them one tunnel of nordland_tiny
+# was taken for another, and a foreign picture for a place of aerial_swindale; and where a model is not adapted to its
+# map, foreign pictures for places of grief_michigan_monthly, of which there are five.
+_ADAPTED, _NOT_ADAPTED = 0.5, 0.1
 _LEAST = 1e-15  # least chance, so that its logarithm exists
 # Power of the share of rotations tried, as a factor of a chance: 1 if rotations were independent, but streets and
 # furrows have directions. Of 2,015 foreign and mirrored pictures, asked with random headings in the maps of sat_marash
@@ -118,7 +119,7 @@ class Model:
         """Return the confidence at and above which the share `precision` (below 1) of the matches is right. A model
         that is not adapted to its map does not know how alike places look there, so its threshold is higher."""
         wrong = 1 - precision
-        return self.scale.confidence(wrong if self.adapted_scale is None else _NOT_ADAPTED * wrong)
+        return self.scale.confidence(wrong * (_ADAPTED if self.adapted_scale is None else _NOT_ADAPTED))
 
 
 def model_of(stored: Mapping[str, Any]) -> Model:
