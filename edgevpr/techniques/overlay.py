@@ -46,7 +46,7 @@ def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
     count that are `seen`, bool (n, n). `around_cells` is the standard deviation of what counts as around a region."""
     weight = seen.astype(np.float32)
     values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
-    near = _around(values, around_cells) / np.maximum(_around(weight[..., None], around_cells), _TINY)
+    near = _around(values, around_cells) / np.maximum(_around(weight, around_cells), _TINY)[..., None]
     values -= near * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
     found: Singles = values / np.sqrt(np.maximum(strength, _LEAST_STRENGTH))[..., None]
@@ -98,9 +98,4 @@ def _strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]
 
 
 def _around(values: Singles, cells: float) -> Singles:
-    """Sum values (n, n, P) around each cell, by Gaussian weights with a standard deviation of so many `cells`."""
-    off = np.subtract.outer(np.arange(len(values)), np.arange(len(values)))
-    weights = np.exp(-(off**2) / (2 * cells**2)).astype(np.float32)
-    down = np.tensordot(weights, values, axes=1)
-    found: Singles = weights @ down
-    return found
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), cells, borderType=cv2.BORDER_CONSTANT))
