@@ -116,30 +116,29 @@ class Views:
     def halved(self) -> tuple[Array, Mask]:
         """Return the picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and
         bool (side, side), True for allowed pixels."""
-        side = (self._side + 1) * max(2, self._cell_px // 2)
         if self._halved is None:
-            grey, allowed = self._picture.grey, self._picture.allowed
-            if grey is None or allowed is None:
-                raise ValueError("a picture that is not kept cannot be turned")
-            small = cv2.resize(allowed.astype(np.uint8), (side, side), interpolation=cv2.INTER_NEAREST)
-            self._halved = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA), small.astype(bool)
+            grey, allowed = self._resized((self._side + 1) * max(2, self._cell_px // 2))
+            self._halved = grey, allowed.astype(bool)
         return self._halved
+
+    def _resized(self, side: int) -> tuple[Array, Array]:
+        """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
+        if self._picture.grey is None or self._picture.allowed is None:
+            raise ValueError("a picture that is not kept cannot be turned")
+        grey: Array = self._picture.grey
+        allowed: Array = self._picture.allowed.astype(np.uint8)
+        if side == len(grey):
+            return grey, allowed
+        grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
+        return grey, cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
 
     def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
         """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three
         things: grey float32 (side, side); bool (side, side), True for allowed pixels; and a cell's side in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
-        grey: Array
-        allowed: Array
         if ratio not in self._scaled:
-            if self._picture.grey is None or self._picture.allowed is None:
-                raise ValueError("a picture that is not kept cannot be turned")
-            grey, allowed = self._picture.grey, self._picture.allowed.astype(np.uint8)
-            if side != len(grey):
-                grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
-                allowed = cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
-            self._scaled[ratio] = grey, allowed
+            self._scaled[ratio] = self._resized(side)
         grey, allowed = self._scaled[ratio]
         if within:
             middle = (side - 1) / 2

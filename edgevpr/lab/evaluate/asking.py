@@ -30,9 +30,8 @@ from edgevpr.runtime.recognise.salience_gate import Gate
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]  # yields the items, of that number, and shows it with a label
-_NOTHING_FOUND = Ranking(
-    slots=np.empty(0, np.intp), scores=np.empty(0, np.float32), compared={}
-)  # e.g. of a discarded query
+# Of a discarded query, for example.
+_NOTHING_FOUND = Ranking(slots=np.empty(0, np.intp), scores=np.empty(0, np.float32), compared={})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
