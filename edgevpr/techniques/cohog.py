@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Mask, Singles
+from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.techniques import layout, overlay, placecode
@@ -240,33 +240,36 @@ class CoHog:
         query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
         counts, and `align` refines its shift, rotation and height. Last, the score is the less, the less the structures
         of query and place agree (see `overlay`)."""
-        reference, best = self._reference(fine), self._hypotheses[0]
+        reference = self._reference(fine)
         if self._is_nadir:
-            best, match = self._likest(query, reference, hypotheses)
+            best, match, nearest = self._likest(query, reference, hypotheses)
+            match = fitted(self._view(query, best), nearest, self._side, match) if self._votes else match
         else:
-            match = self._matched(self._view(query, best), reference)
+            match, _ = self._matched(self._view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
             return match
-        match = fitted(self._view(query, best), reference, match) if self._is_nadir else match
         structure = self._agreement(query, reference, match)
         least, most = _STRUCTURE[self.camera]
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
 
-    def _likest(self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None) -> tuple[int, FineMatch]:
+    def _likest(
+        self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None
+    ) -> tuple[int, FineMatch, Ints]:
         """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
-        highest score, and its match."""
+        highest score, its match, and the most similar region of the place for each region of this view."""
         tried, place = self._hypotheses if hypotheses is None else hypotheses, None
         if self._votes:
             known = np.flatnonzero(reference.any(axis=1))
             place = layout.field(layout.FINE, reference[known], known, (self._side, self._side))
-        matches = {each: self._matched(self._view(query, each), reference) for each in tried}
-        if place is not None:
-            matches = {each: self._laid(query, each, match, place) for each, match in matches.items()}
+        matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
+        for each in tried:
+            match, nearest[each] = self._matched(self._view(query, each), reference)
+            matches[each] = match if place is None else self._laid(query, each, match, place)
         best = max(matches, key=lambda each: matches[each].score)
         ratio, turn = hypothesis(best)
         scale = scale_of(self._side + 1, ratio)
-        return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale)
+        return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
     def _agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
         """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
@@ -294,7 +297,7 @@ class CoHog:
         score, and with a nadir camera a list with the best of `hypotheses` (None: there are none)."""
         reference = self._reference(fine)
         if self._is_nadir:
-            best, match = self._likest(query, reference, hypotheses)
+            best, match, _ = self._likest(query, reference, hypotheses)
             return match.score, [best]
         view = self._view(query, self._hypotheses[0])
         numbers, regions = view.numbers[::_GLANCE], view.regions[::_GLANCE]
@@ -313,9 +316,7 @@ class CoHog:
     def _reference(self, fine: Bytes) -> Singles:
         """Restore the blocks of a place from its stored `fine` part, which holds their square roots, as vectors that
         can be compared (see `_comparable`)."""
-        blocks = fine.astype(np.float32)
-        blocks *= blocks
-        return self._comparable(blocks)
+        return self._comparable(np.square(fine, dtype=np.float32))
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
         """Return the good regions of a query under the hypothesis `number`. They are cached for the newest query."""
@@ -328,8 +329,7 @@ class CoHog:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map is no query")
-            square = (self._side, self._side)
-            own = query.regions.reshape(*square, -1), query.good.reshape(square)
+            own = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
             self._views = Views(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
             self._query = query
         return self._views
@@ -342,8 +342,9 @@ class CoHog:
         """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `slow_patterns`)."""
         return unit_rows(regions @ slow_patterns(self.bins))
 
-    def _matched(self, view: ViewRegions, reference: Singles) -> FineMatch:
+    def _matched(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
         if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
             return voted(view, reference, _VOTES_COUNT[self.camera], with_support=not self._is_nadir)
         likeness = view.regions @ reference.T
-        return FineMatch(float(np.clip(likeness.max(axis=1).mean(), 0, 1)) if len(likeness) else 0.0)
+        score = np.clip(likeness.max(axis=1).mean(), 0, 1) if len(likeness) else 0
+        return FineMatch(float(score)), likeness.argmax(axis=1)

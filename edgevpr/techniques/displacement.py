@@ -87,26 +87,30 @@ def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float,
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
-def voted(view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool) -> FineMatch:
+def voted(
+    view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool
+) -> tuple[FineMatch, Ints]:
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
-    is that of `displacement`, and `with_support` tells whether the match gets its `support`."""
+    is that of `displacement`, and `with_support` tells whether the match gets its `support`. Returns the match, and the
+    number of the most similar region of the place for each region of the view, int (G,)."""
     best = (view.regions @ reference.T).argmax(axis=1)
     found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
-    return FineMatch(
+    match = FineMatch(
         min(1.0, found.share * view.worth),
         shift_cells=found.shift_cells,
         covariance_cells2=found.covariance_cells2,
         coverage=found.agreeing / len(reference),
         support=support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None,
     )
+    return match, best
 
 
-def fitted(view: ViewRegions, reference: Singles, match: FineMatch) -> FineMatch:
-    """Return the match of a view with shift, rotation and height as `align` finds them; as it is if that fails."""
-    best = (view.regions @ reference.T).argmax(axis=1)
+def fitted(view: ViewRegions, best: Ints, side: int, match: FineMatch) -> FineMatch:
+    """Return the match of a view with shift, rotation and height as `align` finds them; as it is if that fails. `best`
+    int (G,) are the most similar regions of the place, which has `side` along a side."""
     around = match.shift_cells or (0.0, 0.0)
-    found = align((view.numbers, view.side), (best, math.isqrt(len(reference))), around)
+    found = align((view.numbers, view.side), (best, side), around)
     if found is None:
         return match
     return replace(

