@@ -147,7 +147,7 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     """Compare R fields of the query with N places, uint8 (N, B): the best score over all shifts, float32 (N, R). The
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
     laid = [_shifted(each, grid.side) for each in queries]
-    asked = np.concatenate(laid)
+    asked = np.concatenate(laid) if len(laid) > 1 else laid[0]  # a megabyte: no copy that is not needed
     scatter = np.einsum("sd,sd->s", asked, asked)
     least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
@@ -158,7 +158,7 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
         # Wide pictures leave the same cells of every place empty.
         filled = (part != _NOTHING).any(axis=0)
         if was is None or (filled != was).any():
-            was, kept = filled, np.ascontiguousarray(asked[:, np.repeat(filled, 2)])
+            was, kept = filled, asked.take(np.flatnonzero(np.repeat(filled, 2)), axis=1)
         places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
         found = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
         strength = np.einsum("nd,nd->n", places, places)
@@ -191,9 +191,9 @@ def _bordered(query: Array, n: int) -> Array:
 
 def _shifted(query: Singles, n: int) -> Singles:
     """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
-    windows = sliding_window_view(_bordered(query, n), (n, n), axis=(1, 2))  # (C, K, K, n, n)
+    windows = sliding_window_view(_bordered(query, n), (n, n), axis=(1, 2)).transpose(1, 2, 0, 3, 4)  # (K, K, C, n, n)
     y, x = _shifts(query.shape[1], n)
-    return np.ascontiguousarray(windows[:, y, x].transpose(1, 0, 2, 3)).reshape(len(y), -1)
+    return windows[y, x].reshape(len(y), -1)
 
 
 @lru_cache
