@@ -23,7 +23,7 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, Tech
 from edgevpr.core.errors import UsageError
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import Contrast, stretched
-from edgevpr.techniques.displacement import fitted, share, voted
+from edgevpr.techniques.displacement import fitted, most_similar, share, voted
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
     grey_square,
@@ -300,9 +300,8 @@ class CoHog:
             best, match, _ = self._likest(query, reference, hypotheses)
             return match.score, [best]
         view = self._view(query, self._hypotheses[0])
-        numbers, regions = view.numbers[::_GLANCE], view.regions[::_GLANCE]
-        nearest = (regions @ reference.T).argmax(axis=1)
-        return share(numbers, nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
+        nearest = most_similar(view.regions[::_GLANCE], reference)
+        return share(view.numbers[::_GLANCE], nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
 
     def _laid(self, query: Descriptor, number: int, match: FineMatch, place: Singles) -> FineMatch:
         """Return a match under the hypothesis `number` with its score times how well the layout of the query agrees

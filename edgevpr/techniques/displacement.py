@@ -22,6 +22,7 @@ from edgevpr.techniques.views import ViewRegions
 
 _ALONG = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
 _RANKED = 4  # one of so many regions is ranked: ranks cost more than all the rest
+_AT_ONCE = 256  # regions compared with all of a place: their likeness, a megabyte, stays in the cache
 _ROUNDS = 8
 _WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
 # Beyond these another hypothesis is nearer, or the pairs are of different places.
@@ -87,13 +88,23 @@ def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float,
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
+def most_similar(regions: Singles, reference: Singles) -> Ints:
+    """Return the number of the most similar region of a place, whose regions are `reference` (N, P), for each of
+    `regions` (G, P): int (G,)."""
+    best = np.empty(len(regions), np.intp)
+    for first in range(0, len(regions), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        best[some] = (regions[some] @ reference.T).argmax(axis=1)
+    return best
+
+
 def voted(
     view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool
 ) -> tuple[FineMatch, Ints]:
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
     is that of `displacement`, and `with_support` tells whether the match gets its `support`. Returns the match, and the
     number of the most similar region of the place for each region of the view, int (G,)."""
-    best = (view.regions @ reference.T).argmax(axis=1)
+    best = most_similar(view.regions, reference)
     found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
     match = FineMatch(
