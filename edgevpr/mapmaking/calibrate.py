@@ -56,9 +56,9 @@ _OVERLAPS = 2.0  # footprints between two places from which on their pictures, f
 _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
 # Strength with which the fit holds on to the shipped weights (see `fitted`), for the two parts of a model. Chosen on
 # corridor and sat_marash, with grief_stromovka_seasons and nordland_tiny in view. Ahead, at 5 the pictures drawn by
-# chance decided whether 21 or 44 queries of corridor were accepted.
+# chance decided whether 21 or 44 queries of corridor were accepted; at 50, whether 35 or 44.
 _PULL_OF_MAP = 20.0
-_PULL_OF_PLACE = {AHEAD: 20.0, DOWN: 5.0, DOWN_BARE: 5.0}
+_PULL_OF_PLACE = {AHEAD: 50.0, DOWN: 5.0, DOWN_BARE: 5.0}
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 

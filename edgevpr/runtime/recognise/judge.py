@@ -61,7 +61,7 @@ class Sureness:
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees about as well."""
         confidence = self.models[kind_of(evidence)].confidence(evidence)
-        return confidence if evidence["lead"] >= _NO_LEAD else min(confidence, _EVEN)
+        return confidence if leads(evidence) else min(confidence, _EVEN)
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
@@ -223,6 +223,11 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if findings.proof and is_hardly_ahead(evidence) and findings.proof.inliers < 2 * rival:
         return Verdict(False, f"{rival} landmarks of a place elsewhere agree as well; {figures}")
     return Verdict(True, figures)
+
+
+def leads(evidence: Evidence) -> bool:
+    """Return True if no place elsewhere agrees about as well."""
+    return evidence["lead"] >= _NO_LEAD
 
 
 def is_hardly_ahead(evidence: Evidence | None) -> bool:
