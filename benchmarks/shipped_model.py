@@ -13,8 +13,8 @@ from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.judge import leads
 
 _PULL = 0.3
-# Parts of the wrong matches that are the tail. With .3 of those of a site itself, one tunnel of nordland_tiny was taken
-# for another in five of eight draws of the pictures that a map is adapted with; with .4 in none.
+# Parts of the wrong matches that are the tail. With .3 of those of a site itself, the draw of the pictures that a map
+# is adapted with decided whether one tunnel of nordland_tiny was taken for another.
 _OFF_MAP, _OFF_PLACE, _STAND_IN = 0.02, 0.4, 0.2
 _FEWEST_WRONG = 20
 _EACH = 100.0  # the weight of the right, and of the wrong, matches of a map

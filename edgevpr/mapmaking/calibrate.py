@@ -55,8 +55,8 @@ _MOST_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, wh
 _OVERLAPS = 2.0  # footprints between two places from which on their pictures, from any heights, share no ground
 _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
 # Strength with which the fit holds on to the shipped weights (see `fitted`), for the two parts of a model. Chosen on
-# corridor and sat_marash, with grief_stromovka_seasons and nordland_tiny in view. Ahead, at 5 the pictures drawn by
-# chance decided whether 21 or 44 queries of corridor were accepted; at 50, whether 35 or 44.
+# corridor and sat_marash, with grief_stromovka_seasons and nordland_tiny in view. Ahead, the less it is, the more
+# the pictures drawn by chance decide how many queries of corridor are accepted.
 _PULL_OF_MAP = 20.0
 _PULL_OF_PLACE = {AHEAD: 50.0, DOWN: 5.0, DOWN_BARE: 5.0}
 _SEED = 15

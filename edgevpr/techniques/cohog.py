@@ -345,5 +345,6 @@ class CoHog:
         if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
             return voted(view, reference, _VOTES_COUNT[self.camera], with_support=not self._is_nadir)
         likeness = view.regions @ reference.T
-        score = np.clip(likeness.max(axis=1).mean(), 0, 1) if len(likeness) else 0
-        return FineMatch(float(score)), likeness.argmax(axis=1)
+        nearest = likeness.argmax(axis=1)
+        score = np.clip(likeness[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0
+        return FineMatch(float(score)), nearest

@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 # Parameters of `mallopt` (glibc's malloc.h) and their values, bytes: how much of what was freed is kept, and from which
 # size on a part of memory is given back to the system as soon as it is freed. Left alone, glibc raises both as larger
-# parts are freed: a flight over 10,000 places looking down then holds 10 MB more. At half of these it is slower.
+# parts are freed: a flight over many places then holds more than it uses. At half of these it is slower.
 _MALLOC = {-1: 8_000_000, -3: 4_000_000}
 
 
