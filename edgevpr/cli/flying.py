@@ -59,8 +59,6 @@ def add(commands: Any) -> None:
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
     check.add_argument("--offline", action="store_true", help="wait for no frame and no heartbeat: on the bench")
-    check.add_argument("--learn-mask", metavar="PNG", help="instead, learn which part of the frames is no ground")
-    check.add_argument("--images", "--source", dest="source", metavar="SOURCE", help="learn it from this recording")
 
     services = group(commands, "service", "print the systemd unit for a board, or install it all")
     unit = command(services, "print", service_print, "print the unit")
@@ -156,16 +154,10 @@ def run_flight(args: Namespace) -> int:
 
 
 def run_check(args: Namespace) -> int:
-    """Run `check`: check whether a flight can start with a configuration, and print the findings; or, with
-    --learn-mask, learn a mask."""
-    from edgevpr.runtime.service.check import check, learn_mask
+    """Run `check`: check whether a flight can start with a configuration, and print the findings."""
+    from edgevpr.runtime.service.check import check
     from edgevpr.runtime.service.finding import lines
 
-    if args.learn_mask:
-        print(learn_mask(args.config, Path(args.learn_mask), args.source))
-        return 0
-    if args.source:
-        raise UsageError("--source goes with --learn-mask: a check looks at the source of the configuration.")
     findings = check(args.config, offline=args.offline, say=waiting)
     for line in lines(findings):
         print(shown(line))

@@ -254,7 +254,7 @@ def _is_display(ranking: Ranking, index: PlaceIndex, rule: AcceptRule) -> str | 
     matches = (ranking.compared[slot] for slot in others.tolist() if slot in ranking.compared)
     if not any(_is_at_rest(match) and match.score >= _DISPLAY_SCORE for match in matches):
         return None
-    return "a place elsewhere has not moved either, as behind a display: learn a mask with `edgevpr check --learn-mask`"
+    return "a place elsewhere has not moved either, as behind a display: paint a mask over it (`source.mask`)"
 
 
 def _is_at_rest(match: FineMatch | None) -> bool:

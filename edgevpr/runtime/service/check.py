@@ -1,20 +1,15 @@
 """`edgevpr check`: checks whether a configuration is ready to fly. It opens everything that `edgevpr run` opens, and
-closes it again. This file also learns the mask: the parts of the frames that never show ground, such as a display that
-is drawn over them."""
+closes it again."""
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 
-import numpy as np
-
 from edgevpr.core.config import Config, load_config
 from edgevpr.core.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
-from edgevpr.core.files import require_folder
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.frames.mask import FEWEST_FRAMES, learn_overlay, require_png, write_mask
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, open_source
 from edgevpr.mavlink.address import LinkAddress, parse_links
@@ -36,8 +31,6 @@ from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
-# Pictures that a mask is learnt from, and the seconds between two: so many that the ground has moved meanwhile.
-_LEARNT_FROM, _APART_S = 3 * FEWEST_FRAMES, 0.5
 
 
 def check(
@@ -68,43 +61,6 @@ def check(
     findings.append(looked_at("link", lambda: _link(config, offline)))
     say("")
     return [*findings, *log_findings(config.log, has_link=config.mavlink.link is not None)]
-
-
-def learn_mask(config_path: str | Path, out: Path, recording: str | None = None) -> str:
-    """Learn which part of the frames never shows ground, from a `recording` or else the configured source, and write
-    the mask to `out` (PNG). Return a sentence about it. Raises an EdgevprError if there is nothing to learn from."""
-    require_png(out)
-    require_folder(out)
-    uri = recording or load_config(config_path).source.uri
-    if uri is None:
-        raise UsageError("There is no source to learn a mask from: name a recording with --source.")
-    with closing(open_source(uri, step_s=_APART_S, live=recording is None)) as source:
-        allowed = learn_overlay(_pictures(source), uri)
-    if allowed.all():
-        return f"{uri} shows no display over the ground: no mask is needed, and none was written."
-    write_mask(out, allowed)
-    return (
-        f"{out}: {1 - allowed.mean():.1%} of the frame is masked. Look at it, use it as `source: {{mask: {out}}}`, and "
-        f"build the map with --mask {out}."
-    )
-
-
-def _pictures(source: Source) -> Iterator[np.ndarray]:
-    """Yield pictures of a source, `_LEARNT_FROM` at most. They are `_APART_S` seconds apart if the source is live. End
-    early if the source ends or the pictures take too long to come."""
-    end_s = time.monotonic() + 2 * _LEARNT_FROM * _APART_S
-    count = 0
-    while count < _LEARNT_FROM and not source.ended and time.monotonic() < end_s:
-        try:
-            frame = source.read(1.0)
-        except ImageError:
-            continue
-        if frame is None:
-            continue
-        count += 1
-        yield frame.image
-        if source.is_live:
-            time.sleep(_APART_S)
 
 
 def _board(config: Config) -> str:

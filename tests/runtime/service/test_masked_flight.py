@@ -1,4 +1,4 @@
-"""The mask from the camera to the match: learnt by `check`, used by map and query, and said where they differ."""
+"""The mask from the file to the match: used by map and query, and said where it is missing."""
 
 import cv2
 import numpy as np
@@ -39,8 +39,7 @@ def folder(tmp_path_factory):
     (folder / "ref").mkdir()
     for number in range(PLACES):
         cv2.imwrite(str(folder / "ref" / f"{number:02d}.png"), shown(view(number)))
-    (folder / "c.yaml").write_text(f"source: {{uri: {folder / 'ref'}}}\nlog: {{path: null}}\n")
-    assert main(["check", "--config", str(folder / "c.yaml"), "--learn-mask", str(folder / "mask.png")]) == 0
+    cv2.imwrite(str(folder / "mask.png"), np.where(shown(np.full((240, 320), 7, np.uint8)) == 7, 255, 0))
     built = ["map", "build", "--images", str(folder / "ref"), "--technique", "cohog", "--param", "w1=208"]
     assert main([*built, str(folder / "plain.gpkg")]) == 0
     assert main([*built, str(folder / "masked.gpkg"), "--mask", str(folder / "mask.png")]) == 0
@@ -50,18 +49,6 @@ def folder(tmp_path_factory):
 def opened(folder, name, mask):
     settings = {"map": str(folder / name), "source.mask": str(folder / "mask.png") if mask else None}
     return open_recogniser(load_config(None, settings), load_board("this"))
-
-
-@pytest.mark.slow
-def test_the_mask_that_check_learns_covers_the_display(folder, capsys):
-    mask = cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)
-    assert mask.shape == (240, 320)
-    assert (mask[15:50, 10:250] == 0).mean() > 0.8
-    assert (mask[90:175] == 255).all(), "nothing but ground"
-    assert main(["check", "--config", str(folder / "c.yaml"), "--learn-mask", str(folder / "again.png")]) == 0
-    said = capsys.readouterr().out
-    assert "% of" in said
-    assert f"--mask {folder / 'again.png'}" in said
 
 
 def test_a_mask_that_is_missing_is_said_to_be_the_mask(folder, tmp_path, capsys):
@@ -88,26 +75,3 @@ def test_with_the_mask_more_is_recognised_behind_a_display(folder):
         assert all(e.best.place.source_image == f"{n:02d}.png" for n, e in enumerate(events) if e.accepted)
         found[name] = sum(e.best.place.source_image == f"{n:02d}.png" for n, e in enumerate(events))
     assert found["masked.gpkg"] > found["plain.gpkg"], "what all places share says nothing of any"
-
-
-def test_check_learns_from_a_recording_and_says_what_it_needs(folder, tmp_path, capsys):
-    config, out = ["check", "--config", str(folder / "c.yaml")], str(tmp_path / "m.png")
-    still = tmp_path / "still"
-    still.mkdir()
-    for number in range(PLACES):
-        cv2.imwrite(str(still / f"{number}.png"), shown(view(1)))
-    for arguments, code, said in (
-        (["--learn-mask", out, "--source", str(still)], 1, "stands still"),
-        (["--learn-mask", str(tmp_path / "m.jpg")], 2, "ends in .png"),
-        (["--learn-mask", str(tmp_path / "absent" / "m.png")], 2, "there is no such folder"),
-        (["--source", str(still)], 2, "--source goes with --learn-mask"),
-        (["--learn-mask", out, "--source", "/dev/video99"], 1, "is live and never ends"),
-    ):
-        assert main([*config, *arguments]) == code
-        err = capsys.readouterr().err
-        assert said in err
-        assert "Traceback" not in err
-    assert not (tmp_path / "m.png").exists()
-    assert main([*config, "--learn-mask", out, "--source", str(folder / "ref")]) == 0
-    (tmp_path / "no-source.yaml").write_text("log: {path: null}\n")
-    assert main(["check", "--config", str(tmp_path / "no-source.yaml"), "--learn-mask", out]) == 2
