@@ -1,6 +1,7 @@
 """The flight log: one JSON object per line. `flight` writes it, `wholeflight` reads it. A full disk or a pulled memory
 card loses lines, but never ends the flight."""
 
+import errno
 import json
 import logging
 import math
@@ -16,7 +17,6 @@ from typing import Any
 
 from edgevpr.core.appending import (
     append,
-    claim,
     is_at,
     keep_within,
     open_appending,
@@ -41,7 +41,7 @@ class FlightLog:
     aside, that is renamed to the next number (see `core.appending`). A file that reaches a quarter of `max_mb` (None:
     no limit) is set aside too. The numbered files share the other three quarters: the oldest are deleted. Each further
     file of a flight begins with a copy of the start line, to which two fields are added: `repeated` (true) and `part`,
-    the number of the file within the flight. If another process writes `path`, this flight writes numbered files only.
+    the number of the file within the flight. A file that another process writes is not written.
 
     Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
     are synced to the disk (fdatasync) by the first line written a second or more after the last sync, or by the next
@@ -69,7 +69,7 @@ class FlightLog:
         self.state: str | None = None
         self.lost_lines = 0
         self._clock, self._utc_s, self._tape = clock, utc_s, tape
-        self._at = Path(path or "")  # the file to be written: `path`, or one with a number
+        self._at = Path(path or "")
         self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
         self._file: FileIO | None = None
         self._ours: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
@@ -83,8 +83,8 @@ class FlightLog:
             except OSError as error:
                 if not wait:
                     raise EdgevprError(
-                        f"The flight log {path} cannot be opened ({error.strerror}): give a file in a folder that is "
-                        "there and may be written to."
+                        f"The flight log {path} cannot be opened ({error.strerror}): give each flight a file of its "
+                        "own, in a folder that is there and may be written to."
                     ) from error
                 self._note_trouble(error)
 
@@ -158,10 +158,18 @@ class FlightLog:
 
     def _writable(self, more_bytes: int) -> FileIO:
         """Return the file to be written, open and with room for `more_bytes`; a full file, or one of an earlier flight,
-        is set aside first. Raises OSError."""
+        is set aside first. If that fails, it is written further: lines matter more than the limit. Raises OSError."""
         file = self._file or self._open()
         size, is_ours = _size_of(file), _identity(file) == self._ours
-        if not size or (is_ours and size + more_bytes <= self._part_bytes) or not self._is_set_aside():
+        if not size or (is_ours and size + more_bytes <= self._part_bytes):
+            return file
+        try:
+            set_aside(self._at)
+        except OSError as error:
+            self._warn(
+                f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
+                "grow past log.max_mb: let the flight write to its folder."
+            )
             return file
         sync(file)
         self._let_go()
@@ -169,44 +177,22 @@ class FlightLog:
         return self._open()
 
     def _open(self) -> FileIO:
-        """Open and lock the file to be written; if another process has locked it, a numbered file. Raises OSError."""
+        """Open and lock the file. Raises OSError, also if another process has locked it."""
         file = open_appending(self._at)
         if not try_lock(file):
             file.close()
-            self._at = claim(self.path or "")
-            file = open_appending(self._at)
-            try_lock(file)
-            self._warn(
-                f"The flight log {self.path} is written by another edgevpr: this flight is in {self._at}. Give each "
-                "flight a `log.path` of its own."
-            )
+            raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._at))
         self._file, self._is_new = file, not _size_of(file)
         if self._is_new:  # on another medium it may have the numbers of a file before it
             self._ours = None
         return file
-
-    def _is_set_aside(self) -> bool:
-        """Set the written file aside, so that `_open` makes a new one. Return False if that fails: the old file is then
-        written further, since lines matter more than the limit."""
-        try:
-            if self._at == Path(self.path or ""):
-                set_aside(self._at)
-            else:
-                self._at = claim(self.path or "")
-        except OSError as error:
-            self._warn(
-                f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
-                "grow past log.max_mb: let the flight write to its folder."
-            )
-            return False
-        return True
 
     def _delete_oldest(self) -> None:
         """Delete the oldest numbered files until together they keep to three quarters of `max_mb`."""
         if math.isinf(self._part_bytes):
             return
         try:
-            if keep_within(self.path or "", self._part_bytes * (_PARTS - 1)):
+            if keep_within(self._at, self._part_bytes * (_PARTS - 1)):
                 self._warn("Old flight logs are deleted, the oldest first: all stay within log.max_mb together.")
         except OSError as error:
             self._warn(
@@ -244,16 +230,11 @@ class FlightLog:
             _log.warning("%s", sentence)
 
 
-def read_log(path: str | Path, begin: int = 0, end: float = math.inf) -> Iterator[dict[str, Any]]:
-    """Yield the lines of one log file as dicts, in order; only those that begin at byte `begin` or later and before
-    byte `end`. A line that was cut (battery pulled) is left out. `wholeflight.flight_of` reads a flight of several
-    files."""
+def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
+    """Yield the lines of one log file as dicts, in order. A line that was cut (battery pulled) is left out.
+    `wholeflight.flight_of` reads a flight of several files."""
     with open(path, "rb") as handle:
-        handle.seek(begin)
         for line in handle:
-            if begin >= end:
-                return
-            begin += len(line)
             record = record_of(line)
             if record is not None:
                 yield record

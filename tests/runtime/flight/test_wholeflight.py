@@ -47,8 +47,8 @@ def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown)
     assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
     assert (lines[0]["version"], "repeated" in lines[0]) == ("2", False)
     assert numbers(lines) == [100, 101, 102, 103]
-    assert [each.path for each in whole.stretches] == flown[2:]
-    assert (whole.number, whole.flights, whole.missing) == (1, 1, None)
+    assert list(whole.files) == flown[2:]
+    assert whole.missing is None
     assert list(whole) == lines, "it can be read twice"
 
 
@@ -74,18 +74,13 @@ def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown)
     assert flight_of(path).missing is None
 
 
-def test_the_last_of_several_flights_in_a_file_is_taken_unless_another_is_asked_for(path):
+def test_the_last_of_several_flights_in_a_file_is_taken(path):
     other = path.with_name("old")
     for begin in (0, 10):
         fly(path, range(begin, begin + 1), version=str(begin))
         with open(other, "ab") as old:
             old.write(path.read_bytes() + b'{"kind": "que\n')
     assert numbers(flight_of(other)) == [10]
-    first = flight_of(other, 1)
-    assert (numbers(first), first.number, first.flights) == ([0], 1, 2)
-    for wrong in (0, 3):
-        with pytest.raises(UsageError, match="1 to 2"):
-            flight_of(other, wrong)
 
 
 def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another(path):
@@ -95,7 +90,7 @@ def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     whole = flight_of(path)
     assert [line["kind"] for line in whole] == ["start", "query", "query"]
-    assert (whole.flights, whole.missing) == (1, None)
+    assert whole.missing is None
     later = path.with_name("flight-0001.jsonl")
     path.rename(later)
     path.write_text(json.dumps({**again, "part": 3}) + '\n{"kind": "query", "n": 3}\n')
