@@ -21,16 +21,9 @@ _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXI
 _XMP = re.compile(rb"""((?:drone-dji|drone-parrot|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
 
 
-_log = logging.getLogger(__name__)
-
-
-class _Impossible(ValueError):
-    """Raised for a value that is present but impossible, such as a latitude of 99 degrees."""
-
-
 def read_exif(path: str | Path) -> GeoTag:
     """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
-    impossible is None. Impossible EXIF values (minutes of 99, a date of 1e308) are reported in the log.
+    impossible (minutes of 99, a date of 1e308) is None.
 
     The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. Heading,
     roll, pitch and height are those of `read_xmp`; if it gives no heading, the heading is that of EXIF.
@@ -38,12 +31,8 @@ def read_exif(path: str | Path) -> GeoTag:
     tags, xmp = _exif_of(path), read_xmp(path)
 
     def known(read: Callable[[Tags], T]) -> T | None:
-        try:
+        with contextlib.suppress(Exception):  # a tag may be absent, impossible, of another type, or divide by zero
             return read(tags)
-        except _Impossible as error:
-            _log.warning("%s: its EXIF says %s, which cannot be: it is taken as unknown.", path, error)
-        except Exception:  # files of any origin: a tag may be absent, of another type or length, or divide by zero
-            pass
         return None
 
     position, alt_m, gps_time_s = known(_position), known(_alt_m), known(_gps_time_s)
@@ -67,7 +56,7 @@ def _exif_of(path: str | Path) -> Tags:
 
 def _within(value: float, low: float, high: float) -> float:
     if not low <= value <= high:
-        raise _Impossible(f"{value:g} where {low:g} to {high:g} is possible")
+        raise ValueError(f"{value:g} where {low:g} to {high:g} is possible")
     return value
 
 
@@ -109,14 +98,9 @@ def _camera_time_s(tags: Tags) -> float:
 
 
 def _time_s(text: str) -> float:
-    if not text.strip("\0 :0"):  # the standard's way of writing "unknown", and that of a clock that was never set
-        raise KeyError(text)
-    try:
-        if ":" in text:  # without a colon it would be seconds, which EXIF does not have
-            return parse_time(text)
-    except (ValueError, OverflowError):
-        pass
-    raise _Impossible(repr(text[:40]))
+    if ":" not in text:  # it would be seconds, which EXIF does not have
+        raise ValueError(text)
+    return parse_time(text)
 
 
 def read_xmp(path: str | Path) -> GeoTag:

@@ -1,7 +1,6 @@
 """Live sources: cameras and network streams. A thread reads their pictures, holds the newest one, and reopens a source
 that is lost."""
 
-import atexit
 import contextlib
 import threading
 from collections.abc import Callable
@@ -12,10 +11,10 @@ import numpy as np
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
 from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot, coarse
+from edgevpr.frames.source import Source
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
-_EXIT_TIMEOUT_S = 10.0  # longer than any time-out of a stream or camera
 _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take less than three pictures a second
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
 
@@ -42,7 +41,7 @@ class DeviceCapture:
         self._capture.release()
 
 
-class LiveSource:
+class LiveSource(Source):
     """Gives the newest frame of the camera or stream that `open_capture` opens (None: it could not be opened).
 
     `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
@@ -50,15 +49,12 @@ class LiveSource:
     interrupted. `close` waits half a second, then leaves the thread to its time-out.
     """
 
-    is_live = True
-    total = 0
-
     def __init__(self, open_capture: Callable[[], Capture | None], clock: Callable[[], float]):
-        self._condition, self.state = Condition.OPENING, "opening"
-        self.ended = False
-        self.dropped = 0
+        self.is_live, self.total, self.ended = True, 0, False
+        self.condition, self.state = Condition.OPENING, "opening"
+        self.dropped: int = 0
         self.refused = {reason.value: 0 for reason in Refusal}
-        self.latency_s: float | None = None
+        self.latency_s = None
         self._open_capture = open_capture
         self._clock = clock
         self._t_start_s = clock()
@@ -70,12 +66,6 @@ class LiveSource:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._capture, name="capture", daemon=True)
         self._thread.start()
-        atexit.register(self._end_thread)
-
-    @property
-    def condition(self) -> Condition:
-        """Condition of the source."""
-        return Condition.ENDED if self.ended else self._condition
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the newest frame not read yet; None if none comes within `timeout_s` seconds, or after `close`."""
@@ -90,15 +80,9 @@ class LiveSource:
 
     def close(self) -> None:
         """Stop the capture thread; return after about half a second at most."""
-        self.ended = True
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
-        if not self._thread.is_alive():
-            atexit.unregister(self._end_thread)
-
-    def _end_thread(self) -> None:
-        self._closing.set()
-        self._thread.join(_EXIT_TIMEOUT_S)  # a thread that returns from FFmpeg while Python exits would crash it
+        self.end()
 
     def _capture(self) -> None:
         wait_s = 0.0
@@ -110,7 +94,7 @@ class LiveSource:
                 capture.release()
             has_failed_again = wait_s and self._captured == before
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
-            self._condition = Condition.LOST
+            self.condition = Condition.LOST
             self.state = f"{'lost' if self._captured else 'nothing there'}, reopening in {wait_s:g} s"
             self._closing.wait(wait_s)
 
@@ -131,7 +115,7 @@ class LiveSource:
 
     def _put(self, shot: Shot) -> None:
         now_s = self._clock()
-        self._condition, self.state = Condition.RUNNING, "streaming"
+        self.condition, self.state = Condition.RUNNING, "streaming"
         self.latency_s = now_s - shot.t_mono_s
         self._same, self._last_new_s, self._last_taken_s = 0, now_s, shot.t_mono_s
         with self._arrived:
@@ -145,6 +129,6 @@ class LiveSource:
         self._same = self._same + 1 if refusal is Refusal.FROZEN else 0
         silent_s = self._clock() - self._last_new_s
         if self._same >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
-            self._condition, self.state = Condition.FROZEN, "frozen: the same picture over and over"
+            self.condition, self.state = Condition.FROZEN, "frozen: the same picture over and over"
         elif not self._same and silent_s > _DAMAGED_S:
-            self._condition, self.state = Condition.DAMAGED, "damaged: no picture is whole"
+            self.condition, self.state = Condition.DAMAGED, "damaged: no picture is whole"

@@ -2,14 +2,12 @@
 and `open_source` opens each. Flights, mapping and all commands that read pictures use them. `RecordingSource` is the
 base class of those that end, `FolderSource` a folder of images."""
 
-import contextlib
 import os
+import re
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Protocol
-from urllib.parse import urlsplit
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import SOURCES
@@ -18,16 +16,14 @@ from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, cv2, list_images, read_image
-from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.positions import GeoTag, find_positions, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, Refusal
 
-_SCHEMES = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
 _READ_TIMEOUT_S = 1.0
-_SCHEMES_THAT_NEED_A_PORT = ("udp", "tcp")
+_ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|udp://.*:\d+.*")  # udp://:PORT: on all interfaces
 
 
-class Source(Protocol):
+class Source:
     """A source of frames.
 
     `is_live`: True for a camera or stream, of which only the newest picture is read. False for a recording, which is
@@ -39,47 +35,35 @@ class Source(Protocol):
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s")."""
 
     is_live: bool
-
-    @property
-    def ended(self) -> bool: ...
-
-    @property
-    def total(self) -> int: ...
-
-    @property
-    def dropped(self) -> int | None: ...
-
-    @property
-    def refused(self) -> dict[str, int]: ...
-
-    @property
-    def latency_s(self) -> float | None: ...
-
-    @property
-    def condition(self) -> Condition: ...
-
-    @property
-    def state(self) -> str: ...
+    ended: bool
+    total: int
+    dropped: int | None
+    refused: dict[str, int]
+    latency_s: float | None
+    condition: Condition
+    state: str
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame (of a live source the newest), or None if there is none within `timeout_s` seconds.
 
         Raises ImageError for an image that cannot be used; the next call continues with the image after it.
         """
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
         """Release the file, the device or the connection."""
-        ...
+
+    def end(self) -> None:
+        """Mark the source as ended: no more frames will come."""
+        self.ended, self.condition, self.state = True, Condition.ENDED, "ended"
 
 
-class RecordingSource:
+class RecordingSource(Source):
     """Base class of sources that end: folders and video files. For the attributes see `Source`. Only frames whose names
     are in `only` are read (None: all)."""
 
     is_live, ended, condition, state = False, False, Condition.RUNNING, "reading"
-    dropped: int | None = None
-    latency_s: float | None = None
+    dropped = latency_s = None
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
@@ -88,13 +72,6 @@ class RecordingSource:
     def is_wanted(self, name: str) -> bool:
         """Return True if the frame of this name is to be read."""
         return self._only is None or name in self._only
-
-    def end(self) -> None:
-        """Mark the source as ended: no more frames will come."""
-        self.ended, self.condition, self.state = True, Condition.ENDED, "ended"
-
-    def close(self) -> None:
-        """Do nothing: no file is held open between images."""
 
 
 def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
@@ -124,8 +101,6 @@ class FolderSource(RecordingSource):
             self.end()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next image, None after the last. Raises ImageError for an image that cannot be used; the next call
-        continues with the image after it."""
         if self.ended:
             return None
         name, path = self._unread.pop()
@@ -173,6 +148,8 @@ def open_source(
     if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
+        from edgevpr.frames.live import LiveSource
+
         return LiveSource(_capture_of(uri, clock), clock)
     if not path.is_file():
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
@@ -204,23 +181,18 @@ def is_live(uri: str) -> bool:
 def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
     """Return a function that opens the camera or stream `uri`. Raises SourceError if that can never succeed."""
     if "://" in uri:
-        _check_address(uri)
+        if not _ADDRESS.fullmatch(uri):
+            raise SourceError(
+                f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
+            )
     elif not Path(uri).exists():
         raise SourceError(f"There is nothing at `{uri}`: connect the camera or correct the name.")
     elif not os.access(uri, os.R_OK):
         raise SourceError(f"{uri} may not be read by this user: add the user to the group of the file, often `video`.")
     elif uri.startswith("/dev/"):
+        from edgevpr.frames.live import DeviceCapture
+
         return lambda: DeviceCapture(cv2.VideoCapture(uri, cv2.CAP_V4L2), clock)
     from edgevpr.frames.streams import open_stream  # loads FFmpeg
 
     return lambda: open_stream(uri, clock)
-
-
-def _check_address(uri: str) -> None:
-    with contextlib.suppress(ValueError):  # of a port that is none, or half an IPv6 address
-        address = urlsplit(uri)
-        is_whole = address.port is not None or address.scheme not in _SCHEMES_THAT_NEED_A_PORT
-        is_somewhere = address.hostname is not None or address.scheme == "udp"  # udp://:PORT: on all interfaces
-        if address.scheme in _SCHEMES and is_whole and is_somewhere:
-            return
-    raise SourceError(f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}.")

@@ -20,7 +20,7 @@ _UNPACKED = "image", "position", "pose"
 _STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
 
 
-class RecordedSource:
+class RecordedSource(Source):
     """A source that records the frames of `source` on a tape, and its attributes (see `Source`) whenever one is read.
     `keep` stores the JPEG of a frame and returns the number under which it is stored."""
 
@@ -55,11 +55,10 @@ class RecordedSource:
         return kept
 
     def close(self) -> None:
-        """Close the source."""
         self._source.close()
 
 
-class ReplayedSource:
+class ReplayedSource(Source):
     """The source of a recorded flight: frames and attributes (see `Source`) come from its tape. `picture` returns the
     picture stored under a number, uint8 (H, W, 3) BGR or (H, W) grey."""
 
@@ -83,6 +82,3 @@ class ReplayedSource:
             raise ImageError(problem)
         number, position = known.pop("number"), known.pop("position")
         return Frame(image=self._picture(number), position=position and Position(**position), **known)
-
-    def close(self) -> None:
-        """Do nothing."""

@@ -106,18 +106,3 @@ def test_a_time_that_cannot_be_is_unknown(gps, taken, tmp_path):
 
 def test_a_position_without_its_height_is_still_one(tmp_path):
     assert tag_of(tmp_path, GPS | {ALT_REF: b"\x00", ALT: 4e9}).position == POSITION
-
-
-@pytest.mark.parametrize(
-    ("gps", "camera", "says"),
-    [
-        (GPS | {LAT: (46.0, 99.0, 33.0)}, None, "99"),
-        (GPS | {ALT_REF: b"\x00", ALT: 4e9}, None, "4e+09"),
-        (None, {TAKEN: "9999:12:31 23:59:59"}, "9999"),
-        (None, {TAKEN: "0000:00:00 00:00:00"}, ""),  # a clock that was never set
-    ],
-)
-def test_what_cannot_be_true_is_said(gps, camera, says, tmp_path, caplog):
-    tag_of(tmp_path, gps, camera=camera)
-    assert says in caplog.text
-    assert bool(caplog.records) == bool(says)
