@@ -18,8 +18,8 @@ from edgevpr.mavlink.fixes import Fixes, Sending
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.peer import Listener
-from edgevpr.mavlink.readiness import Readiness
 from edgevpr.mavlink.requests import Wish, Wished
+from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog

@@ -1,13 +1,11 @@
-"""Questions to an autopilot before the flight: the caller asks, and waits for each answer. Time and retries are
-limited, the link may be of any kind, and no setting of the autopilot is changed. Used by `edgevpr check` and `doctor`.
-"""
+"""Questions to an autopilot before the flight: the caller asks, and waits for each answer. No setting of the autopilot
+is changed. Used by `edgevpr check` and `doctor`."""
 
 import select
 import statistics
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from edgevpr.core.errors import LinkError
@@ -28,13 +26,12 @@ LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
 _FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
 _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
-_BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
 class Inquiry:
     """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as every
-    companion computer does, because some ports of autopilots do not answer without. Use it as a context manager. Every
-    method raises LinkError when the connection is lost.
+    companion computer does, because some ports of autopilots do not answer without. Use it as a context manager, which
+    raises LinkError when the connection is lost.
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
     - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
@@ -77,11 +74,10 @@ class Inquiry:
     def __enter__(self) -> "Inquiry":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        with suppress(OSError):
-            if self._port.unsent():  # a port that accepts nothing must not delay the end
-                self._port.throw_away()
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
+        if isinstance(error, OSError):
+            raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
 
     @property
     def bad_bytes(self) -> int:
@@ -98,8 +94,8 @@ class Inquiry:
         self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
-        """Request one message by its number (MAV_CMD_REQUEST_MESSAGE) and return it. Returns None if the autopilot
-        refuses the request, or does not answer three requests."""
+        """Request one message by its number (MAV_CMD_REQUEST_MESSAGE) and return it; None if the autopilot refuses, or
+        does not answer three requests."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
             sent_s = time.monotonic()
@@ -112,11 +108,7 @@ class Inquiry:
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
         """Read parameters by name (PARAM_REQUEST_READ) and return their values by name. Parameters that the autopilot
-        does not have, and values that are not finite, are left out.
-
-        `bytewise`: the autopilot stores the bytes of a whole number in the float field of the message (PX4 does), which
-        it announces in AUTOPILOT_VERSION.
-        """
+        does not have, and values that are not finite, are left out. For `bytewise` see `parameter_value`."""
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
         for _ in range(TRIES):
@@ -143,8 +135,7 @@ class Inquiry:
             now_s = time.monotonic()
             if now_s >= end_s:
                 return
-            with self._unless_lost():
-                self._turn(now_s, min(end_s - now_s, 0.25))
+            self._turn(now_s, min(end_s - now_s, 0.25))
 
     def _turn(self, now_s: float, wait_s: float) -> None:
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
@@ -177,18 +168,10 @@ class Inquiry:
         self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
-    @contextmanager
-    def _unless_lost(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
-
     def _put(self, message: Message) -> None:
         """Send a message; what a full port does not take is lost, as on any line: every question is asked again."""
         self.signing.stamp(self._packer)
-        with self._unless_lost():
-            self._port.write(message.pack(self._packer))
+        self._port.write(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
 
 
@@ -231,7 +214,7 @@ class AutopilotReading:
     @property
     def asked(self) -> Answers:
         """The answers on which the flight bases its choice of the channel."""
-        return Answers(kind=Kind(self.vehicle), version=self.version and self.version[:2], parameters=self.parameters)
+        return Answers(kind=Kind(self.vehicle), parameters=self.parameters)
 
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
@@ -248,21 +231,19 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     said = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
     answers = bool(said or asking.heard["COMMAND_ACK"])
     is_px4 = firmware == "px4"
-    wanted_ids = {
-        "filter": mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
-        "first": mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        "second": mavlink.MAVLINK_MSG_ID_GPS2_RAW,
-        "position": mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-        "attitude": mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        "origin": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-        "clock": mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-    }
-    # Without an answer each question would take three seconds.
-    told = {name: asking.message(number) if answers else None for name, number in wanted_ids.items()}
-    first, second, origin, clock = (told[name] for name in ("first", "second", "origin", "clock"))
+    numbers = (
+        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_GPS2_RAW,
+        mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+        mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+    )
+    # Without an answer each question would take three seconds. Of the last two it only counts that they are heard.
+    filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
     packed = said.flight_sw_version if said else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
-    bytewise = bool(said.capabilities & _BYTEWISE) if said else is_px4
     return AutopilotReading(
         system_id=beat.get_srcSystem(),
         firmware=firmware,
@@ -270,10 +251,10 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         version=version if said else None,
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
-        parameters=asking.parameters(wanted.get(firmware, ()) if answers else (), bytewise),
+        parameters=asking.parameters(wanted.get(firmware, ()) if answers else (), is_px4),
         heard=tuple(sorted(asking.heard)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
-        filter_flags=told["filter"] and told["filter"].flags,
+        filter_flags=filter_state and filter_state.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
         signs=asking.signed > 0,
         is_signed_to=asking.signing is not NOT_SIGNING,

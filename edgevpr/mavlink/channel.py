@@ -26,15 +26,14 @@ _GPS_LAG_S = 0.2
 
 # PX4
 FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
-CONTROL = "EKF2_AGP0_CTRL"
-_SENSOR_SINCE = (1, 17)
+CONTROL = "EKF2_AGP0_CTRL"  # since 1.17, as is message 296
 
 log = logging.getLogger(__name__)
 
 
 class Channel(Enum):
-    """A way to tell an autopilot a position. COMMAND and SENSOR carry single fixes, which may be rare and late.
-    GPS_INPUT and ODOMETRY need an estimate ten times a second without a gap."""
+    """A way to tell an autopilot a position. COMMAND and SENSOR carry single fixes, which may be rare and late; the
+    other two are continuous: they need an estimate ten times a second without a gap."""
 
     COMMAND = auto()  # 43003, EXTERNAL_POSITION_ESTIMATE
     SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR
@@ -43,7 +42,6 @@ class Channel(Enum):
 
     @property
     def is_continuous(self) -> bool:
-        """True for a channel that needs an estimate ten times a second without a gap."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
 
@@ -76,20 +74,16 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """Answers of an autopilot on which the choice of a channel depends. `version`: of its firmware, (major, minor)
-    (None: unknown). `parameters`: values by name; parameters that the autopilot does not have are left out."""
+    """Answers of an autopilot on which the choice of a channel depends. `parameters`: values by name; parameters that
+    the autopilot does not have are left out."""
 
     kind: Kind
-    version: tuple[int, int] | None
     parameters: Mapping[str, float]
 
 
 def kind_of(mav_type: int) -> Kind:
-    """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE).
-
-    A VTOL aircraft counts as a plane: in forward flight it dead-reckons by airspeed and without sideslip, as a plane
-    does. While it hovers it can do no more than a copter, but its type does not tell whether it hovers.
-    """
+    """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
+    in forward flight it dead-reckons as one, and its type does not tell whether it hovers."""
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), Kind.OTHER)
 
 
@@ -125,20 +119,19 @@ def receiver_name(parameters: Mapping[str, float], number: int) -> str:
 
 
 def px4_choice(answers: Answers) -> Choice:
-    """Choose the channel for a PX4: message 296 if its version knows it and its parameter CONTROL lets it fuse
-    positions, else command 43003. PX4 ignores a message 296 that has no accuracy, and takes the delay of the position
-    from one of its own parameters."""
-    if answers.version and answers.version < _SENSOR_SINCE:
-        major, minor = answers.version
-        return Choice(Channel.COMMAND, f"command 43003, as version {major}.{minor} knows no message 296 (1.17 does)")
-    if int(answers.parameters.get(CONTROL, 0)) & FUSES_POSITION:
+    """Choose the channel for a PX4: message 296 if its parameter CONTROL lets it fuse positions, else command 43003.
+    PX4 ignores a message 296 that has no accuracy, and takes the delay of the position from one of its own
+    parameters."""
+    if not px4_can_fuse(answers):
+        return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.17 has)")
+    if int(answers.parameters[CONTROL]) & FUSES_POSITION:
         return Choice(Channel.SENSOR, f"message 296, as its {CONTROL} fuses positions")
     return Choice(Channel.COMMAND, f"command 43003, as its {CONTROL} fuses no positions of message 296")
 
 
 def px4_can_fuse(answers: Answers) -> bool:
     """Return True if this PX4 has message 296 in its firmware, so that its parameter CONTROL can switch it on."""
-    return CONTROL in answers.parameters and (answers.version is None or answers.version >= _SENSOR_SINCE)
+    return CONTROL in answers.parameters
 
 
 def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
@@ -147,9 +140,10 @@ def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
 
 ARDUPILOT_PARAMETERS = (*(name for names in _RECEIVERS + _DELAYS for name in names), _VISION)
 PX4_PARAMETERS = (CONTROL,)
-# Name, the parameters on which the channel depends, and the function that chooses it (None: always command 43003).
-_Firmware = tuple[str, tuple[str, ...], Callable[[Answers], Choice] | None]
-_UNKNOWN: _Firmware = ("unknown firmware", (), None)
+_OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
+# Name, the parameters on which the channel depends, and the function that chooses it.
+_Firmware = tuple[str, tuple[str, ...], Callable[[Answers], Choice]]
+_UNKNOWN: _Firmware = ("unknown firmware", (), lambda answers: _OF_ANY)
 _FIRMWARES: dict[int, _Firmware] = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ARDUPILOT_PARAMETERS, ardupilot_choice),
     mavlink.MAV_AUTOPILOT_PX4: ("PX4", PX4_PARAMETERS, px4_choice),
@@ -160,13 +154,12 @@ class Interview:
     """Asks an autopilot for its version and a few parameters, and chooses the channel from the answers.
 
     Missing answers are requested four times, a second apart, since an autopilot is silent about a parameter that it
-    does not have. Until the channel is chosen, `choice` is command 43003. The first answer to a question counts, even
-    if it comes after the choice, which is then made again. Further answers to the same question are ignored, so that
-    changing a parameter in flight does not change the channel.
+    does not have. Until the channel is chosen, `choice` is command 43003. Only the first answer to a question counts,
+    so that changing a parameter in flight does not change the channel; after one that comes late, it is chosen again.
     """
 
     def __init__(self) -> None:
-        self.choice = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
+        self.choice = _OF_ANY
         self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), Kind.OTHER
         self._version: tuple[int, int] | None = None
         self._parameters: dict[str, float] = {}
@@ -209,7 +202,6 @@ class Interview:
     def _choose(self) -> None:
         self._is_over = True
         name, _, choose = _FIRMWARES.get(self._autopilot, _UNKNOWN)
-        if choose:
-            self.choice = choose(Answers(kind=self._kind, version=self._version, parameters=self._parameters))
+        self.choice = choose(Answers(kind=self._kind, parameters=self._parameters))
         version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
         log.info("%s%s on a %s: positions go to it by %s", name, version, self._kind.value, self.choice.reason)

@@ -15,8 +15,8 @@ from threading import Event
 
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.mavlink.messages import Fix, Severity
-from edgevpr.mavlink.readiness import GPS_IN_USE, Reason
 from edgevpr.mavlink.texts import News
+from edgevpr.mavlink.vehicle import GPS_IN_USE, Reason
 
 FIXES_MAX = 8
 # The longest that a fix may wait, from `put` on and in all buffers together, unless the configuration says another.

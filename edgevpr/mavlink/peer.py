@@ -12,8 +12,7 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
-from edgevpr.mavlink.readiness import Readiness
-from edgevpr.mavlink.vehicle import GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, gps_sd_m
+from edgevpr.mavlink.vehicle import GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness, gps_sd_m
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost

@@ -26,8 +26,8 @@ STATE = MotionState(
 )
 
 
-def asked(kind=Kind.PLANE, version=(4, 7), **parameters):
-    return Answers(kind=kind, version=version, parameters=parameters)
+def asked(kind=Kind.PLANE, **parameters):
+    return Answers(kind=kind, parameters=parameters)
 
 
 @pytest.mark.parametrize(
@@ -54,13 +54,11 @@ def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be()
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert px4_choice(asked(version=(1, 17), EKF2_AGP0_CTRL=1)).channel is Channel.SENSOR
-    assert px4_choice(asked(version=(1, 17), EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
-    assert px4_choice(asked(version=(1, 16), EKF2_AGP0_CTRL=1)).channel is Channel.COMMAND
-    assert px4_choice(asked(version=None)).channel is Channel.COMMAND
-    assert px4_choice(asked(version=None, EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
-    assert px4_can_fuse(asked(version=(1, 17), EKF2_AGP0_CTRL=0))
-    assert not px4_can_fuse(asked(version=(1, 16), EKF2_AGP0_CTRL=0))
+    assert px4_choice(asked(EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
+    assert px4_choice(asked(EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
+    assert px4_choice(asked()).channel is Channel.COMMAND
+    assert px4_can_fuse(asked(EKF2_AGP0_CTRL=0))
+    assert not px4_can_fuse(asked())
 
 
 class Ear(Listener):

@@ -10,10 +10,10 @@ import pytest
 from conversing import FIX_3D
 from mavlink_peers import Peer, TcpServer, free_port, link_to, wait_until
 
-from edgevpr.mavlink import readiness
+from edgevpr.mavlink import vehicle as reasons
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.readiness import GPS_IN_USE, Readiness
+from edgevpr.mavlink.vehicle import GPS_IN_USE, Readiness
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
@@ -98,10 +98,10 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     fixes.note_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
-    assert fixes.news(readiness.NO_COMMAND_ANSWERED, 8.5)
+    assert fixes.news(reasons.NO_COMMAND_ANSWERED, 8.5)
     sent(fixes, 17.5)
     fixes.note_lost(2)
-    assert (fixes.why_not(20.0), fixes.news(readiness.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, [])
+    assert (fixes.why_not(20.0), fixes.news(reasons.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, [])
 
 
 def fly(autopilot, count, every_s=1.0):
@@ -159,18 +159,18 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     assert refused() == FixAnswer("FAILED", GPS_IN_USE.sentence, pytest.approx(0.03))
     autopilot.wait(2)
     autopilot.gps(fix_type=1)
-    assert refused().why == readiness.UNKNOWN.sentence
+    assert refused().why == reasons.UNKNOWN.sentence
     (request,) = autopilot.questions()
     assert (request.command, request.param1) == (512, 49), "it is asked for its origin"
     why = [refused(after_s=3.0).why] + [refused().why for _ in range(20)]
-    assert set(why) == {readiness.NO_ORIGIN.sentence}, "while it is asked again, too"
+    assert set(why) == {reasons.NO_ORIGIN.sentence}, "while it is asked again, too"
     assert len(autopilot.questions()) == 2
     autopilot.say(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
     autopilot.filter(mavlink.EKF_CONST_POS_MODE)
-    assert refused().why == readiness.NOT_RECKONING.sentence
+    assert refused().why == reasons.NOT_RECKONING.sentence
     assert refused(ACCEPTED).why is None
     assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
-    assert autopilot.conversation.fixes.refusal is readiness.NOT_RECKONING
+    assert autopilot.conversation.fixes.refusal is reasons.NOT_RECKONING
 
 
 def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):

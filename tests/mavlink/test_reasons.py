@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from edgevpr.mavlink import readiness as reasons
+from edgevpr.mavlink import vehicle as reasons
 from edgevpr.mavlink.messages import TEXT_BYTES
-from edgevpr.mavlink.readiness import Readiness, Reason
+from edgevpr.mavlink.vehicle import Readiness, Reason
 from edgevpr.mavlink.wire import mavlink
 
 AIRBORNE = Readiness(is_armed=True, gps_s=-60.0, origin_s=-1.0, flags_s=0.0)

@@ -9,7 +9,7 @@ from flights import Flight, of_kind
 from mavlink_peers import Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
-from edgevpr.mavlink.readiness import GPS_IN_USE
+from edgevpr.mavlink.vehicle import GPS_IN_USE
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight import systemd
 
