@@ -12,9 +12,8 @@ places that are compared in full: 144 bytes with a forward camera (see `placecod
 `layout`).
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, Tech
 from edgevpr.core.errors import UsageError
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import Contrast, stretched
-from edgevpr.techniques.displacement import fitted, most_similar, share, voted
+from edgevpr.techniques.displacement import aligned, most_similar, share, voted
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
     grey_square,
@@ -100,21 +99,18 @@ class CoHog:
             self.gt = _DEFAULT_GT[self.entropy]
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
+        tells_height = self._is_nadir and self._votes  # the thesis's score does not say which of two heights is right
         self.min_score, self.min_margin = _ACCEPT[self.camera if self._votes else "thesis"]
         self.min_quality = _MIN_QUALITY[self.entropy]
         self.candidates = _CANDIDATES[self.camera]
         as_it_is = HEIGHT_RATIOS.index(1.0) * ROTATIONS
-        self._hypotheses = range(as_it_is, as_it_is + 1)
+        self._hypotheses = range(as_it_is, as_it_is + (ROTATIONS if self._is_nadir else 1))
+        if tells_height:
+            self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
+        # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
+        self._comparable: Callable[[Singles], Singles] = self._patterns if self._votes else unit_rows
         self._query: Descriptor | None = None
         self._views: Views | None = None
-        heights: dict[str, Any] = {}
-        if self._is_nadir:
-            # The thesis's score does not tell which of two heights is right.
-            whole = range(len(HEIGHT_RATIOS) * ROTATIONS)
-            self._hypotheses = whole if self._votes else whole[as_it_is : as_it_is + ROTATIONS]
-            heights = {"heading_within_deg": _HEADING_WITHIN_DEG}
-            if self._votes:
-                heights |= {"cells": self.w1 // self.w2, "height_ratios": HEIGHT_RATIOS}
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
         self.spec = TechniqueSpec(
             name="cohog",
@@ -123,8 +119,10 @@ class CoHog:
             fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
             packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
             scan_counts=self._votes and not self._is_nadir,
+            heading_within_deg=_HEADING_WITHIN_DEG if self._is_nadir else None,
+            cells=self.w1 // self.w2 if tells_height else None,
+            height_ratios=HEIGHT_RATIOS if tells_height else (),
             in_full=_IN_FULL[self.camera] if self._votes else None,
-            **heights,
         )
 
     def _require_parameters(self) -> None:
@@ -228,9 +226,7 @@ class CoHog:
         """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
         fields = self._views_of(query).fields
         if (number, grid.side) not in fields:
-            # The vote compares patterns too, and keeps them: the thesis's score compares whole blocks.
-            own = self._votes and self._view(query, number)
-            view = own or self._views_of(query).regions(*hypothesis(number), self._patterns)
+            view = self._views_of(query).regions(number, self._patterns)
             fields[number, grid.side] = layout.field(grid, view.regions, view.numbers, (view.side, self._side))
         return fields[number, grid.side]
 
@@ -238,12 +234,14 @@ class CoHog:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
         regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
         query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
-        counts, and `align` refines its shift, rotation and height. Last, the score is the less, the less the structures
-        of query and place agree (see `overlay`)."""
+        counts, and `aligned` refines its shift, rotation and height. Last, the less the structures of query and place
+        agree (see `overlay`), the less is the score."""
         reference = self._reference(fine)
         if self._is_nadir:
             best, match, nearest = self._likest(query, reference, hypotheses)
-            match = fitted(self._view(query, best), nearest, self._side, match) if self._votes else match
+            if self._votes:
+                view = self._view(query, best)
+                match = aligned((view.numbers, view.side), (nearest, self._side), match)
         else:
             match, _ = self._matched(self._view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
@@ -265,7 +263,11 @@ class CoHog:
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
         for each in tried:
             match, nearest[each] = self._matched(self._view(query, each), reference)
-            matches[each] = match if place is None else self._laid(query, each, match, place)
+            if place is not None and match.shift_cells is not None:
+                shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
+                agrees = layout.agreement(self._field(query, each, layout.FINE), place, shift)
+                match = replace(match, score=min(1.0, match.score * agrees / _LAYOUT_AGREES))
+            matches[each] = match
         best = max(matches, key=lambda each: matches[each].score)
         ratio, turn = hypothesis(best)
         scale = scale_of(self._side + 1, ratio)
@@ -278,9 +280,8 @@ class CoHog:
         known = reference.any(axis=1).reshape(self._side, self._side)
         place = overlay.structure(reference, known, _AROUND_CELLS[self.camera])
         if self._is_nadir:
-            grey, allowed = views.halved()
-            laid = overlay.laid(grey, allowed, match, cells)
-            return overlay.stands_out(self._structure(*self._all_blocks(*laid, len(grey) // cells)), place)
+            laid = overlay.laid(*views.halved, match, cells)
+            return overlay.stands_out(self._structure(*self._all_blocks(*laid, len(laid[0]) // cells)), place)
         if views.structure is None:
             views.structure = self._structure(views.blocks(1.0, 0)[0], views.seen)
         return overlay.agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
@@ -303,26 +304,13 @@ class CoHog:
         nearest = most_similar(view.regions[::_GLANCE], reference)
         return share(view.numbers[::_GLANCE], nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
 
-    def _laid(self, query: Descriptor, number: int, match: FineMatch, place: Singles) -> FineMatch:
-        """Return a match under the hypothesis `number` with its score times how well the layout of the query agrees
-        with that of the place, `place` (C, n, n), on the shift of the match."""
-        if match.shift_cells is None:
-            return match
-        dx, dy = match.shift_cells
-        laid = layout.agreement(self._field(query, number, layout.FINE), place, (dx / self._side, dy / self._side))
-        return replace(match, score=min(1.0, match.score * laid / _LAYOUT_AGREES))
-
     def _reference(self, fine: Bytes) -> Singles:
-        """Restore the blocks of a place from its stored `fine` part, which holds their square roots, as vectors that
-        can be compared (see `_comparable`)."""
+        """Restore the vectors that are compared from the `fine` part of a place, which holds square roots of blocks."""
         return self._comparable(np.square(fine, dtype=np.float32))
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
-        """Return the good regions of a query under the hypothesis `number`. They are cached for the newest query."""
-        cached = self._views_of(query).cached
-        if number not in cached:
-            cached[number] = self._views_of(query).regions(*hypothesis(number), self._comparable)
-        return cached[number]
+        """Return the good regions of a query under the hypothesis `number`."""
+        return self._views_of(query).regions(number, self._comparable)
 
     def _views_of(self, query: Descriptor) -> Views:
         if query is not self._query or self._views is None:
@@ -332,10 +320,6 @@ class CoHog:
             self._views = Views(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
             self._query = query
         return self._views
-
-    def _comparable(self, blocks: Singles) -> Singles:
-        """Convert blocks float32 (N, 4 bins) to the vectors of length 1 that `matching` compares."""
-        return self._patterns(blocks) if self._votes else unit_rows(blocks)
 
     def _patterns(self, regions: Singles) -> Singles:
         """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `slow_patterns`)."""

@@ -10,7 +10,7 @@ second measure. Regions are numbered row by row.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -32,32 +32,17 @@ _LEAST_PAIRS = 8
 _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
 
 
-@dataclass(frozen=True, slots=True)
-class Displacement:
-    """Result of a vote. A weighted `share` (0..1) of the regions agrees on the shift `shift_cells` (dx, dy) from the
-    query to the reference. `covariance_cells2` (var x, cov xy, var y) is that of the votes around the peak. `agreeing`
-    is the number of different regions of the reference that the agreeing votes lead to."""
-
-    share: float
-    shift_cells: tuple[float, float]
-    covariance_cells2: tuple[float, float, float]
-    agreeing: int
-
-
-_NOTHING = Displacement(0.0, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
-
-
-def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> Displacement:
+def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> FineMatch:
     """Find the shift on which most regions agree. `asking` and `best` are int (G,): the good regions of the query, and
     for each the most similar region of the reference. `sides` are the regions along one side of the query's grid and of
     the reference's, both even or both odd.
 
     A shift is counted from the middle of one grid to that of the other. For each shift, a vote that is n cells off it,
     along rows or columns, has the weight `counts[n]`; one further off has none. The peak is the shift with the largest
-    sum of weights. Without any region the share is 0.
+    sum of weights. The score is its share of all votes, 0 without any region.
     """
     if not len(asking):
-        return _NOTHING
+        return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
     room = len(counts) - 1
     step, votes, around = _piled(asking, best, sides, counts)
     wide = len(votes)
@@ -75,16 +60,20 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
         float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
     )
     none = sum(sides) // 2 - 1  # the index of a shift of 0, along one side
-    shift = (peak_x - none + mean_x, peak_y - none + mean_y)
     near = np.zeros((wide, wide), bool)
     near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
     agreed = np.zeros(sides[1] ** 2, bool)
     agreed[best[near.ravel().take(step)]] = True
-    return Displacement(count / len(asking), shift, covariance, int(np.count_nonzero(agreed)))
+    return FineMatch(
+        count / len(asking),
+        shift_cells=(peak_x - none + mean_x, peak_y - none + mean_y),
+        covariance_cells2=covariance,
+        coverage=np.count_nonzero(agreed) / len(agreed),
+    )
 
 
 def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
-    """Return only the `share` of the result of `displacement` for these arguments, in half the time."""
+    """Return only the score of `displacement` for these arguments, in half the time."""
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
@@ -107,34 +96,12 @@ def voted(
     best = most_similar(view.regions, reference)
     found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
-    match = FineMatch(
-        min(1.0, found.share * view.worth),
-        shift_cells=found.shift_cells,
-        covariance_cells2=found.covariance_cells2,
-        coverage=found.agreeing / len(reference),
-        support=support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None,
-    )
-    return match, best
-
-
-def fitted(view: ViewRegions, best: Ints, side: int, match: FineMatch) -> FineMatch:
-    """Return the match of a view with shift, rotation and height as `align` finds them; as it is if that fails. `best`
-    int (G,) are the most similar regions of the place, which has `side` along a side."""
-    around = match.shift_cells or (0.0, 0.0)
-    found = align((view.numbers, view.side), (best, side), around)
-    if found is None:
-        return match
-    return replace(
-        match,
-        shift_cells=found.shift_cells,
-        covariance_cells2=found.covariance_cells2,
-        rotation_deg=((match.rotation_deg or 0.0) + found.turn_deg) % 360,
-        height_ratio=(match.height_ratio or 1.0) * found.scale,
-    )
+    backed = support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None
+    return replace(found, score=min(1.0, found.score * view.worth), support=backed), best
 
 
 def support(
-    asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float]
+    asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float] | None
 ) -> Support:
     """Measure how all regions of query and place support the shift that a vote has found. `asking` int (G,) and
     `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side * side,
@@ -142,7 +109,7 @@ def support(
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
     of_y, of_x = np.divmod(asking, side)
-    step_x, step_y = (round(step) for step in shift_cells)
+    step_x, step_y = (round(step) for step in shift_cells or (0.0, 0.0))
     y, x = np.divmod(np.arange(len(reference)), side)
     off = np.maximum(abs(x - of_x[back] - step_x), abs(y - of_y[back] - step_y))
     return Support(
@@ -198,35 +165,25 @@ def _weights(counts: tuple[float, ...]) -> Singles:
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """Exact position of a query's picture on that of a place. After turning the query's picture by `turn_deg`
-    (clockwise) and scaling it by `scale`, its middle lies at `shift_cells` (x, y) from the middle of the place's.
-    `covariance_cells2` (var x, cov xy, var y) is that of the distances by which single regions miss this fit."""
-
-    shift_cells: tuple[float, float]
-    turn_deg: float
-    scale: float
-    covariance_cells2: tuple[float, float, float]
-
-
-def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Alignment | None:
+def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
     region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
-    grid. Only pairs that agree on the shift `shift_cells` are used. Returns None if fewer than 8 agree, or if the
-    rotation or scale found belongs to another hypothesis.
+    grid. Only pairs that agree on the shift of the `match` are used. Returns the match with the exact position: after
+    turning the query's picture and scaling it, its middle lies at the shift from that of the place's, and the
+    covariance is that of the distances by which single regions miss the fit. Returns the match as it is if fewer than 8
+    pairs agree, or if the rotation or scale found belongs to another hypothesis.
 
     The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis, so regions far from
     the middle miss. So the fit is repeated, each time with the regions that agree with the last one.
     """
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)
-    turned, shift = 1 + 0j, complex(*shift_cells)
+    turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
     for again in range(_ROUNDS + 1):
         off = there - turned * mine - shift
         near = np.maximum(abs(off.real), abs(off.imag)) <= _WITHIN_CELLS
         if np.count_nonzero(near) < _LEAST_PAIRS:
-            return None
+            return match
         if again == _ROUNDS:
             break
         of, to = mine[near], there[near]
@@ -234,15 +191,19 @@ def align(asking: _Grid, best: _Grid, shift_cells: tuple[float, float]) -> Align
         spread = np.vdot(of - middle_of, of - middle_of).real
         turned = np.vdot(of - middle_of, to - middle_to) / spread if spread > 0 else 0j
         if not 1 / _FURTHEST_SCALE < abs(turned) < _FURTHEST_SCALE:
-            return None
+            return match
         if abs(np.angle(turned, deg=True)) > _FURTHEST_TURN_DEG:
-            return None
+            return match
         shift = middle_to - turned * middle_of
     x, y = off[near].real, off[near].imag
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = float(x.var()) + 1 / 12, float(np.mean(x * y) - x.mean() * y.mean()), float(y.var()) + 1 / 12
-    return Alignment(
-        (float(shift.real), float(shift.imag)), float(np.angle(turned, deg=True)), float(abs(turned)), covariance
+    return replace(
+        match,
+        shift_cells=(float(shift.real), float(shift.imag)),
+        covariance_cells2=covariance,
+        rotation_deg=((match.rotation_deg or 0.0) + float(np.angle(turned, deg=True))) % 360,
+        height_ratio=(match.height_ratio or 1.0) * float(abs(turned)),
     )
 
 

@@ -11,6 +11,7 @@ from the shares that foreign pictures reach under each view (measured between th
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ _LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to a
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of a
 # number of pixels. Returns blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
 Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
+Describe = Callable[[Singles], Singles]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,17 +72,16 @@ class Views:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
         self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
         self._encoded = {(1.0, 0): square}
-        self._halved: tuple[Array, Mask] | None = None
         self._scaled: dict[float, tuple[Array, Array]] = {}
         self.structure: Singles | None = None  # of the unchanged view (see `overlay`)
-        self.cached: dict[int, ViewRegions] = {}  # by the number of the hypothesis
+        self._regions: dict[tuple[int, Describe], ViewRegions] = {}
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 
     def keep(self, ratio: float) -> None:
         """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
         self._scaled = {each: picture for each, picture in self._scaled.items() if each == ratio}
-        self.cached = {key: view for key, view in self.cached.items() if hypothesis(key)[0] == ratio}
+        self._regions = {key: view for key, view in self._regions.items() if hypothesis(key[0])[0] == ratio}
         self.fields = {key: field for key, field in self.fields.items() if hypothesis(key[0])[0] == ratio}
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
@@ -92,34 +93,32 @@ class Views:
         blocks, good = self._encoded[ratio, within]
         return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
-    def side_of(self, ratio: float) -> int:
-        """Return the number of regions along one side of the grid of a view, at least that of a place."""
-        return max(cells_along(self._side + 1, ratio) - 1, self._side)
+    def regions(self, number: int, described: Describe) -> ViewRegions:
+        """Return all good regions of the view of the hypothesis `number`. `described` converts blocks float32 (G, 4
+        bins) to the vectors (G, P) that are compared."""
+        if (number, described) not in self._regions:
+            ratio, turn = hypothesis(number)
+            blocks, good = self.blocks(ratio, turn)
+            side = max(cells_along(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
+            if ratio > 1:
+                ground = scale_of(self._side + 1, ratio) ** 2  # over that of the place
+                worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
+            else:
+                worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
+            self._regions[number, described] = ViewRegions(
+                numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
+                regions=described(blocks[good]),
+                side=side,
+                worth=worth,
+            )
+        return self._regions[number, described]
 
-    def regions(self, ratio: float, turn: int, described: Callable[[Singles], Singles]) -> ViewRegions:
-        """Return all good regions of the view of the height ratio `ratio` and the rotation step `turn`. `described`
-        converts blocks (G, 4 bins) to the vectors (G, P) that are compared."""
-        blocks, good = self.blocks(ratio, turn)
-        side = self.side_of(ratio)
-        if ratio > 1:
-            ground = scale_of(self._side + 1, ratio) ** 2  # over that of the place
-            worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
-        else:
-            worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
-        return ViewRegions(
-            numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
-            regions=described(blocks[good]),
-            side=side,
-            worth=worth,
-        )
-
+    @cached_property
     def halved(self) -> tuple[Array, Mask]:
-        """Return the picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and
-        bool (side, side), True for allowed pixels."""
-        if self._halved is None:
-            grey, allowed = self._resized((self._side + 1) * max(2, self._cell_px // 2))
-            self._halved = grey, allowed.astype(bool)
-        return self._halved
+        """The picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and bool
+        (side, side), True for allowed pixels."""
+        grey, allowed = self._resized((self._side + 1) * max(2, self._cell_px // 2))
+        return grey, allowed.astype(bool)
 
     def _resized(self, side: int) -> tuple[Array, Array]:
         """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
