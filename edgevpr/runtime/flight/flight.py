@@ -22,7 +22,6 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import look_ahead, open_map, rate_hz, say_start
-from edgevpr.runtime.flight.air import in_the_air
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.commands import Commands
@@ -33,7 +32,7 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
-from edgevpr.runtime.flight.world import Crew, StopNow, World, signals
+from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
 from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
@@ -46,7 +45,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions
     of the frames, if the source is a recording (None: there is none). Raises an EdgevprError, one sentence, if the
     flight cannot start."""
-    with in_the_air(config, positions) as world, signals(world.stop):
+    with in_the_air(config, positions) as world:
         try:
             with closing(Flight.open(config, world)) as flight:
                 return flight.run()

@@ -3,11 +3,18 @@ goes wrong and when it is right again. The loop of `flight` calls `tell` of each
 it ends no flight."""
 
 import logging
+import math
 
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.herald import Herald, Trouble
-from edgevpr.runtime.flight.integrity import Integrity
+from edgevpr.runtime.flight.navigation import PositionedMatch, positioned, worst_sd
+from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -18,6 +25,17 @@ _LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten
 _LOST, _LOST_AFTER = 0.9, 10  # probability of being lost, in so many queries in a row that are not accepted
 _FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches that find the map again, with fewer misses between two of them
 _TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to the next
+
+# In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
+# does not reduce them: they are so large in one flight of 3000. With a standard deviation of 5 m for the map, the limit
+# is 23 m for good matches and a good receiver.
+_GPS_CONTRADICTS = 4.0
+_GPS_LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
+_GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
+_GPS_WITHIN_S = 30.0  # the matches in a row must be no older
+_GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
+_TIME_SD_S = 0.1  # between a position of the receiver and a frame
+_ATTITUDE_SD = math.tan(math.radians(1.0))
 
 _log = logging.getLogger(__name__)
 
@@ -127,22 +145,69 @@ class Sight:
 
 
 class GpsWatch:
-    """Compares GPS with the matches, and reports once when they contradict each other and when they agree again. Every
-    comparison is sent to the autopilot, and the navigation does not use a GPS that is wrong."""
+    """Compares GPS with the matches: a receiver far from them is jammed, spoofed, or wrong for a moment. It reports
+    once when they contradict each other and when they agree again. Every comparison is sent to the autopilot, and the
+    navigation does not use a GPS that is wrong.
+
+    GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
+    from GPS; it is right again after three matches in a row that agree with it. `map_sd_m` is the standard deviation of
+    the error that all matches share."""
 
     def __init__(self, map_sd_m: float, herald: Herald, autopilot: ToAutopilot | None) -> None:
-        self._integrity, self._herald, self._autopilot = Integrity(map_sd_m), herald, autopilot
+        self._map_sd_m, self._herald, self._autopilot = map_sd_m, herald, autopilot
+        self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
+        self._agreeing = 0
+        self.is_wrong = False
 
     def tell(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
-        if event.position is None or event.view.reason:
+        seen, vehicle = positioned(event), event.vehicle
+        if seen is None or event.view.reason or vehicle is None or vehicle.gps is None:
             return
-        news = self._integrity.look(event)
-        off_m, is_wrong = self._integrity.off_m, self._integrity.is_wrong
-        if off_m is None:
+        if not vehicle.is_fresh_at(seen.t_s):
             return
+        off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
+        self._weigh(seen, off_m, self._sd_m(seen, vehicle, vehicle.gps))
+        away_m = math.hypot(*off_m)
         if self._autopilot:
-            self._autopilot.compare_gps(off_m, is_wrong)
-        if news:
-            severity = Severity.WARNING if is_wrong else Severity.INFO
-            self._herald.tell("gps", severity, news, said=news, off_m=round(off_m, 1), is_wrong=is_wrong)
+            self._autopilot.compare_gps(away_m, self.is_wrong)
+        if self.is_wrong != was_wrong:
+            severity = Severity.WARNING if self.is_wrong else Severity.INFO
+            news = (
+                f"GPS is {away_m:.0f} m from the map's position" if self.is_wrong else "GPS agrees with the map again"
+            )
+            self._herald.tell("gps", severity, news, said=news, off_m=round(away_m, 1), is_wrong=self.is_wrong)
+
+    def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
+        """Judge GPS anew by a match that is `off_m` (2,) metres from it."""
+        if math.hypot(*off_m) <= _GPS_LEAST_M or in_sd(off_m, sd_m**2 * np.eye(2)) <= _GPS_CONTRADICTS:
+            self._against.clear()
+            self._agreeing += 1
+            if self._agreeing >= _GPS_IN_A_ROW:
+                self.is_wrong = False
+            return
+        self._agreeing = 0
+        self._against = [
+            (other, other_m)
+            for other, other_m in self._against
+            if seen.t_s - other.t_s <= _GPS_WITHIN_S
+            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
+            and not set(other.places) >= set(seen.places)
+        ]
+        self._against.append((seen, off_m))
+        self.is_wrong = self.is_wrong or len(self._against) >= _GPS_IN_A_ROW
+
+    def _sd_m(self, seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> float:
+        speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else 0.0
+        of_fix_m = worst_sd(seen.covariance_m2)
+        tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
+        return math.hypot(of_fix_m, self._map_sd_m, gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
+
+
+def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
+    """Return the offset (2,), metres east and north, from the receiver's position at the time of the frame to the
+    match."""
+    here = seen.position
+    off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
+    flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+    return off_m - flown_m

@@ -1,27 +1,49 @@
-"""The world of a flight: all that it takes in from outside and sends outside. In the air these are real cameras, clocks
-and links; in a replay they come from the recording's tape. The code of the flight is the same."""
+"""The world of a flight: all that it takes in from outside and sends outside. In the air (`in_the_air`) these are real
+cameras, clocks and links, with a recording of all input if one is configured; in a replay they come from the
+recording's tape. The code of the flight is the same."""
 
+import ctypes
+import logging
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeVar
 
-from edgevpr.core.config import LogConfig
+from edgevpr import __version__
+from edgevpr.core.config import Config, LogConfig
+from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.types import NO_TAPE, Tape
-from edgevpr.frames.source import Source
+from edgevpr.frames.source import Source, open_source
+from edgevpr.frames.taped import RecordedSource
+from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.signing import Signing
-from edgevpr.mavlink.wire import Tap
-from edgevpr.power.boards import Board
+from edgevpr.mavlink.signing import Signing, open_signing
+from edgevpr.mavlink.tlog import Tlog
+from edgevpr.mavlink.wire import Tap, untapped
+from edgevpr.power.boards import Board, load_board
+from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.flight.status import StatusFile
-from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.flight.recording import Recording
+from edgevpr.runtime.flight.status import StatusFile, usual_path
+from edgevpr.runtime.recognise.learn import Learner, check_positions
+from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+# Parameters of `mallopt` (glibc's malloc.h) and their values, bytes: how much of what was freed is kept, and from which
+# size on a part of memory is given back to the system as soon as it is freed. Left alone, glibc raises both as larger
+# parts are freed: a flight over many places then holds more than it uses. At half of these it is slower.
+_MALLOC = {-1: 8_000_000, -3: 4_000_000}
 
 
 class StopNow(BaseException):
@@ -122,7 +144,80 @@ class Crew:
 
 
 @contextmanager
-def signals(stop: Stop) -> Iterator[None]:
+def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]:
+    """Open all inputs and outputs of a real flight, yield them, and close them at the end; meanwhile SIGTERM and SIGINT
+    end the flight. `positions` is a file with the positions of the frames, if the source is a recording (None: there is
+    none). Raises an EdgevprError if something cannot be opened."""
+    uri = config.source.uri
+    if uri is None:
+        raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
+    parse_links(config.mavlink.link, config.mavlink.ground)
+    if config.mapping.learn:
+        check_positions(config, positions)
+    board = load_board(config.board)
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
+        for parameter, value in _MALLOC.items():
+            mallopt(parameter, value)
+    with ExitStack() as stack:
+        recording = _or_without(lambda: _recording(config, stack))
+        folder = str(recording.path.resolve()) if recording else None
+        tape: Tape = recording or NO_TAPE
+        header = {"version": __version__, "config": asdict(config), "board": asdict(board), "recording": folder}
+        tape.note("flight", header)
+        status_path = config.status.file or usual_path()
+        status = _or_without(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
+        if config.log.tlog and not config.mavlink.link:
+            _log.warning("there is no link, so there is no tlog either")
+        tlog_path = config.log.tlog if config.mavlink.link else None
+        tlog = _or_without(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
+
+        def opened_source(step_s: float) -> Source:
+            source = open_source(uri, step_s=step_s, positions=positions, live=True)
+            return RecordedSource(source, recording, recording.keep) if recording else source
+
+        world = World(
+            board=board,
+            place_map=config.map,
+            log=config.log,
+            tape=tape,
+            clock=taped(Clock(), tape) if recording else Clock(),
+            open_source=opened_source,
+            link=Link,
+            ground=GroundLink,
+            signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
+            tap=tlog.record if tlog else untapped,
+            stop=Stop(tape),
+            status=status,
+            recording=folder,
+        )
+        with _signals(world.stop):
+            yield world
+
+
+def _recording(config: Config, stack: ExitStack) -> Recording | None:
+    """Begin the recording, which `stack` closes; return None if none is configured."""
+    if config.log.record is None:
+        return None
+    recording = stack.enter_context(Recording(config.log.record, config.log.record_mb))
+    if config.mapping.learn and config.map and has_map(Path(config.map)):
+        recording.keep_map(Path(config.map))
+    return recording
+
+
+def _or_without(opened: Callable[[], T]) -> T | None:
+    """Return the result of `opened`. If that raises an EdgevprError in a systemd service, which may be restarted in the
+    air, log it and return None, so that the flight goes on without."""
+    try:
+        return opened()
+    except EdgevprError as error:
+        if not systemd.is_there():
+            raise
+        _log.warning("%s", error)
+        return None
+
+
+@contextmanager
+def _signals(stop: Stop) -> Iterator[None]:
     """Context manager: SIGTERM and SIGINT call `stop` inside it. SIGHUP is ignored: a closed terminal ends no
     flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}

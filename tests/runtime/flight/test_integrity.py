@@ -13,7 +13,6 @@ from edgevpr.core.types import Position, Receiver
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.integrity import Integrity
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.flight.watching import GpsWatch
 
@@ -154,7 +153,7 @@ def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(watched):
 def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_receiver(fix_sd_m):
     """Five flights, whose maps are off by what the configuration says."""
     for seed in range(5):
-        rng, integrity = np.random.default_rng(seed), Integrity(MAP_SD_M)
+        rng, integrity = np.random.default_rng(seed), Looks(MAP_SD_M)
         map_off_m = MAP_SD_M * np.array([math.cos(seed), math.sin(seed)])
         at_m, wander_m, velocity = np.zeros(2), np.zeros(2), (12.0, 5.0)
         for t_s in map(float, range(1800)):
@@ -171,6 +170,23 @@ def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_rece
             assert integrity.off_m is not None
 
 
+class Looks:
+    """A watch that says what it has told of one match."""
+
+    def __init__(self, map_sd_m):
+        clock = FakeClock()
+        self.link, self.off_m = FakeLink(clock), None
+        autopilot = to_autopilot(self.link, Navigator(map_sd_m, 1.0), clock)
+        self.watch = GpsWatch(map_sd_m, Herald(FlightLog(None), self.link), autopilot)
+
+    def look(self, event):
+        before = len(self.link.sent)
+        self.watch.tell(event)
+        told = self.link.sent[before:]
+        self.off_m = next((each.value for each in told if each.get_type() == "NAMED_VALUE_FLOAT"), None)
+        return next((each.text for each in told if each.get_type() == "STATUSTEXT"), None)
+
+
 def looks(integrity, *matches, t_s=0.0):
     """Let matches be looked at: by how many metres off to the east, of which places, and so many seconds later."""
     said = []
@@ -182,17 +198,17 @@ def looks(integrity, *matches, t_s=0.0):
 
 
 def test_three_of_different_places_that_say_the_same_are_needed():
-    far = "GPS is 100 m from the map's position"
-    assert looks(Integrity(5.0), (100, (1,), 0), (100, (2,), 1), (100, (3,), 1)) == [None, None, far]
-    assert looks(Integrity(5.0), *[(100, (1,), 1)] * 20) == [None] * 20, "one place may be a wrong one"
-    assert looks(Integrity(5.0), *[(100, (number // 3,), 1) for number in range(7)]) == [*[None] * 6, far]
-    assert looks(Integrity(5.0), (100, (1,), 0), (-100, (2,), 1), (100, (3,), 1), (300, (4,), 1)) == [None] * 4
-    assert looks(Integrity(5.0), *[(100, (number,), 16) for number in range(5)]) == [None] * 5, "too long ago"
-    assert looks(Integrity(5.0), (100, (1,), 0), (100, (2,), 1), (0, (3,), 1), (100, (4,), 1)) == [None] * 4
+    far = "edgevpr: GPS is 100 m from the map's position"
+    assert looks(Looks(5.0), (100, (1,), 0), (100, (2,), 1), (100, (3,), 1)) == [None, None, far]
+    assert looks(Looks(5.0), *[(100, (1,), 1)] * 20) == [None] * 20, "one place may be a wrong one"
+    assert looks(Looks(5.0), *[(100, (number // 3,), 1) for number in range(7)]) == [*[None] * 6, far]
+    assert looks(Looks(5.0), (100, (1,), 0), (-100, (2,), 1), (100, (3,), 1), (300, (4,), 1)) == [None] * 4
+    assert looks(Looks(5.0), *[(100, (number,), 16) for number in range(5)]) == [None] * 5, "too long ago"
+    assert looks(Looks(5.0), (100, (1,), 0), (100, (2,), 1), (0, (3,), 1), (100, (4,), 1)) == [None] * 4
 
 
 def test_less_than_fifteen_metres_is_no_alarm_however_exact_the_matches_are():
-    exact = Integrity(0.1)
+    exact = Looks(0.1)
     t_s = 0.0
     for number in range(20):
         event = match_at(Position(*moved(*HOME, 14.0, 0.0)), t_s, vehicle_at(*HOME, t_s), 0.1, (number,))
@@ -200,7 +216,7 @@ def test_less_than_fifteen_metres_is_no_alarm_however_exact_the_matches_are():
 
 
 def test_without_a_receiver_or_with_an_old_report_nothing_is_compared(watched):
-    integrity = Integrity(5.0)
+    integrity = Looks(5.0)
     here = Position(*HOME)
     for vehicle in (None, vehicle_at(*HOME, 5.0, has_gps=False), vehicle_at(*HOME, 3.0)):
         assert integrity.look(match_at(here, 5.0, vehicle, 3.0, (1,))) is None
@@ -220,7 +236,7 @@ def test_a_picture_that_does_not_show_the_ground_below_is_not_compared(watched):
 
 
 def test_the_time_between_receiver_and_frame_is_allowed_for():
-    integrity, speed_m_s = Integrity(0.1), 25.0
+    integrity, speed_m_s = Looks(0.1), 25.0
     for number in range(10):
         t_s = float(number)
         gps = moved(*HOME, speed_m_s * (t_s - 0.8), 0.0)
