@@ -7,7 +7,7 @@ shows. Recognition and mapping level their pictures by `runtime.recognise.levell
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -242,32 +242,26 @@ def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink:
     return warped  # type: ignore[return-value]  # of the same dtype
 
 
-@dataclass(frozen=True, slots=True)
-class Footprint:
-    """The rectangle of flat ground that a picture shows: its middle (east, north) in metres from a common origin, its
-    width and height in metres, and the compass direction (0..360) of the picture's top."""
-
-    middle_m: tuple[float, float]
-    sides_m: tuple[float, float]
-    up_deg: float
+# A rectangle of flat ground: its middle (metres east and south of a common origin), its width and height in metres, and
+# the compass direction of its top in degrees. So OpenCV writes rotated rectangles.
+Footprint: TypeAlias = tuple[tuple[float, float], tuple[float, float], float]
 
 
 def footprint(
     middle_m: tuple[float, float], height_m: float, fov_deg: float, size_px: tuple[int, int], up_deg: float
 ) -> Footprint:
-    """Return the footprint of a picture of `size_px` (width, height) taken straight down from `height_m` above flat
-    ground, with a field of view of `fov_deg` across its longest side. `middle_m` and `up_deg` are as in `Footprint`."""
+    """Return the ground shown by a picture of `size_px` (width, height) taken straight down from `height_m` above flat
+    ground, with a field of view of `fov_deg` across its longest side. `middle_m`: point (east, north) in its middle.
+    `up_deg`: compass direction of its top."""
     longest_m = 2 * height_m * math.tan(math.radians(fov_deg) / 2)
     width_m, depth_m = (longest_m * each / max(size_px) for each in size_px)
-    return Footprint(middle_m, (width_m, depth_m), up_deg)
+    return (middle_m[0], -middle_m[1]), (width_m, depth_m), up_deg
 
 
 def shared(one: Footprint, other: Footprint) -> float:
     """Return the area that two footprints share, as a share of the area of the smaller one, 0..1."""
-    # OpenCV's rotated rectangles have x to the east and y to the south.
-    own, others = (((each.middle_m[0], -each.middle_m[1]), each.sides_m, each.up_deg) for each in (one, other))
-    kind, corners = cv2.rotatedRectangleIntersection(own, others)
+    kind, corners = cv2.rotatedRectangleIntersection(one, other)
     if kind == cv2.INTERSECT_NONE:
         return 0.0
     area_m2 = cv2.contourArea(cv2.convexHull(np.asarray(corners, np.float32)))
-    return min(1.0, float(area_m2) / min(math.prod(one.sides_m), math.prod(other.sides_m)))
+    return min(1.0, float(area_m2) / min(math.prod(one[1]), math.prod(other[1])))

@@ -35,6 +35,7 @@ _MAX_FILE_BYTES = 100_000_000  # a million images
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
 MOST_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
 _ROUNDING_S = 0.001  # Matroska counts in milliseconds
+_ANGLES = [1, 3, 4]  # which of `_numbers_of` are angles of a full turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,9 +75,14 @@ def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "time"))
         for name, tag in tags.items():
-            at = tag.position
-            where = (at.lat_deg, at.lon_deg, at.alt_m) if at else (None, None, None)
-            table.writerow((name, *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m, tag.t_utc_s))
+            table.writerow((name, *_numbers_of(tag), tag.t_utc_s))
+
+
+def _numbers_of(tag: GeoTag) -> tuple[Any, ...]:
+    """Return latitude, longitude, altitude, heading, roll, pitch and height of a tag; None: unknown."""
+    at = tag.position
+    where = (at.lat_deg, at.lon_deg, at.alt_m) if at else (None, None, None)
+    return *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
 def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
@@ -181,7 +187,7 @@ def parse_time(text: str) -> float:
 @dataclass(frozen=True, slots=True)
 class VideoTrack:
     """Positions and attitudes along a video. `t_s` are seconds from its first frame, ascending, and `tags` the data at
-    each. `path` is the table's file, for messages."""
+    each, all with a position. `path` is the table's file, for messages."""
 
     path: Path
     t_s: tuple[float, ...]
@@ -196,22 +202,18 @@ class VideoTrack:
         after = int(np.searchsorted(self.t_s, t_s))
         if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MOST_GAP_S:
             return GeoTag()
-        one, other = self.tags[after - 1], self.tags[after]
+        one, other = (np.array(_numbers_of(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
+        way = other - one
+        way[_ANGLES] = (way[_ANGLES] + 180) % 360 - 180  # the shorter turn
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
-        heading_deg = _between(one.heading_deg, other.heading_deg, share, is_angle=True)
-        position = None
-        if one.position and other.position:
-            lat_deg, lon_deg, alt_m = (
-                _between(getattr(one.position, name), getattr(other.position, name), share, is_angle=name == "lon_deg")
-                for name in ("lat_deg", "lon_deg", "alt_m")
-            )
-            position = Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m)
+        between: list[Any] = [None if math.isnan(number) else number for number in (one + share * way).tolist()]
+        lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = between
         return GeoTag(
-            position=position,
+            position=Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m),
             heading_deg=None if heading_deg is None else heading_deg % 360,
-            roll_deg=_between(one.roll_deg, other.roll_deg, share, is_angle=True),
-            pitch_deg=_between(one.pitch_deg, other.pitch_deg, share),
-            height_m=_between(one.height_m, other.height_m, share),
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
+            height_m=height_m,
         )
 
     def require_within(self, video: Path, lasts_s: float) -> None:
@@ -242,12 +244,3 @@ def read_track(csv_path: str | Path) -> VideoTrack:
     if not tags:
         raise UsageError(f"{csv_path} has no line with time, lat and lon: the positions of a video need them.")
     return VideoTrack(Path(csv_path), tuple(tags), tuple(tags.values()))
-
-
-def _between(one: float | None, other: float | None, share: float, is_angle: bool = False) -> Any:
-    """Interpolate linearly: return the number at `share` (0..1) of the way from `one` to `other`; None if either is
-    None. With `is_angle` both are degrees, and the way is the shorter turn."""
-    if one is None or other is None:
-        return None
-    way = other - one
-    return one + share * ((way + 180) % 360 - 180 if is_angle else way)

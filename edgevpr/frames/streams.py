@@ -9,10 +9,9 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from queue import Queue
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -68,15 +67,16 @@ class StreamCapture:
             arrival = self._arrivals.next()
             if arrival is None:
                 return None
-            came_s = self._unstamped.taken_s(arrival.asked_s, arrival.t_mono_s)
-            self._note_stamp(arrival)
-            waited_s = self._clock() - arrival.t_mono_s
+            fetched, asked_s, t_mono_s = arrival
+            came_s = self._unstamped.taken_s(asked_s, t_mono_s)
+            self._note_stamp(fetched, t_mono_s)
+            waited_s = self._clock() - t_mono_s
             if waited_s > _TOO_OLD_S or (waited_s > _BEHIND_S and self._arrivals.can_begin_anew()):
                 return self._whole.skip()
-            pictures = self._whole.decode(arrival.fetched)
+            pictures = self._whole.decode(fetched)
             if isinstance(pictures, Refusal):
                 return pictures
-            self._ready.extend(self._shot(picture, came_s, arrival.t_mono_s) for picture in pictures)
+            self._ready.extend(self._shot(picture, came_s, t_mono_s) for picture in pictures)
         return self._ready.popleft()
 
     def release(self) -> None:
@@ -84,12 +84,12 @@ class StreamCapture:
         self._arrivals.close()
         self._whole.close()
 
-    def _note_stamp(self, arrival: "Arrival") -> None:
-        packet = arrival.fetched.packet
+    def _note_stamp(self, fetched: Fetched, t_mono_s: float) -> None:
+        packet = fetched.packet
         if self._stamped is None or packet.pts is None:
             return
         order = packet.pts if packet.dts is None else packet.dts
-        self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, arrival.t_mono_s)
+        self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, t_mono_s)
         if self._stamped.is_live:
             self._whole.caught_up()
 
@@ -110,13 +110,8 @@ class StreamCapture:
         return coarse(rows[: picture.height, : picture.width])
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """A packet. The call that fetched it began at `asked_s` and returned at `t_mono_s` (seconds, monotonic)."""
-
-    fetched: Fetched
-    asked_s: float
-    t_mono_s: float
+# A packet, and when the call that fetched it began and returned (seconds, monotonic).
+Arrival: TypeAlias = tuple[Fetched, float, float]
 
 
 class Arrivals:
@@ -139,7 +134,7 @@ class Arrivals:
     def can_begin_anew(self) -> bool:
         """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
         with self._waiting.mutex:
-            return any(arrival and arrival.fetched.packet.is_keyframe for arrival in self._waiting.queue)
+            return any(arrival and arrival[0].packet.is_keyframe for arrival in self._waiting.queue)
 
     def close(self) -> None:
         """Stop the thread, and wait until its current fetch has returned."""
@@ -153,7 +148,7 @@ class Arrivals:
                 fetched = self._fetch()
                 if fetched is None:
                     break
-                self._waiting.put(Arrival(fetched, asked_s, self._clock()))
+                self._waiting.put((fetched, asked_s, self._clock()))
         finally:
             self._waiting.put(None)
 

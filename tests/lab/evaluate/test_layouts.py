@@ -11,7 +11,7 @@ from pictures import textured
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.frames.level import Footprint, footprint, shared
+from edgevpr.frames.level import footprint, shared
 from edgevpr.lab.evaluate.layouts import Nearness, open_folder
 
 RULE = Nearness()
@@ -131,16 +131,16 @@ def test_positions_by_distance_heading_and_ground_in_common(tmp_path):
 
 
 def test_the_ground_in_common_is_a_share_of_the_smaller():
-    one = Footprint((0, 0), (100, 50), 0)
+    one = ((0, 0), (100, 50), 0)
     assert shared(one, one) == pytest.approx(1)
-    assert shared(one, Footprint((0, 0), (100, 50), 180)) == pytest.approx(1)
-    assert shared(one, Footprint((50, 0), (100, 50), 0)) == pytest.approx(0.5)
-    assert shared(one, Footprint((0, 50), (100, 50), 0)) == pytest.approx(0)
-    assert shared(one, Footprint((0, 0), (10, 10), 30)) == pytest.approx(1)
-    east = Footprint((0, 0), (100, 50), 90)  # 100 m from north to south
+    assert shared(one, ((0, 0), (100, 50), 180)) == pytest.approx(1)
+    assert shared(one, ((50, 0), (100, 50), 0)) == pytest.approx(0.5)
+    assert shared(one, ((0, 50), (100, 50), 0)) == pytest.approx(0)
+    assert shared(one, ((0, 0), (10, 10), 30)) == pytest.approx(1)
+    east = ((0, 0), (100, 50), 90)  # 100 m from north to south
     assert shared(one, east) == pytest.approx(0.5)
-    assert shared(Footprint((0, 0), (50, 100), 0), east) == pytest.approx(1)
-    assert footprint((0, 0), 50, 90, (400, 300), 0).sides_m == pytest.approx((100, 75))
+    assert shared(((0, 0), (50, 100), 0), east) == pytest.approx(1)
+    assert footprint((0, 0), 50, 90, (400, 300), 0)[1] == pytest.approx((100, 75))
 
 
 def test_what_is_no_data_set_is_told_what_is_one(tmp_path, capsys):
