@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, command, path_of, show, write_out
 from edgevpr.cli.wording import of_replay, of_what_if
-from edgevpr.core.errors import MapError, UsageError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import waiting
 
 if TYPE_CHECKING:
     from edgevpr.review.logged import LoggedFlight
-    from edgevpr.review.overhead import MapGround
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +35,7 @@ def add(commands: Any) -> None:
     export = command(commands, "export", run_export, "write matches, fixes and places of a flight, for a map viewer")
     export.add_argument("log", metavar="LOG")
     form = export.add_mutually_exclusive_group(required=True)
-    for name in ("geojson", "csv", "kml"):
+    for name in ("geojson", "csv"):
         form.add_argument(f"--{name}", metavar="FILE", help="file to write, - for standard output")
     text = "fly a recorded flight again: the same, or with another configuration"
     replay = command(commands, "replay", run_replay, text)
@@ -51,20 +50,29 @@ def add(commands: Any) -> None:
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
     from edgevpr.review.logged import text
+    from edgevpr.review.overhead import read_ground
     from edgevpr.review.page import Album, page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     flight = _read(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
     frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
-    page = page_of(flight, _ground(args.map or text(flight.start, "map"), bool(args.map)), frames, references)
+    ground, no_ground = [], "The log does not name a map: give it with --map."
+    if path := args.map or text(flight.start, "map"):
+        try:
+            ground, no_ground = read_ground(path), ""
+        except EdgevprError as error:
+            if args.map:
+                raise
+            no_ground = f"The map of the flight is not drawn: {error} Its place can be given with --map."
+    page = page_of(flight, ground, frames, references, no_ground)
     write_out(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0
 
 
 def run_export(args: Namespace) -> int:
-    """Run `export`: write the points of a flight (matches, fixes, places) as GeoJSON, CSV or KML."""
+    """Run `export`: write the points of a flight (matches, fixes, places) as GeoJSON or CSV."""
     from edgevpr.review.export import WRITERS, features_of
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
@@ -84,21 +92,6 @@ def _read(log: str) -> "LoggedFlight":
     if flight.missing:
         _log.warning("%s", flight.missing)
     return flight
-
-
-def _ground(path: str | None, must_exist: bool) -> "MapGround":
-    """Read the places of the map at `path` (None: the log names no map). If it cannot be read, raise MapError or
-    UsageError with `must_exist`, else return a result without places that says why."""
-    from edgevpr.review.overhead import MapGround, read_ground
-
-    if path is None:
-        return MapGround(trouble="The log does not name a map: give it with --map.")
-    try:
-        return read_ground(path)
-    except (MapError, UsageError) as error:
-        if must_exist:
-            raise
-        return MapGround(trouble=f"The map of the flight is not drawn: {error} Its place can be given with --map.")
 
 
 def run_replay(args: Namespace) -> int:

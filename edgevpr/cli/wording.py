@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refined
     from edgevpr.places.examine import MapCheck
     from edgevpr.places.mapinfo import MapInfo
-    from edgevpr.review.compare import Difference, Lines, Packets
+    from edgevpr.review.compare import Lines, Packets
     from edgevpr.review.replay import Replayed
     from edgevpr.runtime.preflight.networks import Listed
 
@@ -94,8 +94,6 @@ def of_check(found: "MapCheck") -> Iterator[str]:
     yield f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read"
     yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
-    lacking = f"{found.without_checksums} places lack some: damage of those cannot be seen"
-    yield f"  checksums   {lacking if found.without_checksums else 'all match'}"
 
 
 def of_networks(found: Sequence["Listed"], folders: list[str]) -> Iterator[str]:
@@ -147,11 +145,11 @@ def _first(texts: list[str]) -> list[str]:
     return texts[:_SHOWN] + more
 
 
-def _of_line(difference: "Difference") -> list[str]:
-    where = f"{difference.t_mono_s:.3f} s, {difference.query or difference.kind}"
-    if difference.only_in:
-        return [f"{where}: only in the {difference.only_in}"]
-    return [f"{where}: {name} was {then}, is {now}" for name, (then, now) in difference.fields.items()]
+def _of_line(difference: dict[str, Any]) -> list[str]:
+    where = f"{difference['t_mono_s']:.3f} s, {difference['query'] or difference['kind']}"
+    if "only_in" in difference:
+        return [f"{where}: only in the {difference['only_in']}"]
+    return [f"{where}: {name} was {then}, is {now}" for name, (then, now) in difference["fields"].items()]
 
 
 def _said(query: dict[str, Any] | None) -> str:

@@ -4,7 +4,6 @@ by byte, and the queries. In names here, "then" is the flight and "now" its repl
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,53 +23,39 @@ _COMPARED = ("accepted", "reason", "place", "confidence", "at", "off_m")  # of a
 PROGRAM = "version", "machine", "python", "libraries"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Difference:
-    """A log line that differs between flight and replay: its kind, its time and the name of its query (None: it is
-    about no query). `fields` has the fields that differ, by dotted name (like "fix.sent"). `only_in` is "flight" or
-    "replay" if the other log has no such line (None: both have)."""
-
-    kind: str
-    t_mono_s: float
-    query: str | None
-    fields: Changes = field(default_factory=dict)
-    only_in: str | None = None
-
-
 @dataclass(slots=True)
 class Lines:
     """Comparison of the logs of flight and replay: the number of lines that are `alike`, the `others`, which differ,
     and the number of lines of the flight that come `after` the end of the replay. `program` has those fields of the
-    first line that describe the program (see `PROGRAM`) and differ."""
+    first line that describe the program (see `PROGRAM`) and differ. Each of the `others` has the `kind` of the line,
+    its time `t_mono_s`, its `query`, and either `fields`, those that differ, by dotted name (like "fix.sent"), or
+    `only_in`: "flight" or "replay" if the other log has no such line."""
 
     alike: int = 0
-    others: list[Difference] = field(default_factory=list)
+    others: list[Line] = field(default_factory=list)
     after: int = 0
     program: Changes = field(default_factory=dict)
 
 
 def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
-    """Compare the lines of a flight's log with those of its replay. If a full disk has cost the flight lines (its log
-    then has a line of kind "gap"), lines that only the replay has are no differences."""
+    """Compare the lines of a flight's log with those of its replay."""
     before, after, found = _keyed(then), _keyed(now), Lines()
-    has_gaps = any(kind == "gap" for kind, *_ in before)
     last_s = max((t_s for _, t_s, *_ in after), default=0.0)
     for key in before | after:
         kind, t_s, query, _ = key
-        differs = partial(Difference, kind=kind, t_mono_s=t_s, query=query)
+        line = {"kind": kind, "t_mono_s": t_s, "query": query}
         if key not in before:
-            found.others += [] if has_gaps else [differs(only_in="replay")]
+            found.others.append({**line, "only_in": "replay"})
+        elif key not in after and t_s > last_s:
+            found.after += 1
         elif key not in after:
-            if t_s > last_s:
-                found.after += kind != "gap"
-            elif kind != "gap":
-                found.others.append(differs(only_in="flight"))
+            found.others.append({**line, "only_in": "flight"})
         else:
             fields = dict(_differing(before[key], after[key]))
             if kind == "start":
                 found.program = {name: each for name, each in fields.items() if name.partition(".")[0] in PROGRAM}
             if others := {name: each for name, each in fields.items() if name not in found.program}:
-                found.others.append(differs(fields=others))
+                found.others.append({**line, "fields": others})
             else:
                 found.alike += 1
     return found

@@ -8,10 +8,9 @@ HTML, unless they say otherwise.
 
 import base64
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import pairwise
 from pathlib import Path
 
 from edgevpr.core.text import shown
@@ -25,7 +24,6 @@ _LAST = 0.97  # share of an axis: a text centred on a point further right would 
 _TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
-_GAP, _LEAST_GAP = 5.0, 3.0  # a line is broken where points are missing for so many usual steps, and so much of x
 
 # Content security policy: the browser loads nothing from anywhere, even if a file name in the page contains HTML.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -123,7 +121,7 @@ class Axis:
 
 def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: float = 0.0) -> str:
     """Return a chart of `series` as HTML. Its values reach from 0 to the highest one, and to `top` at least. A series
-    without points is left out; if none has points, the result is "". A line is broken where points are missing."""
+    without points is left out; if none has points, the result is ""."""
     series = [each for each in series if each.points]
     if not series:
         return ""
@@ -131,11 +129,10 @@ def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: floa
     paths = ""
     for each in series:
         path, kind = (dots, "dots") if each.are_dots else (way, "line")
-        several = [each.points] if each.are_dots else _known_parts(each.points)
-        places = ([(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in part] for part in several)
-        paths += f'<path class="{kind} {each.colour}" d="{"".join(map(path, places))}"/>'
+        places = [(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in each.points]
+        paths += f'<path class="{kind} {each.colour}" d="{path(places)}"/>'
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
-    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + paths)
+    drawing = _svg(f"{title}, {unit}", _HIGH, axis.grid(_HIGH) + paths)
     return _framed(title, f"{unit} {legend}", highest, axis, drawing)
 
 
@@ -152,7 +149,7 @@ def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str
             tag += _TAG_WIDE
         taken.append((tag, above))
         tags += f'<span class="tag {colour}" style="left:{100 * tag:.1f}%;top:{100 * above:.1f}%">{escape(text)}</span>'
-    drawing = _svg(_label(title, unit), _HIGH, axis.grid(_HIGH) + marks)
+    drawing = _svg(f"{title}, {unit}", _HIGH, axis.grid(_HIGH) + marks)
     return _framed(title, f"{unit} ", top, axis, f'<div class="tagged">{drawing}{tags}</div>') if points else ""
 
 
@@ -196,9 +193,8 @@ def figure(value: float | None, unit: str = "") -> str:
 def clock(t_s: float) -> str:
     """Return a time in seconds as text: minutes and seconds (2:03), from an hour on with the hours (1:02:03)."""
     minutes, seconds = divmod(round(t_s), 60)
-    if minutes < 60:
-        return f"{minutes}:{seconds:02d}"
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    hours = f"{minutes // 60}:{minutes % 60:02d}" if minutes >= 60 else str(minutes)
+    return f"{hours}:{seconds:02d}"
 
 
 def _svg(label: str, high: float, content: str) -> str:
@@ -216,22 +212,9 @@ def _framed(title: str, beside: str, highest: float, axis: Axis, drawing: str) -
     )
 
 
-def _label(title: str, unit: str) -> str:
-    return f"{title}, {unit}" if unit else title
-
-
 def times(span_s: float) -> Axis:
     """Return an axis of time, from 0 to `span_s` seconds."""
     step = next((each for each in _STEPS_S if span_s / each <= _MOST_TICKS), span_s / _MOST_TICKS)
     ticks = [count * step for count in range(int(span_s / step) + 1)] if step else [0.0]
     last = _LAST * span_s
     return Axis(0.0, span_s, [(t_s, clock(t_s) if t_s <= last or not t_s else "") for t_s in ticks])
-
-
-def _known_parts(points: Points) -> Iterator[Points]:
-    """Split a line wherever the step in x between two points is unusually long (see `_GAP`), and yield its parts."""
-    steps = [after[0] - before[0] for before, after in pairwise(points)]
-    most = max(_LEAST_GAP, _GAP * sorted(steps)[len(steps) // 2]) if steps else 0.0
-    breaks = [at for at, step in enumerate(steps, start=1) if step > most]
-    for first, last in pairwise([0, *breaks, len(points)]):
-        yield points[first:last]

@@ -30,33 +30,30 @@ class FixOutcome(Enum):
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query: its outcome, `why` it was not sent or not taken (None: no reason is given), its position `at`
-    (None: there was nothing to send), and the time until the autopilot's answer, `latency_ms` (None: unknown)."""
+    """The fix of a query: its outcome, `why` it was not sent or not taken (None: no reason is given), and its position
+    `at` (None: there was nothing to send)."""
 
     outcome: FixOutcome
     why: str | None
     at: Point | None
     accuracy_m: float | None
-    latency_ms: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedQuery:
     """One query, whose frame was taken `t_s` seconds after the start of the flight. None in any field: unknown.
 
-    `at` is the position of an accepted match, `place_at` that of the place found. `autopilot_at` and `gps_at` are the
-    aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the distance from the match to
-    `autopilot_at` if the autopilot has GPS, else to `gps_at`. `wall_ms` is the time of encoding and matching,
-    `latency_ms` the age of the newest picture when it could be read, `cores` the number of cores that the process kept
-    busy since the query before. `has_link`: the autopilot was heard."""
+    `line` is its line of the log. `at` is the position of an accepted match, `place_at` that of the place found.
+    `autopilot_at` and `gps_at` are the aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the
+    distance from the match to `autopilot_at` if the autopilot has GPS, else to `gps_at`. `has_link`: the autopilot was
+    heard."""
 
+    line: dict[str, Any]
     name: str
     t_s: float
-    time: str
     accepted: bool
     reason: str
     confidence: float | None
-    score: float | None
     place: int | None
     reference_image: str | None
     at: Point | None
@@ -66,12 +63,6 @@ class LoggedQuery:
     gps_at: Point | None
     off_m: float | None
     fix: LoggedFix | None
-    wall_ms: float | None
-    latency_ms: float | None
-    cores: float | None
-    rss_mb: float | None
-    temperature_c: float | None
-    used_mah: float | None
     has_link: bool | None
 
 
@@ -115,7 +106,7 @@ def read_flight(path: str | Path) -> LoggedFlight:
     """Read the last flight of the log `path`. Raises UsageError if there is no such file, and EdgevprError if it has no
     line of a flight (see `wholeflight.flight_of`)."""
     lines = flight_of(path)
-    flight = read_lines(lines, lines.path)
+    flight = read_lines(lines, Path(path))
     flight.missing = lines.missing
     if lines.missing:
         flight.remarks.insert(0, Remark(0.0, "missing", lines.missing))
@@ -125,7 +116,6 @@ def read_flight(path: str | Path) -> LoggedFlight:
 def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
     """Read a flight from the lines of its log, in their order."""
     flight, queries = LoggedFlight(path=path), dict[str, LoggedQuery]()
-    before = 0.0, 0.0
     for line in lines:
         kind, t_s = line.get("kind"), flight.since_start(number(line, "t_mono_s"))
         flight.span_s = max(flight.span_s, t_s)
@@ -134,15 +124,11 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
         elif kind == "end":
             flight.end = line
         elif kind == "query":
-            now = number(line, "totals", "process_cpu_s"), number(line, "totals", "elapsed_s")
-            cores = None
-            if now[0] is not None and now[1] is not None and now[1] > before[1]:
-                cores = max(0.0, (now[0] - before[0]) / (now[1] - before[1]))
-                before = now[0], now[1]
-            query = queries[text(line, "query") or ""] = _query(line, flight, cores)
+            query = queries[text(line, "query") or ""] = _query(line, flight)
             flight.queries.append(query)
         elif kind == "answer":
-            _take_answer(queries.get(text(line, "query") or ""), line)
+            if (answered := queries.get(text(line, "query") or "")) and answered.fix:
+                _take_answer(answered.fix, line)
         elif kind == "unusable":
             flight.unusable.append(t_s)
         elif kind == "learnt":
@@ -152,17 +138,15 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
     return flight
 
 
-def _take_answer(query: LoggedQuery | None, line: dict[str, Any]) -> None:
-    """Set outcome, reason and latency in the fix of a query from a log line of kind "answer". None: no such query."""
-    if query and query.fix:
-        query.fix.outcome = _outcome(line, line.get("result"))
-        query.fix.why = text(line, "why") or query.fix.why
-        if query.fix.outcome is FixOutcome.REFUSED:
-            query.fix.why = query.fix.why or "it does not say why"
-        query.fix.latency_ms = number(line, "latency_ms")
+def _take_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
+    """Set outcome and reason of a fix from a log line of kind "answer"."""
+    fix.outcome = _outcome(line, line.get("result"))
+    fix.why = text(line, "why") or fix.why
+    if fix.outcome is FixOutcome.REFUSED:
+        fix.why = fix.why or "it does not say why"
 
 
-def _query(line: dict[str, Any], flight: LoggedFlight, cores: float | None) -> LoggedQuery:
+def _query(line: dict[str, Any], flight: LoggedFlight) -> LoggedQuery:
     t_frame_s = number(line, "t_frame_s")
     accepted = line.get("accepted") is True
     at = point(line, "located") or point(line, "position") if accepted else None
@@ -173,16 +157,14 @@ def _query(line: dict[str, Any], flight: LoggedFlight, cores: float | None) -> L
     truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
     confidences = number(line, "confidence"), number(line, "followed", "confidence")
-    encode_s, match_s = number(line, "costs", "t_encode_s"), number(line, "costs", "t_match_s")
-    place, latency_s = number(line, "place"), number(line, "totals", "latency_s")
+    place = number(line, "place")
     return LoggedQuery(
+        line=line,
         name=text(line, "query") or "",
         t_s=flight.since_start(number(line, "t_mono_s") if t_frame_s is None else t_frame_s),
-        time=text(line, "time") or "",
         accepted=accepted,
         reason=text(line, "reason") or "no reason is given",
         confidence=max((known for known in confidences if known is not None), default=None),
-        score=number(line, "score"),
         place=None if place is None else int(place),
         reference_image=text(line, "reference_image"),
         at=at,
@@ -192,12 +174,6 @@ def _query(line: dict[str, Any], flight: LoggedFlight, cores: float | None) -> L
         gps_at=gps_at,
         off_m=float(distance_m(*truth, *at)) if truth and at else None,
         fix=_fix(line),
-        wall_ms=None if encode_s is None or match_s is None else 1e3 * (encode_s + match_s),
-        latency_ms=None if latency_s is None else 1e3 * latency_s,
-        cores=cores,
-        rss_mb=number(line, "costs", "rss_mb"),
-        temperature_c=number(line, "board", "temperature_c"),
-        used_mah=number(line, "totals", "used_mah"),
         has_link=is_heard if "vehicle" in line else None,
     )
 
@@ -236,10 +212,10 @@ def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
 
 def _words(line: dict[str, Any]) -> str:
     words = next((known for key in _WORDS if (known := text(line, key))), None)
-    before, after = line.get("from"), line.get("to")  # only lines of the governor have them
-    if words and isinstance(before, dict) and isinstance(after, dict):
-        changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
-        return ": ".join(filter(None, (", ".join(changed), words)))
+    match line:
+        case {"from": dict() as before, "to": dict() as after}:  # of the governor
+            changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
+            return f"{', '.join(changed)}: {words}"
     others = {"kind", "time", "t_mono_s"}
     return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
 

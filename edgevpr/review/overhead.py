@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Pose
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.review.html import Points, dots, way
 from edgevpr.review.logged import FixOutcome, LoggedFlight, Point
+
+Ground = Sequence[tuple[Point, Pose | None]]  # the places of a map: position; pose of the picture (None: unknown)
 
 _WIDE = 1000.0  # of the drawing, in its own units
 _MARGIN = 0.04
@@ -30,17 +31,6 @@ _FIXES = (
 
 
 @dataclass(frozen=True, slots=True)
-class MapGround:
-    """The places of a map that can be drawn: `at` has (position; pose of the picture, None if unknown) for each place
-    with a position. `places` is the number of all places, also of those without a position. `trouble` is a sentence on
-    why places could not be read (None: all could)."""
-
-    at: Sequence[tuple[Point, Pose | None]] = ()
-    places: int = 0
-    trouble: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Layer:
     """Layer of the drawing, which the reader can hide: its name, the CSS class that colours it, and its `ways`, each a
     sequence of positions. With `are_dots` the positions are drawn as dots, else each way is drawn as a line."""
@@ -51,36 +41,30 @@ class Layer:
     are_dots: bool = True
 
 
-def read_ground(path: str | Path) -> MapGround:
-    """Read the places of the map file `path`. If it is damaged, the places up to there are returned, with `trouble`.
-    Raises MapError if nothing can be read."""
-    places, at, trouble = 0, [], None
+def read_ground(path: str | Path) -> Ground:
+    """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be read,
+    or is damaged."""
     with PlaceMap.open(path) as place_map:
-        try:
-            for place in place_map.places():
-                places += 1
-                if place.position:
-                    at.append(((place.position.lat_deg, place.position.lon_deg), place.pose))
-        except EdgevprError as error:
-            trouble = f"Only {places} places of the map are drawn. {error}"
-    return MapGround(at, places, trouble)
+        return [
+            ((place.position.lat_deg, place.position.lon_deg), place.pose)
+            for place in place_map.places()
+            if place.position
+        ]
 
 
 def layers_of(flight: LoggedFlight) -> list[Layer]:
     """Return the layers of a flight, from the bottom to the top. Those without points are left out."""
     queries = flight.queries
-    fixes = [query.fix for query in queries if query.fix and query.fix.at]
     layers = [
         Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("GPS", "gps", _known_ways(query.gps_at for query in queries), are_dots=False),
         Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), are_dots=False),
         Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
-        *(
-            Layer(name, colour, [[fix.at for fix in fixes if fix.at and fix.outcome is outcome]])
-            for outcome, name, colour in _FIXES
-        ),
     ]
+    for outcome, name, colour in _FIXES:
+        fixes = (query.fix for query in queries if query.fix and query.fix.outcome is outcome)
+        layers.append(Layer(name, colour, [[fix.at for fix in fixes if fix.at]]))
     return [layer for layer in layers if any(layer.ways)]
 
 
@@ -89,14 +73,14 @@ def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
     return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
 
 
-def draw(ground: MapGround, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
+def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
     """Return HTML with the ground, the layers over it, and a label at each of the `named` points (its name, position);
     "" if nothing has a position."""
-    everything = [at for at, _ in ground.at] + [at for layer in layers for way in layer.ways for at in way]
+    everything = [at for at, _ in ground] + [at for layer in layers for way in layer.ways for at in way]
     if not everything:
         return ""
-    view = _View(everything, max((pose.footprint_m for _, pose in ground.at if pose), default=20.0))
-    shown = ground.at[:: -(-len(ground.at) // _MOST_PLACES) or 1]
+    view = _View(everything, max((pose.footprint_m for _, pose in ground if pose), default=20.0))
+    shown = ground[:: -(-len(ground) // _MOST_PLACES) or 1]
     squares = "".join(view.square(at, pose) for at, pose in shown if pose)
     paths = f'<path class="footprints" d="{squares}"/>' if squares else ""
     if shown:

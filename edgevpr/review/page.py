@@ -6,10 +6,10 @@ Functions that return a str return HTML.
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from html import escape
-from itertools import groupby, product
+from itertools import groupby
 from pathlib import Path
 from statistics import median
 from types import MappingProxyType
@@ -33,8 +33,8 @@ from edgevpr.review.html import (
     table,
     times,
 )
-from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, text, value
-from edgevpr.review.overhead import MapGround, draw, layers_of
+from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, number, text, value
+from edgevpr.review.overhead import Ground, draw, layers_of
 
 _MOST_REMARKS = 200
 _FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
@@ -50,43 +50,9 @@ _COLOURS = {
     FixOutcome.KEPT: "places",
 }
 _KNOWN = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
-_CHARTS = (
-    ("CPU", "cores busy", "cores", "accepted"),
-    ("RAM", "MB", "rss_mb", "accepted"),
-    ("Charge", "mAh", "used_mah", "accepted"),
-    ("Temperature", "°C", "temperature_c", "refused"),
-    ("A query", "ms, encode and match", "wall_ms", "accepted"),
-    ("Age of the newest picture", "ms", "latency_ms", "accepted"),
-)
 
 Moment = tuple[LoggedQuery, str]  # a query to show, and a sentence on why
-
-# The kinds of bad moments: so many of the worst come into question (None: all), how bad a query is (None: not at all),
-# and why. The first are dangers; `_silences` come after them.
-_DANGERS = 3
-_WORST: tuple[tuple[int | None, Callable[[LoggedQuery], float | None], str], ...] = (
-    (
-        None,
-        lambda query: query.off_m if (query.off_m or 0.0) > _FAR_M else None,
-        "The match lies {0.off_m:.0f} m from GPS: one of both is wrong.",
-    ),
-    (
-        None,
-        lambda query: 0.0 if query.fix and query.fix.outcome is FixOutcome.REFUSED else None,
-        "The autopilot refused the fix: {0.fix.why}.",
-    ),
-    (
-        None,  # not sent because it contradicts the autopilot
-        lambda query: 0.0 if query.fix and (query.fix.why or "").startswith("held back") else None,
-        "The fix was {0.fix.why}.",
-    ),
-    (
-        1,
-        lambda query: query.accuracy_m if query.accepted else None,
-        "Of the accepted matches this is the least exact: good to {0.accuracy_m:.1f} m.",
-    ),
-    (1, lambda query: query.wall_ms, "The slowest query: it took {0.wall_ms:.0f} ms."),
-)
+_Ranked = tuple[int, float, LoggedQuery, str]  # the kind of a moment and its rank, both the lower the worse; the moment
 
 
 class Album:
@@ -103,13 +69,12 @@ class Album:
 
     def picture(self, name: str | None) -> bytes | None:
         """Return the picture `name` as a small JPEG; None if there is none that can be read."""
-        if not name or not (self._folders or name in self._recorded):
-            return None
-        from edgevpr.frames.images import EXTENSIONS, read_image, small_jpeg  # a page without pictures needs no OpenCV
-
-        files = [(path.parent, path) for path in [self._recorded.get(name)] if path]
-        files += [(folder, folder / f"{name}{ending}") for folder, ending in product(self._folders, ("", *EXTENSIONS))]
+        files = [(folder, folder / name) for folder in self._folders] if name else []
+        if name in self._recorded:
+            files.insert(0, (self._recorded[name].parent, self._recorded[name]))
         for folder, path in files:
+            from edgevpr.frames.images import read_image, small_jpeg  # a page without pictures needs no OpenCV
+
             with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
                 # A log from somebody else may name any file of this machine: show only files in the folder.
                 if path.resolve().is_relative_to(folder.resolve()) and path.is_file():
@@ -117,11 +82,12 @@ class Album:
         return None
 
 
-def page_of(flight: LoggedFlight, ground: MapGround, frames: Album, references: Album) -> str:
-    """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of."""
+def page_of(flight: LoggedFlight, ground: Ground, frames: Album, references: Album, no_ground: str = "") -> str:
+    """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
+    `no_ground` is a sentence on why there is no `ground`."""
     queries, moments = flight.queries, list(enumerate(worst(flight.queries), start=1))
-    positions = [(str(number), query.at or query.autopilot_at or query.gps_at) for number, (query, _) in moments]
-    time = text(flight.start, "time") or next((each.time for each in queries), "")
+    positions = [(str(at), query.at or query.autopilot_at or query.gps_at) for at, (query, _) in moments]
+    time = text(flight.start, "time") or next((text(each.line, "time") for each in queries), None)
     title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
     start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
     refusals = (query.reason.partition(":")[0] for query in queries if not query.accepted)
@@ -129,11 +95,11 @@ def page_of(flight: LoggedFlight, ground: MapGround, frames: Album, references: 
     body = [
         heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
         section("", _figures(queries)),
-        notes(_notes(flight, ground)),
+        notes(_notes(flight, bool(ground), no_ground)),
         section("Over the ground", draw(ground, layers_of(flight), [(name, at) for name, at in positions if at])),
         section("What became of every query", _lanes(flight)),
         section("Over time", _charts(flight)),
-        section("Worst moments", "".join(_moment(number, *each, frames, references) for number, each in moments)),
+        section("Worst moments", "".join(_moment(at, *each, frames, references) for at, each in moments)),
         section("Why matches were refused", _counts(refusals)),
         section(
             "Why fixes were not sent, or not taken",
@@ -150,29 +116,29 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
     sent = sum(outcomes[outcome] for outcome in (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED))
     accepted = sum(query.accepted for query in queries)
     share = f" <small>{accepted / len(queries):.0%}</small>" if queries else ""
-    off_m, wall_ms = _all(queries, "off_m"), _all(queries, "wall_ms")
+    off_m = [query.off_m for query in queries if query.off_m is not None]
     figures = {
         "queries": str(len(queries)),
         "accepted": f"{accepted}{share}",
         "fixes sent": str(sent),
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
-        "fixes refused": str(outcomes[FixOutcome.REFUSED]),
-        "fixes not answered": str(outcomes[FixOutcome.UNANSWERED]),
-        "in continuous position": str(outcomes[FixOutcome.CONTINUOUS] or UNKNOWN),
         "from GPS, median": figure(median(off_m) if off_m else None, "m"),
         "from GPS, most": figure(max(off_m, default=None), "m"),
-        "charge": figure(max(_all(queries, "used_mah"), default=None), "mAh"),
-        "RAM, most": figure(max(_all(queries, "rss_mb"), default=None), "MB"),
-        "a query, median": figure(median(wall_ms) if wall_ms else None, "ms"),
-        "hottest": figure(max(_all(queries, "temperature_c"), default=None), "°C"),
+        "charge": figure(_most(queries, "totals", "used_mah"), "mAh"),
+        "RAM, most": figure(_most(queries, "costs", "rss_mb"), "MB"),
+        "hottest": figure(_most(queries, "board", "temperature_c"), "°C"),
     }
     known = [f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in figures.items() if value != UNKNOWN]
     return f'<dl class="figures">{"".join(known)}</dl>'
 
 
-def _notes(flight: LoggedFlight, ground: MapGround) -> list[str]:
-    queries, nowhere = flight.queries, ground.places - len(ground.at)
-    has_places = bool(ground.at) or any(query.place_at for query in queries)
+def _most(queries: Sequence[LoggedQuery], *keys: str) -> float | None:
+    return max((value for _, value in _over(queries, *keys)), default=None)
+
+
+def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
+    queries = flight.queries
+    has_places = has_ground or any(query.place_at for query in queries)
     known = [
         (flight.start, "The log lacks the first line of this flight: how it was set is not known."),
         (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight still goes on."),
@@ -183,8 +149,7 @@ def _notes(flight: LoggedFlight, ground: MapGround) -> list[str]:
             not queries or any(query.has_link for query in queries),
             "The log has no report of the autopilot's position: its track and the distance from GPS are not known.",
         ),
-        (not ground.trouble, ground.trouble or ""),
-        (not nowhere, f"{nowhere} of {ground.places} places of the map have no position and are not drawn."),
+        (not no_ground, no_ground),
     ]
     return [sentence for is_there, sentence in known if not is_there]
 
@@ -208,67 +173,88 @@ def _lanes(flight: LoggedFlight) -> str:
 
 def _charts(flight: LoggedFlight) -> str:
     queries = flight.queries
-    accepted = _over([query for query in queries if query.accepted], "confidence")
-    refused = _over([query for query in queries if not query.accepted], "confidence")
-    answered = [
-        (query.t_s, query.fix.latency_ms) for query in queries if query.fix and query.fix.latency_ms is not None
+
+    def over(name: str, colour: str, factor: float, *keys: str) -> Series:
+        return Series(name, colour, [(t_s, factor * value) for t_s, value in _over(queries, *keys)])
+
+    confidences = [
+        Series(name, name, _points((query, query.confidence) for query in queries if query.accepted is accepted), True)
+        for name, accepted in (("accepted", True), ("refused", False))
     ]
-    confidences = [Series("accepted", "accepted", accepted, True), Series("refused", "refused", refused, True)]
-    positions = [
-        Series("from GPS", "gps", _over(queries, "off_m"), True),
-        Series("accuracy, 1 sigma", "accepted", _over(queries, "accuracy_m")),
+    off_gps = Series("from GPS", "gps", _points((query, query.off_m) for query in queries), True)
+    accuracy = Series("accuracy, 1 sigma", "accepted", _points((query, query.accuracy_m) for query in queries), True)
+    took = [
+        over("encode", "gps", 1e3, "costs", "t_encode_s"),
+        over("match", "accepted", 1e3, "costs", "t_match_s"),
+        over("CPU", "taken", 1e3, "costs", "cpu_s"),
     ]
-    charts = [
+    charts = (
         ("Confidence", "", confidences),
-        ("Position", "m", positions),
-        *((title, unit, [Series("", colour, _over(queries, field))]) for title, unit, field, colour in _CHARTS),
-        ("Answer to a fix", "ms", [Series("", "taken", answered, True)]),
-    ]
+        ("Position", "m", [off_gps, accuracy]),
+        ("A query", "ms", took),
+        ("RAM", "MB", [over("", "accepted", 1, "costs", "rss_mb")]),
+        ("Charge", "mAh", [over("", "accepted", 1, "totals", "used_mah")]),
+        ("Temperature", "°C", [over("", "refused", 1, "board", "temperature_c")]),
+        ("Age of the newest picture", "ms", [over("", "accepted", 1e3, "totals", "latency_s")]),
+    )
     axis = times(flight.span_s)
     drawn = [chart(title, unit, series, axis, top=0.0 if unit else 1.0) for title, unit, series in charts]
     return f'<div class="charts">{"".join(drawn)}</div>' if any(drawn) else ""
 
 
-def _over(queries: Sequence[LoggedQuery], field: str) -> Points:
-    return [(query.t_s, known) for query in queries if (known := getattr(query, field)) is not None]
+def _points(values: Iterable[tuple[LoggedQuery, float | None]]) -> Points:
+    """Return (time, value) of the queries whose value is known."""
+    return [(query.t_s, value) for query, value in values if value is not None]
 
 
-def _all(queries: Sequence[LoggedQuery], field: str) -> list[float]:
-    return [known for _, known in _over(queries, field)]
+def _over(queries: Sequence[LoggedQuery], *keys: str) -> Points:
+    """Return (time, number at `keys` in the line of the query), as far as it is known."""
+    return _points((query, number(query.line, *keys)) for query in queries)
 
 
 def worst(queries: Sequence[LoggedQuery]) -> list[Moment]:
     """Return the worst moments, at most `_MOST`, each (query, sentence on why it is shown). The kinds that could have
     been dangerous come first, and of each kind the worst moments."""
-    kinds = []
-    for first, badness, why in _WORST:
-        bad = [(known, query) for query in queries if (known := badness(query)) is not None]
-        kinds.append([(query, why.format(query)) for _, query in sorted(bad, key=lambda pair: -pair[0])[:first]])
-    kinds.insert(_DANGERS, _silences(queries))
     chosen: list[Moment] = []
-    for moments in kinds:
-        most = len(chosen) + _OF_A_KIND
-        for query, sentence in moments:
-            if len(chosen) < most and all(abs(query.t_s - other.t_s) > _NEAR_S for other, _ in chosen):
-                chosen.append((query, sentence))
+    shown_of = Counter[int]()
+    for kind, _, query, sentence in sorted([*_dangers(queries), *_silences(queries)], key=lambda each: each[:2]):
+        if shown_of[kind] < _OF_A_KIND and all(abs(query.t_s - other.t_s) > _NEAR_S for other, _ in chosen):
+            shown_of[kind] += 1
+            chosen.append((query, sentence))
     return chosen[:_MOST]
 
 
-def _silences(queries: Sequence[LoggedQuery]) -> list[Moment]:
-    """Return a moment in the middle of each long time without an accepted match, the longest time first."""
-    moments = []
-    runs = [list(several) for accepted, several in groupby(queries, lambda each: each.accepted) if not accepted]
-    for run in sorted(runs, key=lambda run: run[0].t_s - run[-1].t_s):
-        if run[-1].t_s - run[0].t_s >= _LONG_S:
+def _dangers(queries: Sequence[LoggedQuery]) -> Iterator[_Ranked]:
+    """Yield the queries that may be worth a look: those of kind 0 to 2 could have been dangerous."""
+    for query in queries:
+        why = query.fix.why if query.fix else None
+        if query.off_m is not None and query.off_m > _FAR_M:
+            yield 0, -query.off_m, query, f"The match lies {query.off_m:.0f} m from GPS: one of both is wrong."
+        elif query.fix and query.fix.outcome is FixOutcome.REFUSED:
+            yield 1, 0.0, query, f"The autopilot refused the fix: {why}."
+        elif why and why.startswith("held back"):  # not sent because it contradicts the autopilot
+            yield 2, 0.0, query, f"The fix was {why}."
+        elif query.accepted and query.accuracy_m is not None:
+            said = f"Of the accepted matches this is one of the least exact: good to {query.accuracy_m:.1f} m."
+            yield 4, -query.accuracy_m, query, said
+
+
+def _silences(queries: Sequence[LoggedQuery]) -> Iterator[_Ranked]:
+    """Yield a query in the middle of each long time without an accepted match."""
+    for accepted, several in groupby(queries, lambda each: each.accepted):
+        run = list(several)
+        length_s = run[-1].t_s - run[0].t_s
+        if not accepted and length_s >= _LONG_S:
             since = f"{clock(run[0].t_s)} to {clock(run[-1].t_s)}"
-            moments.append((run[len(run) // 2], f"Nothing was recognised from {since}, in {len(run)} queries."))
-    return moments
+            said = f"Nothing was recognised from {since}, in {len(run)} queries."
+            yield 3, -length_s, run[len(run) // 2], said
 
 
-def _moment(number: int, query: LoggedQuery, why: str, frames: Album, references: Album) -> str:
+def _moment(at: int, query: LoggedQuery, why: str, frames: Album, references: Album) -> str:
     found = "no place was found"
     if query.place is not None:
-        found = f"place {query.place} ({query.reference_image or 'without a name'}), score {figure(query.score)}"
+        score = figure(number(query.line, "score"))
+        found = f"place {query.place} ({query.reference_image or 'without a name'}), score {score}"
     sure = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
     verdict = f"{'accepted' if query.accepted else 'refused'}: {query.reason}"
     pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
@@ -278,7 +264,7 @@ def _moment(number: int, query: LoggedQuery, why: str, frames: Album, references
         if name and (jpeg := album.picture(name))
     )
     return (
-        f'<div class="moment" id="moment-{number}"><h3><i>{number}</i>{clock(query.t_s)} – {foreign(why)}</h3>'
+        f'<div class="moment" id="moment-{at}"><h3><i>{at}</i>{clock(query.t_s)} – {foreign(why)}</h3>'
         f'<p class="soft">{foreign(f"{query.name}: {found}{sure}; {verdict}")}</p>'
         + (f'<div class="pair">{pair}</div></div>' if pair else "</div>")
     )

@@ -17,8 +17,8 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Tape
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
-from edgevpr.mavlink.line import LOST
 from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.ports import LOST
 from edgevpr.mavlink.signing import KEY_BYTES, Signing
 from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.review.compare import Packets

@@ -15,7 +15,7 @@ def write_log(path):
 
 def test_export_writes_a_file_or_standard_output(tmp_path, capsys):
     log = write_log(tmp_path / "log")
-    for form in ("geojson", "csv", "kml"):
+    for form in ("geojson", "csv"):
         out = tmp_path / f"out.{form}"
         assert main(["export", str(log), f"--{form}", str(out)]) == 0
         assert capsys.readouterr().out == f"{out}: 1 points\n"

@@ -35,12 +35,6 @@ def test_points_lie_where_their_values_are():
     assert paths(drawn, "line") == ["M0.0 100.0L500.0 50.0L1000.0 0.0"]
 
 
-def test_a_line_is_broken_where_nothing_is_known_for_long():
-    points = [(float(t), 1.0) for t in (0, 1, 2, 3, 30, 31)]
-    (path,) = paths(chart("RAM", "MB", [Series("", "blue", points)], times(100.0)), "line")
-    assert path.count("M") == 2
-
-
 def test_nothing_known_is_no_chart():
     assert chart("RAM", "MB", [Series("", "blue", [])], times(10.0)) == ""
 

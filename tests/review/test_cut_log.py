@@ -8,7 +8,7 @@ from logs import query, write_log
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
-from edgevpr.review.export import features_of, write_csv, write_geojson, write_kml
+from edgevpr.review.export import features_of, write_csv, write_geojson
 from edgevpr.review.logged import read_flight
 
 
@@ -35,7 +35,7 @@ def test_a_log_that_was_cut_at_any_byte_is_read_and_exported_up_to_its_last_whol
         flight = read_flight(cut_log)
         assert len(flight.queries) == sum(is_query[:there])
         features = features_of(flight)
-        for write in (write_csv, write_geojson, write_kml):
+        for write in (write_csv, write_geojson):
             write(features, written := io.StringIO())
             assert written.getvalue()
         assert [each for each in features if each["kind"] == "match"] or not flight.queries
