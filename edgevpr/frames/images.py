@@ -37,8 +37,7 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 _STARTS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s")  # JPEG, PNG, TIFF (2), BMP, WebP, PNM
 # In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
-_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
-_MOST_SCANS = 100  # of a progressive JPEG, which has about ten; each costs the decoder a pass over the whole picture
+_END_OF_IMAGE = 0xD9
 
 
 def list_images(folder: str | Path) -> list[Path]:
@@ -142,16 +141,12 @@ def _is_incomplete(data: bytes) -> bool:
 
 
 def jpeg_is_whole(data: bytes) -> bool:
-    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there, after 100 scans
-    at most. Segments are skipped by their length, so that an EXIF thumbnail's end mark is not taken for the image's."""
-    position, scans = 2, 0
+    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there. Segments are
+    skipped by their length, so that an EXIF thumbnail's end mark is not taken for the image's."""
+    position = 2
     while marker := _MARKER.search(data, position):
-        code = data[marker.end() - 1]
-        if code == _END_OF_IMAGE:
+        if data[marker.end() - 1] == _END_OF_IMAGE:
             return True
-        scans += code == _START_OF_SCAN
-        if scans > _MOST_SCANS:
-            return False
         position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
     return False
 

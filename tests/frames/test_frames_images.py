@@ -256,11 +256,3 @@ def test_a_file_with_bytes_gone_wrong_is_read_or_refused_and_its_tags_never_leav
             assert tag.position is None or (abs(tag.position.lat_deg) <= 90 and abs(tag.position.lon_deg) <= 180)
             assert tag.heading_deg is None or 0 <= tag.heading_deg < 360
             assert tag.height_m is None or abs(tag.height_m) <= 100_000
-
-
-def test_a_jpeg_of_hundreds_of_scans_is_refused(tmp_path):
-    jpeg = photographs.encoded(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
-    at = jpeg.rindex(b"\xff\xda")
-    (tmp_path / "scans.jpg").write_bytes(jpeg[:at] + jpeg[at:-2] * 200 + jpeg[-2:])
-    with pytest.raises(ImageError, match="damaged"):
-        read_image(tmp_path / "scans.jpg")
