@@ -20,7 +20,8 @@ from edgevpr.core.text import figure, markdown
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path.append(str(REPOSITORY / "tests"))  # the tests' tools: cameras on loopback, large maps, flights as processes
+# The tests' tools (cameras on loopback, large maps, flights as processes), and the writing of networks.
+sys.path += [str(REPOSITORY / "tests"), str(REPOSITORY / "models" / "recipes")]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
 TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash")

@@ -22,13 +22,13 @@ import torch
 import walks
 from torch import nn
 from torch.nn import functional
+from write_onnx import ModelFile, write_model
 
 from edgevpr.core.arrays import Bools, Bytes, Image, Singles
 from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.metrics import roc_auc
-from edgevpr.lab.training.onnxfile import ModelFile, write_model
 from edgevpr.runtime.recognise.gate_networks import prepared_crops
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import InputRule

@@ -108,9 +108,9 @@ def netvlad(
     by cosine. The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1. The paper trains words and network together. Here the words are learned afterwards (`edgevpr train
-    words`), which is how the paper starts (its section 3.1). The vector is whitened only if the file of the words holds
-    a whitening.
+    thesis 4.2.1. The paper trains words and network together. Here the words are learned afterwards (by
+    models/recipes/train_words.py), which is how the paper starts (its section 3.1). The vector is whitened only if the
+    file of the words holds a whitening.
     """
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")

@@ -1,6 +1,6 @@
 """Learned visual words, and the vectors made with them: VLAD, which sums, word by word, the differences between a
-picture's local descriptors and their words (Jégou et al., CVPR 2010), and the bag of words. `edgevpr train words`
-writes the file of the words; the techniques in `network` and `regions` load it."""
+picture's local descriptors and their words (Jégou et al., CVPR 2010), and the bag of words. `train_words.py` in
+models/recipes/ writes the file of the words; the techniques in `network` and `regions` load it."""
 
 import hashlib
 from dataclasses import dataclass
@@ -66,7 +66,8 @@ def load_words(model: str, kind: str, count: int) -> Words:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
     Raises ModelError as `_read` does, and if they were learned on another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
-    command = f"make them with `edgevpr train words --images DIR --model {model} --kind {kind} --count {count}`"
+    recipe = "python models/recipes/train_words.py"
+    command = f"make them with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
     content, arrays, words = _read(name, command)
     learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != wanted:

@@ -114,7 +114,7 @@ def test_amosnet_and_hybridnet_differ_by_their_weights_alone():
         ("amosnet", {"levels": 0}, UsageError, "amosnet: levels is 0"),
         ("hybridnet", {"levels": 40}, ModelError, "too small for a grid"),
         ("netvlad", {"assignment": "fuzzy"}, UsageError, "use soft or hard"),
-        ("netvlad", {"words": 7}, ModelError, "train words --images DIR --model calc --kind vlad --count 7"),
+        ("netvlad", {"words": 7}, ModelError, "train_words.py --images DIR --model calc --kind vlad --count 7"),
         ("region_vlad", {"regions": 0}, UsageError, "region_vlad: regions is 0"),
         ("region_vlad", {"words": 7}, ModelError, "--kind regions --count 7"),
         ("cross_region_bow", {"words": 7}, ModelError, "--kind bow --count 7"),

@@ -1,4 +1,4 @@
-"""Writing a trained network as an ONNX file with its card, checked against PyTorch; `job` uses it."""
+"""Writes a network of PyTorch as an ONNX file with its card, checked against PyTorch."""
 
 import logging
 import warnings
@@ -34,10 +34,6 @@ class ModelFile:
     rule: InputRule
     outputs: dict[str, str]
 
-    @property
-    def card(self) -> Path:
-        return self.path.with_suffix(".yaml")
-
 
 def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Singles]) -> float:
     """Write a network and its card. Each of `samples` is an input to compare with, float32 (N, ...). If N > 1 in the
@@ -49,7 +45,7 @@ def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Sin
     _write_onnx(file, network, samples[0])
     largest = _largest_difference(file, network, samples)
     if not largest <= LARGEST_DIFFERENCE:
-        file.path.unlink()  # a wrong file must not be taken for a model, nor be in the way of another try
+        file.path.unlink()  # a wrong file must not be taken for a model
         raise EdgevprError(
             f"{file.path} gives other values than PyTorch (they differ by {largest:.2g}): install another version of "
             "onnx or torch and run the command again."
@@ -63,7 +59,7 @@ def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Sin
         "input": {key: value for key, value in asdict(file.rule).items() if value is not None},
         "outputs": file.outputs,
     }
-    file.card.write_text(card_text(values), encoding="utf-8")
+    file.path.with_suffix(".yaml").write_text(card_text(values), encoding="utf-8")
     return largest
 
 

@@ -1,22 +1,25 @@
-"""`edgevpr train words`: visual words, learned by k-means from one's own pictures.
+"""Learns visual words by k-means from one's own pictures, for the techniques that count them:
+`python models/recipes/train_words.py --images DIR... --kind vlad --count 64`.
 
-The file that `techniques.words.load_words` reads holds `words` float16 (K, D), rounded to steps of 1/256 so that ten
-thousand of them take little room, and `model_sha256`, the fingerprint of the card whose feature map they describe. If
-asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and Chum, ECCV 2012).
+The file MODEL_KIND<COUNT>.npz, which `edgevpr.techniques.words.load_words` reads, holds `words` float16 (K, D), rounded
+to steps of 1/256 so that ten thousand of them take little room, and `model_sha256`, the fingerprint of the card whose
+feature map they describe. If asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and
+Chum, ECCV 2012).
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from training_pictures import read_pictures
 
 from edgevpr.core.arrays import Array, Image, Ints, Singles
-from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.files import model_folders, write_whole
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.files import own_models
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
-from edgevpr.lab.training.pictures import read_pictures
 from edgevpr.techniques.regions import describe, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.words import local_descriptors, nearest, sharpness_of, vlad
@@ -32,102 +35,61 @@ _JUDGED = 5000  # of the points: enough to tell how well the words fit
 _BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
 
 
-@dataclass(frozen=True, slots=True)
-class WordsWanted:
-    """The words to learn: `count` of a `kind` ("vlad" for `netvlad`, "regions" for `region_vlad`, "bow" for
-    `cross_region_bow`) on the feature map of the card `model`. `whiten` is the length of the whitened VLAD vectors
-    (None: no whitening)."""
-
-    model: str
-    kind: str
-    count: int
-    whiten: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class WordsResult:
-    """Result of a training of words: the file, the numbers of pictures and of descriptors it was learned from, and the
-    mean square distance of a descriptor to its nearest word (2: nothing in common)."""
-
-    file: str
-    pictures: int
-    descriptors: int
-    distance: float
-
-
-def train_words(
-    folders: Sequence[str], wanted: WordsWanted, folder: Path | None, seed: int, unusable: list[ImageError]
-) -> WordsResult:
-    """Learn words and write <model>_<kind><count>.npz to `folder` (None: the user's own models folder).
-
-    Raises UsageError for settings that make no sense, a file that exists already or too few descriptors, ModelError for
-    a network that cannot be used, SourceError for a folder without images.
-    """
-    count, whiten = wanted.count, wanted.whiten
-    if count < 2 or seed < 0 or (whiten is not None and whiten < 1):
-        raise UsageError(f"--count {count} --seed {seed}: give at least 2 words, a seed of 0 or more, --whiten from 1.")
-    if whiten is not None and wanted.kind != "vlad":
-        raise UsageError(f"--whiten is for --kind vlad: leave it out for {wanted.kind}.")
-    folder = model_folders()[0] if folder is None else folder
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{wanted.model}_{wanted.kind}{count}.npz"
-    if path.exists():
-        raise UsageError(f"{path} is there already: delete it, or give another --out.")
-    backbone = open_backbone(wanted.model, "features")
-
-    def described(picture: Image) -> Singles:
-        features = backbone.run(picture)
-        if wanted.kind == "vlad":
-            return local_descriptors(features)
-        return describe(features, find_regions(features, REGIONS[wanted.kind]))
-
-    rng = np.random.default_rng(seed)
-    points, pictures = _gathered(folders, described, max(_POINTS, _POINTS_PER_WORD * count), rng, unusable)
-    if whiten is not None and whiten >= pictures:
+def main(argv: Sequence[str] | None = None) -> None:
+    """Learn the words that the arguments ask for, write their file, and print how well they fit."""
+    parser = argparse.ArgumentParser(description="Learn the words that vlad, regions or bow count.")
+    parser.add_argument("--images", required=True, nargs="+", metavar="DIR", help="folders of images")
+    parser.add_argument("--model", default="calc", metavar="NAME", help="the card of the backbone (calc)")
+    parser.add_argument("--kind", required=True, choices=("vlad", *REGIONS), help="what the words are of")
+    parser.add_argument("--count", type=int, required=True, metavar="N", help="the number of words")
+    parser.add_argument("--whiten", type=int, metavar="D", help="also learn a whitening to D values (vlad)")
+    parser.add_argument("--out", type=Path, default=own_models(), metavar="DIR", help="(your models folder)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    args = parser.parse_args(argv)
+    if args.whiten and args.kind != "vlad":
+        raise UsageError(f"--whiten is for --kind vlad: leave it out for {args.kind}.")
+    backbone, rng = open_backbone(args.model, "features"), np.random.default_rng(args.seed)
+    points, pictures = _descriptors(args.images, backbone, args.kind, args.count, rng)
+    if len(points) < 2 * args.count or (args.whiten or 0) >= pictures:
         raise UsageError(
-            f"--whiten {whiten} needs more than {whiten} usable images, and there are {pictures}: give more, or a "
-            "smaller --whiten."
+            f"{pictures} usable images give {len(points)} descriptors: give more images, at most {len(points) // 2} "
+            "words (--count), and fewer values of a whitening (--whiten) than images."
         )
-    if len(points) < 2 * count:
-        raise UsageError(
-            f"{pictures} usable images give {len(points)} descriptors, too few for {count} words: give more images, "
-            f"or a --count of at most {len(points) // 2}."
-        )
-    *_, centres = progress(kmeans(points, count, _ROUNDS, rng), _ROUNDS, "learning")
+    *_, centres = progress(kmeans(points, args.count, _ROUNDS, rng), _ROUNDS, "learning")
     stored = (np.rint(centres * _STEP) / _STEP).astype(np.float16)
     words = stored.astype(np.float32)
     arrays = {"words": stored, "model_sha256": np.array(backbone.sha256)}
-    if whiten is not None:
-        arrays |= _whitening(backbone, folders, pictures, words, whiten)
-    return _written(path, arrays, points, words, pictures)
+    if args.whiten:
+        arrays |= _whitening(backbone, args.images, pictures, words, args.whiten)
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / f"{args.model}_{args.kind}{args.count}.npz"
+    np.savez_compressed(path, **arrays)
+    some = points[:: max(1, len(points) // _JUDGED)]
+    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
+    print(
+        f"{path}: learnt from {len(points)} descriptors of {pictures} images, whose mean square distance to their word "
+        f"is {distance:.3f} (2: nothing in common)"
+    )
 
 
-def _gathered(
-    folders: Sequence[str],
-    described: Callable[[Image], Singles],
-    wanted: int,
-    rng: np.random.Generator,
-    unusable: list[ImageError],
+def _descriptors(
+    folders: Sequence[str], backbone: Backbone, kind: str, count: int, rng: np.random.Generator
 ) -> tuple[Singles, int]:
-    """Collect descriptors of the pictures in `folders`: of those of each picture, `described` (n, D), so many random
-    ones that all pictures give about `wanted`. Returns them, float32 (N, D), and the number of pictures."""
-    share = -(-wanted // sum(len(list_images(name)) for name in folders))
+    """Collect descriptors of the pictures in `folders`, of each so many random ones that all give enough for `count`
+    words. Returns them, float32 (N, D), and the number of pictures."""
+
+    def described(picture: Image) -> Singles:
+        features = backbone.run(picture)
+        return (
+            local_descriptors(features) if kind == "vlad" else describe(features, find_regions(features, REGIONS[kind]))
+        )
+
+    share = -(-max(_POINTS, _POINTS_PER_WORD * count) // sum(len(list_images(name)) for name in folders))
     points = []
-    for picture in read_pictures(folders, "describing", unusable):
+    for picture in read_pictures(folders, "describing"):
         found = described(picture)
         points.append(found[rng.permutation(len(found))[:share]])
     return np.concatenate(points or [np.empty((0, 1), np.float32)]), len(points)
-
-
-def _written(path: Path, arrays: dict[str, Array], points: Singles, words: Singles, pictures: int) -> WordsResult:
-    def write(unfinished: Path) -> None:
-        with open(unfinished, "wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's third parameter is a bool
-
-    write_whole(path, write)
-    some = points[:: max(1, len(points) // _JUDGED)]
-    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
-    return WordsResult(str(path), pictures, len(points), float(distance))
 
 
 def kmeans(points: Singles, count: int, rounds: int, rng: np.random.Generator) -> Iterator[Singles]:
@@ -187,3 +149,10 @@ def _whitening(
     scale = np.abs(matrix).max(axis=1) / 127
     whitening = np.rint(matrix / scale[:, None]).astype(np.int8)
     return {"mean": mean, "whitening": whitening, "whitening_scale": scale.astype(np.float32)}
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except EdgevprError as error:
+        sys.exit(f"train_words: {error}")

@@ -1,0 +1,93 @@
+"""Words are learnt with NumPy and onnxruntime alone, on the network that edgevpr ships."""
+
+import shutil
+
+import numpy as np
+import pytest
+import train_words
+from training_pictures import read_pictures
+from write_pictures import write_pictures
+
+from edgevpr import techniques
+from edgevpr.core.errors import UsageError
+from edgevpr.core.files import shipped
+from edgevpr.techniques.session import open_backbone
+from edgevpr.techniques.words import load_words, local_descriptors, sharpness_of, vlad
+
+
+@pytest.fixture(autouse=True)
+def own_models(models, monkeypatch):
+    """The backbone alone, so that no shipped words are found."""
+    for name in ("calc.onnx", "calc.yaml"):
+        shutil.copy(shipped("models") / name, models / name.replace("calc.yaml", "mine.yaml"))
+    monkeypatch.setattr(train_words, "_POINTS", 2000)
+    return models
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_pictures(tmp_path / "pictures", 12)
+
+
+def train(folder, out, *more):
+    train_words.main(["--images", str(folder), "--model", "mine", "--out", str(out), *more])
+
+
+@pytest.mark.parametrize(("kind", "technique"), [("vlad", "netvlad"), ("regions", "region_vlad")])
+def test_words_make_the_technique_work(kind, technique, folder, own_models, capsys):
+    (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    train(folder, own_models, "--kind", kind, "--count", "8")
+    said = capsys.readouterr()
+    assert "descriptors of 12 images" in said.out
+    assert "broken.jpg" in said.err
+    made = techniques.create(technique, {"model": "mine", "words": 8})
+    (picture, *_) = read_pictures([folder], "reading")
+    vector = made.encode(picture).coarse.astype(np.float32)
+    assert vector.shape == (8 * 128,)
+    assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_the_same_pictures_give_the_same_file_and_whitened_vectors_that_are_uncorrelated(folder, own_models, tmp_path):
+    for out in (own_models, tmp_path / "again"):
+        train(folder, out, "--kind", "vlad", "--count", "8", "--whiten", "6")
+    first, again = ((out / "mine_vlad8.npz").read_bytes() for out in (own_models, tmp_path / "again"))
+    assert first == again
+    words = load_words("mine", "vlad", 8)
+    backbone, white, rows = open_backbone("mine", "features"), words.whitening, []
+    for picture in read_pictures([folder], "reading"):
+        vector = vlad(local_descriptors(backbone.run(picture)), words.words, sharpness_of(words.words))
+        assert np.linalg.norm(white(vector)) == pytest.approx(1, abs=1e-5)
+        rows.append(white.scale * (white.matrix.astype(np.float32) @ (vector - white.mean)))
+    np.testing.assert_allclose(np.cov(np.array(rows).T, bias=True), np.eye(6), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--kind", "bow", "--count", "8", "--whiten", "4"), "--whiten is for --kind vlad"),
+        (("--kind", "vlad", "--count", "8", "--whiten", "12"), "12 usable images"),
+        (("--kind", "vlad", "--count", "5000"), r"at most \d+ words"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(arguments, said, folder, own_models):
+    with pytest.raises(UsageError, match=said):
+        train(folder, own_models, *arguments)
+
+
+def test_a_round_of_kmeans_is_the_textbooks():
+    """Against a loop over points and centres."""
+    points = np.random.default_rng(2).normal(size=(200, 3)).astype(np.float32)
+    before, after = (each.copy() for each in train_words.kmeans(points, 7, 2, np.random.default_rng(3)))
+    own = [min(range(7), key=lambda k: float(np.square(point - before[k]).sum())) for point in points]
+    wanted = [
+        np.mean([point for point, k in zip(points, own, strict=True) if k == number], axis=0) for number in range(7)
+    ]
+    np.testing.assert_allclose(after, wanted, atol=1e-5)
+
+
+def test_no_centre_is_left_without_points():
+    rng = np.random.default_rng(4)
+    points = np.repeat(rng.normal(size=(10, 4)).astype(np.float32), 30, axis=0)  # starts mostly coincide
+    *_, found = train_words.kmeans(points, 10, 12, rng)
+    assert np.square(points[:, None] - found).sum(axis=2).min(axis=1).mean() < 1e-6
