@@ -17,6 +17,7 @@ from edgevpr.core.text import waiting
 
 if TYPE_CHECKING:
     from edgevpr.review.logged import LoggedFlight
+    from edgevpr.review.overhead import Ground
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +58,8 @@ def run_report(args: Namespace) -> int:
     flight = _read(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
     frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
-    ground, no_ground = [], "The log does not name a map: give it with --map."
+    ground: Ground = ()
+    no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):
         try:
             ground, no_ground = read_ground(path), ""

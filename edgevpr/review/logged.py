@@ -66,40 +66,22 @@ class LoggedQuery:
     has_link: bool | None
 
 
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """A line of the log with a text for people: its time in seconds after the start, its kind, and the text `said`."""
-
-    t_s: float
-    kind: str
-    said: str
-
-
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
-    """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `unusable` are times
-    (seconds after the start) of frames that never became queries, `learnt` the positions of places learnt in flight.
-    `missing` is a sentence about files of the flight that are not there (None: all are). The flight began at `start_s`
-    on its monotonic clock (None: unknown), and is `span_s` long."""
+    """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
+    lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
+    `learnt` the positions of places learnt in flight. `missing` is a sentence about files of the flight that are not
+    there (None: all are). Times are seconds after its start; it is `span_s` long."""
 
     path: Path
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)
-    remarks: list[Remark] = field(default_factory=list)
+    remarks: list[tuple[float, str, str]] = field(default_factory=list)
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
     missing: str | None = None
-    start_s: float | None = None
     span_s: float = 0.0
-
-    def since_start(self, t_mono_s: float | None) -> float:
-        """Return the seconds from the start of the flight to `t_mono_s` (None: to the latest time read so far). The
-        first time that is given counts as the start."""
-        if t_mono_s is None:
-            return self.span_s
-        self.start_s = t_mono_s if self.start_s is None else self.start_s
-        return max(0.0, t_mono_s - self.start_s)
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
@@ -109,22 +91,28 @@ def read_flight(path: str | Path) -> LoggedFlight:
     flight = read_lines(lines, Path(path))
     flight.missing = lines.missing
     if lines.missing:
-        flight.remarks.insert(0, Remark(0.0, "missing", lines.missing))
+        flight.remarks.insert(0, (0.0, "missing", lines.missing))
     return flight
 
 
 def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
-    """Read a flight from the lines of its log, in their order."""
+    """Read a flight from the lines of its log, in their order. The first time in it counts as the start."""
     flight, queries = LoggedFlight(path=path), dict[str, LoggedQuery]()
+    start_s = None
     for line in lines:
-        kind, t_s = line.get("kind"), flight.since_start(number(line, "t_mono_s"))
+        kind, t_mono_s, t_s = line.get("kind"), number(line, "t_mono_s"), flight.span_s
+        if t_mono_s is not None:
+            start_s = t_mono_s if start_s is None else start_s
+            t_s = max(0.0, t_mono_s - start_s)
         flight.span_s = max(flight.span_s, t_s)
         if kind == "start":
             flight.start = line
         elif kind == "end":
             flight.end = line
         elif kind == "query":
-            query = queries[text(line, "query") or ""] = _query(line, flight)
+            t_frame_s = number(line, "t_frame_s")
+            taken_s = t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0))
+            query = queries[text(line, "query") or ""] = _query(line, taken_s)
             flight.queries.append(query)
         elif kind == "answer":
             if (answered := queries.get(text(line, "query") or "")) and answered.fix:
@@ -134,7 +122,7 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
         elif kind == "learnt":
             flight.learnt += filter(None, [point(line, "position")])
         else:
-            flight.remarks.append(Remark(t_s, str(kind), _words(line)))
+            flight.remarks.append((t_s, str(kind), _words(line)))
     return flight
 
 
@@ -146,7 +134,7 @@ def _take_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
         fix.why = fix.why or "it does not say why"
 
 
-def _query(line: dict[str, Any], flight: LoggedFlight) -> LoggedQuery:
+def _query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     t_frame_s = number(line, "t_frame_s")
     accepted = line.get("accepted") is True
     at = point(line, "located") or point(line, "position") if accepted else None
@@ -161,7 +149,7 @@ def _query(line: dict[str, Any], flight: LoggedFlight) -> LoggedQuery:
     return LoggedQuery(
         line=line,
         name=text(line, "query") or "",
-        t_s=flight.since_start(number(line, "t_mono_s") if t_frame_s is None else t_frame_s),
+        t_s=t_s,
         accepted=accepted,
         reason=text(line, "reason") or "no reason is given",
         confidence=max((known for known in confidences if known is not None), default=None),

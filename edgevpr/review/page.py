@@ -69,15 +69,15 @@ class Album:
 
     def picture(self, name: str | None) -> bytes | None:
         """Return the picture `name` as a small JPEG; None if there is none that can be read."""
-        files = [(folder, folder / name) for folder in self._folders] if name else []
-        if name in self._recorded:
-            files.insert(0, (self._recorded[name].parent, self._recorded[name]))
-        for folder, path in files:
-            from edgevpr.frames.images import read_image, small_jpeg  # a page without pictures needs no OpenCV
+        if not name or not (self._folders or name in self._recorded):
+            return None
+        from edgevpr.frames.images import read_image, small_jpeg  # a page without pictures needs no OpenCV
 
+        # A log from somebody else may name any file of this machine: show only files in the folders.
+        paths = [folder / Path(name).name for folder in self._folders]
+        for path in [self._recorded[name], *paths] if name in self._recorded else paths:
             with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
-                # A log from somebody else may name any file of this machine: show only files in the folder.
-                if path.resolve().is_relative_to(folder.resolve()) and path.is_file():
+                if path.is_file():
                     return small_jpeg(read_image(path))
         return None
 
@@ -143,7 +143,6 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
         (flight.start, "The log lacks the first line of this flight: how it was set is not known."),
         (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight still goes on."),
         (queries, "No picture became a query in this flight: there is nothing to show of one."),
-        (not queries or any(query.accepted for query in queries), "No match was accepted in this flight."),
         (not queries or has_places, "No place has a position: nothing can be drawn over ground, and no fix was sent."),
         (
             not queries or any(query.has_link for query in queries),
@@ -278,7 +277,7 @@ def _counts(reasons: Iterable[str]) -> str:
 
 
 def _remarks(flight: LoggedFlight) -> str:
-    rows = [(clock(each.t_s), each.kind, each.said) for each in flight.remarks[:_MOST_REMARKS]]
+    rows = [(clock(t_s), kind, said) for t_s, kind, said in flight.remarks[:_MOST_REMARKS]]
     left_out = f'<p class="soft">and {len(flight.remarks) - len(rows)} more lines</p>'
     return (table(("time", "of", "said"), rows) if rows else "") + left_out * (len(flight.remarks) > len(rows))
 

@@ -66,7 +66,7 @@ def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark
     first.unlink()
     flight = read_flight(path)
     assert (flight.start["map"], flight.start["repeated"]) == ("m.gpkg", True)
-    assert flight.remarks[0].said == flight.missing
+    assert flight.remarks[0] == (0.0, "missing", flight.missing)
     assert "flight.jsonl: 1." in flight.missing
     assert 0 < len(flight.queries) < 4
 
@@ -115,8 +115,7 @@ def test_lines_of_note_are_kept_in_their_words(tmp_path):
         ("governor", {"from": {"rate_hz": 2, "form": "bits"}, "to": {"rate_hz": 1, "form": "bits"}, "why": "too hot"}),
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines))
-    told = [(each.t_s, each.kind, each.said) for each in flight.remarks]
-    assert told == [
+    assert flight.remarks == [
         (1, "camera", "camera shows nothing"),
         (2, "gap", "lost_lines 3"),
         (4, "command", "paused"),

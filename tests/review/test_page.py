@@ -93,7 +93,6 @@ def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     [
         ([], True, "No picture became a query"),
         ([("unusable", {"problem": "cut short"})], True, "No picture became a query"),
-        ([("query", query("a", accepted=False, located=None, fix=None))], True, "No match was accepted"),
         ([("query", query("a", located=None, position=None, fix=None))], True, "No place has a position"),
         ([("query", query("a"))], False, "has no last line: it was cut off"),
         ([("query", query("a"))], True, "no report of the autopilot"),
