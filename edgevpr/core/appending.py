@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
-MOST_FILES = 100  # limits the many short logs of a service that restarts again and again
 _MOST_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
 _NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
@@ -96,13 +95,6 @@ def is_at(file: BinaryIO, path: str | Path) -> bool:
         return False
 
 
-def keep_as_earlier(path: str | Path) -> None:
-    """Rename the full file NAME.jsonl to NAME.1.jsonl in its folder, replacing an older one."""
-    path = Path(os.path.realpath(path))
-    os.replace(path, path.with_name(f"{path.stem}.1{path.suffix}"))
-    sync_folder(path)
-
-
 def numbered(path: str | Path) -> list[Path]:
     """List the numbered files of `path` (see the module), the lowest number first."""
     return [file for _, file in _numbered(Path(os.path.realpath(path)))]
@@ -138,24 +130,19 @@ def set_aside(path: str | Path) -> Path:
     return target
 
 
-def keep_within(path: str | Path, most_bytes: float) -> list[Path]:
-    """Delete numbered files of `path`: the smallest of more than `MOST_FILES`, then the oldest until the others take at
-    most `most_bytes` together. A file that a process has locked stays. Return the paths of the deleted files."""
-    sizes, deleted = {}, []
+def keep_within(path: str | Path, most_bytes: float) -> bool:
+    """Delete the oldest numbered files of `path` until the others take at most `most_bytes` together. A file that a
+    process has locked stays. Return True if any was deleted."""
+    sizes = {}
     for file in numbered(path):
         with suppress(FileNotFoundError):  # another process deletes as well
-            status = os.lstat(file)
-            if stat.S_ISREG(status.st_mode):
-                sizes[file] = status.st_size
-    # Among files of about the same size the oldest goes first. The newest stays: its number would be used again.
-    smallest = sorted(list(sizes)[:-1], key=lambda file: sizes[file].bit_length())
-    too_many = smallest[: max(0, len(sizes) - MOST_FILES)]
-    for file in (*too_many, *sizes.copy()):
-        if file in sizes and (file in too_many or sum(sizes.values()) > most_bytes) and _is_free(file):
+            sizes[file] = os.lstat(file).st_size
+    kept_bytes = before_bytes = sum(sizes.values())
+    for file, size in sizes.items():
+        if kept_bytes > most_bytes and _is_free(file):
             file.unlink(missing_ok=True)
-            del sizes[file]
-            deleted.append(file)
-    return deleted
+            kept_bytes -= size
+    return kept_bytes < before_bytes
 
 
 def _numbered(path: Path) -> list[tuple[int, Path]]:

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from pathlib import Path
 
-from edgevpr.core.appending import append, is_at, keep_as_earlier, open_appending, sync
+from edgevpr.core.appending import append, is_at, keep_within, open_appending, set_aside, sync
 from edgevpr.core.errors import EdgevprError
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
@@ -96,7 +96,8 @@ class Tlog:
         is_full = os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES
         is_there = is_at(self._file, self._path)  # neither moved nor deleted in flight
         if is_there and is_full:
-            keep_as_earlier(self._path)
+            set_aside(self._path)
+            keep_within(self._path, MOST_BYTES)
         if is_full or not is_there:
             self._file.close()
             self._file = open_appending(self._path)

@@ -15,12 +15,12 @@ from fakes import FakeClock
 from full_disk import no_file_larger_than
 from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
+from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink import messages, tlog
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Health
-from edgevpr.mavlink.ports import open_port
+from edgevpr.mavlink.ports import Line, open_port
 from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
@@ -192,7 +192,7 @@ def test_there_are_never_more_than_two_files_of_the_largest_size(path, monkeypat
     for first in range(0, 200, 10):
         record(path, range(first, first + 10))
     assert os.stat(path).st_mode & 0o777 == 0o640
-    older = path.with_name("flight.1.tlog")
+    (older,) = numbered(path)
     assert sorted(path.parent.iterdir()) == [older, path]
     assert max(path.stat().st_size, older.stat().st_size) <= 1000
     found = numbers(older) + numbers(path)
