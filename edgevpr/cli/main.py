@@ -11,7 +11,6 @@ from functools import cache
 from edgevpr import __version__
 from edgevpr.cli import evaluation, flying, maps, networks, profile, review, simulation, top
 from edgevpr.cli.screen import LineFormatter, guarded_output
-from edgevpr.core.config import require_sayable
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
 
@@ -44,8 +43,6 @@ def _run(argv: list[str]) -> int:
     handler.setFormatter(LineFormatter("edgevpr: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if args.debug else logging.INFO, handlers=[handler])
     try:
-        for word in argv:
-            require_sayable(word, "The command line")
         code: int = args.run(args)
         return code
     except EdgevprError as error:

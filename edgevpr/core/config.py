@@ -224,9 +224,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     ({"source.rate_hz": 2.0}; None values are ignored). Raises ConfigError, which names the file, the key and what to
     do."""
     defaults_path = shipped("deploy") / "config.yaml"
-    merged = read_yaml(defaults_path)
-    if path is not None:
-        merged = _overlaid(merged, read_yaml(path), str(path), "")
+    merged = _overlaid(read_yaml(defaults_path), read_yaml(path) if path is not None else {})
     for dotted, value in (overrides or {}).items():
         if value is not None:
             *sections, key = dotted.split(".")
@@ -239,7 +237,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 def changed_config(config: Config, path: str | Path) -> Config:
     """Return a copy of `config` with the values of the YAML file `path` in place of its own. Raises ConfigError."""
-    return build(Config, _overlaid(asdict(config), read_yaml(path), str(path), ""), str(path))
+    return build(Config, _overlaid(asdict(config), read_yaml(path)), str(path))
 
 
 def with_logs_in(config: Config, folder: str) -> Config:
@@ -263,7 +261,9 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     known = {f.name: f for f in fields(cls)}
     for key in mapping:
         if key not in known:
-            raise _unknown(key, known, where, prefix)
+            name = str(key)[:_SHOWN]
+            hint = meant(name, known, f"known: {', '.join(sorted(known))}")
+            raise ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
     values = {}
     for name, spec in known.items():
         if name in mapping:
@@ -273,21 +273,13 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     return cls(**values)
 
 
-def _overlaid(base: dict[str, Any], over: dict[str, Any], where: str, prefix: str) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in over.items():
-        if key not in base:
-            raise _unknown(key, base, where, prefix)
-        if isinstance(base[key], dict) and isinstance(value, dict):
-            value = _overlaid(base[key], value, where, f"{prefix}{key}.")
-        merged[key] = value
+def _overlaid(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Return `base` with the values of `over` in place of its own; sections are overlaid key by key."""
+    merged = base | over
+    for key in base.keys() & over.keys():
+        if isinstance(base[key], dict) and isinstance(over[key], dict):
+            merged[key] = _overlaid(base[key], over[key])
     return merged
-
-
-def _unknown(key: object, known: typing.Iterable[str], where: str, prefix: str) -> ConfigError:
-    name = str(key)[:_SHOWN]
-    hint = meant(name, known, f"known: {', '.join(sorted(known))}")
-    return ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
 
 
 def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key: str) -> Any:
@@ -305,7 +297,7 @@ def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key:
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str):
-        require_sayable(value, f"{where}: `{key}`")
+        _require_sayable(value, f"{where}: `{key}`")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
         raise ConfigError(f"{where}: `{key}` must be {_WORDS.get(wanted, wanted)}, not {value!r:.{_SHOWN}}.")
     if limits and not limits[0] <= value <= limits[1]:
@@ -316,16 +308,14 @@ def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key:
     return value
 
 
-def require_sayable(text: str, what: str) -> None:
-    """Raise ConfigError if `text` cannot be a file name and be printed, for a NUL character or half a character (a lone
-    surrogate). `what` is the beginning of the message, such as the file and the key."""
-    problem = "a NUL character" if "\0" in text else None
+def _require_sayable(text: str, what: str) -> None:
+    """Raise ConfigError if `text` cannot be a file name: for a NUL character or a lone surrogate."""
     try:
-        os.fsencode(text)
+        is_sayable = b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
-        problem = "half a character"
-    if problem:
-        raise ConfigError(f"{what} holds {problem} ({text!a:.60}): write it anew.")
+        is_sayable = False
+    if not is_sayable:
+        raise ConfigError(f"{what} holds a character that no file name can have ({text!a:.60}): write it anew.")
 
 
 def _kind(hint: Any) -> type:

