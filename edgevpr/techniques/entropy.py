@@ -28,28 +28,27 @@ _LOG2_OVER_8 = _LOG2 / 8
 _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 
 
-def filled_bins(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Singles:
+def filled_bins(grey: Bytes) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
 
     `grey` is uint8 (H, W); returns float32 (H, W) in 0..1.
     """
-    padded = _replicated(grey, radius_px)
+    padded = _replicated(grey)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
-        strip = padded[top : top + _STRIP_ROWS + 2 * radius_px]
-        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[_different(strip, radius_px)]
+        different = _different(padded[top : top + _STRIP_ROWS + 2 * DISC_RADIUS_PX])
+        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[different]
     return entropy
 
 
-def shannon(grey: Bytes, radius_px: int = DISC_RADIUS_PX) -> Array:
+def shannon(grey: Bytes) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
 
     The authors' public code computes this, where the thesis's text has `filled_bins`. `grey` is uint8 (H, W); returns
     float32 (H, W) in 0..1.
     """
     height, width = grey.shape
-    small = _shannon_copy(grey)
-    return cv2.resize(_shannon_of(small, radius_px), (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(_shannon_of(_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def block_means(per_pixel: Array, cell_px: int) -> Array:
@@ -100,10 +99,10 @@ class _Bounds:
 def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
     """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*."""
     r = DISC_RADIUS_PX
-    padded = _replicated(grey, r)
+    padded = _replicated(grey)
     at_least = np.empty(grey.shape, np.uint8)
     for top in range(0, len(grey), _STRIP_ROWS):
-        endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), r, np.bitwise_or)
+        endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), np.bitwise_or)
         at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
     # n intensities have at most n endings; of those within 64 k values at most k share one.
     at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # saturates at 255
@@ -114,7 +113,7 @@ def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
         means = np.empty(len(patches), np.float32)
         for start in range(0, len(patches), _STRIP_CELLS):
             strip = slice(start, start + _STRIP_CELLS)
-            means[strip] = _LOG2_OVER_8[_different(patches[strip], r)].mean(axis=(1, 2))
+            means[strip] = _LOG2_OVER_8[_different(patches[strip])].mean(axis=(1, 2))
         return means
 
     low, high = (_cell_means(cv2.LUT(number, _LOG2_OVER_8[:256]), cell_px) for number in (at_least, at_most))
@@ -127,7 +126,7 @@ def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
     *endings*."""
     small = _shannon_copy(grey)
     # The entropy of the endings is at most that of all bits; within 16 k values the others add at most log2 k.
-    low = _shannon_of(small & 15, DISC_RADIUS_PX)
+    low = _shannon_of(small & 15)
     high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
     return _Bounds(low=low, high=high, down=down, across=across, exact=partial(_shannon_at, small))
@@ -169,39 +168,36 @@ def _range(grey: Bytes) -> Array:
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
-def _replicated(grey: Bytes, radius_px: int) -> Array:
-    """Pad `grey` with copies of its border. They add no new intensity to a disc: the pixel that is copied is nearer to
-    the middle of the disc, and so inside it."""
-    r = radius_px
+def _replicated(grey: Bytes) -> Array:
+    """Pad with copies of the border. They add no intensity to a disc: the pixel copied is nearer to its middle."""
+    r = DISC_RADIUS_PX
     return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
 
 
 def _bit(grey: Bytes) -> NDArray[np.uint64]:
-    """Return for each pixel a set with one element, as a 64-bit word: only bit n is set, n being the last six bits of
-    the pixel's intensity."""
+    """Return for each pixel a set with one element, as a word: the bit of the last six bits of the intensity is set."""
     sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
     return sets
 
 
-def _different(padded: Bytes, radius_px: int) -> Array:
-    """Count the different intensities in the disc around each pixel, by unions of sets of 256 bits: a picture padded by
-    the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
+def _different(padded: Bytes) -> Array:
+    """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in `_over_disc`."""
     bit, word_of = _bit(padded), padded >> 6
-    unions = (_over_disc(bit * (word_of == word), radius_px, np.bitwise_or) for word in range(4))
+    unions = (_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
     return sizes
 
 
-def _shannon_of(small: Array, radius_px: int) -> Singles:
+def _shannon_of(small: Array) -> Singles:
     """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
-    padded = np.pad(small.astype(np.int16), radius_px, constant_values=-1)  # -1: outside, no intensity
+    padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside, no intensity
     of_counts = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
-        counts = _over_disc(one_hot, radius_px, np.add)
+        counts = _over_disc(one_hot, np.add)
         of_counts += _COUNT_LOG2.take(counts).sum(axis=0)
-    in_disc = _over_disc((padded >= 0).view(np.uint8), radius_px, np.add)
+    in_disc = _over_disc((padded >= 0).view(np.uint8), np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
     entropy: Singles = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
     return entropy
@@ -226,10 +222,10 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
     return entropy
 
 
-def _over_disc(planes: Array, radius_px: int, combine: np.ufunc) -> Array:
+def _over_disc(planes: Array, combine: np.ufunc) -> Array:
     """Combine the values in the disc around each pixel of each plane by an associative ufunc (add, bitwise_or): planes
     padded by the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
-    r, pitch = radius_px, planes.shape[-1]
+    r, pitch = DISC_RADIUS_PX, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]
     flat = planes.ravel()
     first = r * pitch + r  # the middle of the first disc

@@ -70,8 +70,8 @@ def alexnet(
     from `seed`, compared by cosine.
 
     Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, in the form of thesis
-    4.2.1: `conv3` of AlexNet, projected (see `pooling.Projection`). The 1064 dimensions are those of the public code of
-    the thesis's author. The form `1bit` is the locality-sensitive hash of the paper's section IV-D.
+    4.2.1: `conv3` of AlexNet, projected as by `gaussian_projection`. The 1064 dimensions are those of the public code
+    of the thesis's author. The form `1bit` is the locality-sensitive hash of the paper's section IV-D.
     """
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
@@ -104,13 +104,12 @@ def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels
 def netvlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, words: int = 64, assignment: str = "soft"
 ) -> NetworkVector:
-    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, whitened, compared
-    by cosine. The `assignment` of a position to the words is "soft" or "hard".
+    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, compared by
+    cosine. The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1. The paper trains words and network together. Here the words are learned afterwards (by
-    models/recipes/train_words.py), which is how the paper starts (its section 3.1). The vector is whitened only if the
-    file of the words holds a whitening.
+    thesis 4.2.1, not whitened. The paper trains words and network together. Here the words are learned afterwards (by
+    models/recipes/train_words.py), which is how the paper starts (its section 3.1).
     """
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
@@ -119,8 +118,7 @@ def netvlad(
     sharpness = sharpness_of(learned.words) if assignment == "soft" else None
 
     def head(features: Singles) -> Singles:
-        vector = vlad(local_descriptors(features), learned.words, sharpness)
-        return vector if learned.whitening is None else learned.whitening(vector)
+        return vlad(local_descriptors(features), learned.words, sharpness)
 
     parameters = {"model": model, "words": words, "assignment": assignment}
     return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=learned.sha256)

@@ -56,7 +56,11 @@ def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
 def stands_out(query: Singles, place: Singles) -> float:
     """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, stands out
     from that at other shifts, in standard deviations of independent structures."""
-    agree = _agreements(query, place)
+    border = ((_ROOM, _ROOM), (_ROOM, _ROOM))
+    common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
+    of_query, of_place, least = _strengths(query, place)
+    scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
+    agree = common / np.sqrt(np.maximum(scatter, least) + _TINY)  # at all shifts of up to `_ROOM` cells
     first, last = _ROOM - _MISSES, _ROOM + _MISSES + 1
     at_y, at_x = np.divmod(int(agree[first:last, first:last].argmax()), last - first)
     y, x = at_y + first, at_x + first
@@ -79,16 +83,6 @@ def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) 
             scatter = max(float(np.einsum("ij,ij", of_query[asked], of_place[known])), least)
             best = max(best, float(np.einsum("ijk,ijk", query[asked], place[known])) / math.sqrt(scatter + _TINY))
     return best
-
-
-def _agreements(query: Singles, place: Singles) -> Array:
-    """Return the agreement of two structures at all shifts up to `_ROOM` cells, (2 `_ROOM` + 1, 2 `_ROOM` + 1)."""
-    border = ((_ROOM, _ROOM), (_ROOM, _ROOM))
-    common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
-    of_query, of_place, least = _strengths(query, place)
-    scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
-    found: Array = common / np.sqrt(np.maximum(scatter, least) + _TINY)
-    return found
 
 
 def _strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:

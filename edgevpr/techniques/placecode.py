@@ -9,7 +9,6 @@ Each such *hypothesis* is a row of a matrix, the places of the map are another m
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Floats, Ints, Singles
 from edgevpr.techniques.gradients import waves
@@ -24,27 +23,17 @@ _BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
 _SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
-def _shifts() -> NDArray[np.int8]:
-    steps = np.arange(1 - SIDE, SIDE)
-    dy, dx = np.meshgrid(steps, steps, indexing="ij")
-    enough = (SIDE - abs(dx)) * (SIDE - abs(dy)) >= _MIN_OVERLAP * SIDE**2
-    return np.stack([dx[enough], dy[enough]], axis=1).astype(np.int8)
-
-
+_DY, _DX = np.mgrid[1 - SIDE : SIDE, 1 - SIDE : SIDE]
+_ENOUGH = (SIDE - abs(_DX)) * (SIDE - abs(_DY)) >= _MIN_OVERLAP * SIDE**2
 # int8 (S, 2): every shift (dx, dy) in cells under which two grids overlap by at least half.
-SHIFTS = _shifts()
+SHIFTS = np.stack([_DX[_ENOUGH], _DY[_ENOUGH]], axis=1).astype(np.int8)
 
 
-def grid(blocks: Singles) -> Singles:
-    """Make the grid of a picture from its blocks, float32 (n, n, 4 L). A block has L numbers, one per orientation, for
-    each of its 2x2 cells. These four are averaged, then the blocks in each of 12x12 larger cells: float32 (12, 12, L).
-    Each cell has length 1, so that contrast and haze do not count."""
-    return seen_grid(blocks, np.ones(blocks.shape[:2], bool))[0]
-
-
-def seen_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the `grid` from the blocks where `seen`, bool (n, n), is True. Returns the grid float32 (12, 12, L), and
-    bool (12, 12), True where at least half of the cell is seen."""
+def grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
+    """Make the grid of a picture from the blocks float32 (n, n, 4 L) where `seen`, bool (n, n), is True. A block has L
+    numbers, one per orientation, for each of its 2x2 cells. These four are averaged, then the blocks in each of 12x12
+    larger cells. Each cell has length 1, so that contrast and haze do not count. Returns the grid float32 (12, 12, L),
+    and bool (12, 12), True where at least half of the cell is seen."""
     n, bins = len(blocks), blocks.shape[2] // 4
     source = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
     at = _sources(n)
@@ -61,11 +50,6 @@ def middle(per_block: Array, seen: Bools) -> Array:
     return per_block[start : start + n, start : start + n]
 
 
-def middle_grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the `seen_grid` of the `middle` of a picture."""
-    return seen_grid(middle(blocks, seen), middle(seen, seen))
-
-
 def special(grids: Floats, mean: Floats) -> Array:
     """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
     Fourier series: float32 of the shape of `grids`."""
@@ -80,7 +64,7 @@ def pack(grids: Floats, mean: Floats) -> Bytes:
 
 
 def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
-    """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `seen_grid`) and the map's
+    """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `grid`) and the map's
     mean (12, 12, L). Row s is the signs of the query (0 where nothing is seen), moved by shift s of `SHIFTS`."""
     signs = np.where(special(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     asked = np.zeros((len(SHIFTS), *signs.shape), np.float32)

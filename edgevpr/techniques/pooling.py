@@ -1,7 +1,7 @@
 """Pooling of a feature map to one vector, for `network` and `regions`. A feature map is float32 (channels, rows,
 columns)."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
@@ -45,41 +45,27 @@ def pyramid(features: Singles, levels: int) -> Singles:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Projection:
-    """Gaussian random projection of n values to `length` values, in a form that fits a small board: `spectrum`
-    complex128 (n // 2 + 1,), the conjugate Fourier transform of a Gaussian vector, and `signs` float32 (n,), -1 or 1.
+def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
+    """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), in a form that
+    fits a small board. It keeps the Euclidean length on average. The same `seed` always gives the same projection.
 
     A matrix of Gaussian values keeps the angles between vectors. For the 43 008 activations of CALC and 1064 dimensions
     it takes 183 MB. Here its rows are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
     activation (Hinrichs and Vybíral 2011): angles are kept as well, and the product is a correlation, which the Fourier
-    transform computes in a twentieth of the time.
-    """
-
-    spectrum: Array
-    signs: Singles
-    length: int
-
-    def __call__(self, features: Singles) -> Singles:
-        """Project float32 of n values in any shape to (length,). The Euclidean length is kept on average."""
-        size = len(self.signs)
-        shifted = np.fft.irfft(self.spectrum * np.fft.rfft(features.ravel() * self.signs, size), size)
-        projected: Singles = (shifted[: self.length] / np.sqrt(self.length)).astype(np.float32)
-        return projected
-
-
-def gaussian_projection(size: int, length: int, seed: int) -> Projection:
-    """Make the projection from `size` to `length` values. The same `seed` always gives the same projection.
-
-    Raises ModelError if `length` is larger than `size`.
+    transform computes in a twentieth of the time. Raises ModelError if `length` is larger than `size`.
     """
     if length > size:
         raise ModelError(
             f"A feature map of {size} values cannot be projected to {length} dimensions: ask for at most {size}."
         )
     row, signs = gaussian_row(size, seed)
-    # Row j of the matrix is the Gaussian vector shifted by j. The product is a correlation, hence the conjugate.
-    return Projection(np.conj(np.fft.rfft(row)), signs, length)
+    spectrum = np.conj(np.fft.rfft(row))  # row j of the matrix is the Gaussian vector shifted by j: a correlation
+
+    def projected(features: Singles) -> Singles:
+        shifted = np.fft.irfft(spectrum * np.fft.rfft(features.ravel() * signs, size), size)
+        return np.asarray(shifted[:length] / np.sqrt(length), np.float32)
+
+    return projected
 
 
 def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:

@@ -61,6 +61,7 @@ class VectorTechnique:
         is_measured = parameters.get("model", _SHIPPED) == _SHIPPED
         self.min_margin = margins[FORMS.index(form)] if is_measured else NEVER
         self._similarity, self._length = similarity, length
+        self._at_once = max(_BYTES_AT_ONCE // (4 * length), _FEWEST_AT_ONCE)
         packed = {
             "float": None,
             "8bit": PartSpec((length + _BESIDE_BYTES,), "|i1"),
@@ -101,7 +102,8 @@ class VectorTechnique:
         D), and the map's mean (D,). A row of `8bit` is D int8 numbers, then two float32 as bytes: the step by which the
         numbers are multiplied, and the vector's length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
-        for block in _blocks(len(coarse), self._length):
+        for start in range(0, len(coarse), self._at_once):
+            block = slice(start, start + self._at_once)
             left = coarse[block].astype(np.float32)
             left -= mean
             if self.spec.form == "1bit":
@@ -135,13 +137,12 @@ class VectorTechnique:
             code[: -(-self._length // 8)] = np.packbits(vector > 0)
             return (1 - hamming(code, rows) / np.float32(self._length)).astype(np.float32, copy=False), None
         scores = np.empty(len(rows), np.float32)
-        blocks = _blocks(len(rows), self._length)
-        values = np.empty((len(rows[blocks[0]]) if blocks else 0, self._length), np.float32)
-        for block in blocks:
-            part = rows[block]
+        values = np.empty((min(self._at_once, len(rows)), self._length), np.float32)
+        for start in range(0, len(rows), self._at_once):
+            part = rows[start : start + self._at_once]
             np.copyto(values[: len(part)], part[:, : self._length])
             beside = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
-            scores[block] = self._compared(vector, values[: len(part)], beside)
+            scores[start : start + len(part)] = self._compared(vector, values[: len(part)], beside)
         return scores, None
 
     def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
@@ -192,11 +193,6 @@ class Hog(VectorTechnique):
         allowed = mask_square(mask, self._w1)
         cells = oriented_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
         return normalised_blocks(cells).ravel()
-
-
-def _blocks(count: int, length: int) -> list[slice]:
-    at_once = max(_BYTES_AT_ONCE // (4 * length), _FEWEST_AT_ONCE)
-    return [slice(start, min(start + at_once, count)) for start in range(0, count, at_once)]
 
 
 def hamming(query: Bytes, codes: Bytes) -> Ints:

@@ -6,69 +6,42 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edgevpr.core.arrays import Array, Ints, Singles
+from edgevpr.core.arrays import Ints, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.card import load_card
 from edgevpr.techniques.pooling import unit
 
 _MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
-_ROWS_AT_ONCE = 64  # of an 8-bit matrix converted to float32 together
 _TINY = 1e-12
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Whitening:
-    """A learned whitening W (v - mean) of VLAD vectors v (Jégou and Chum, ECCV 2012), for K words of D numbers. `mean`
-    is float32 (K D,). W is `matrix` int8 (P, K D) with each row multiplied by its number in `scale` float32 (P,)."""
-
-    mean: Singles
-    matrix: NDArray[np.int8]
-    scale: Singles
-
-    def __call__(self, vector: Singles) -> Singles:
-        """Whiten a VLAD vector (K D,) and scale it to length 1: float32 (P,)."""
-        centred = vector - self.mean
-        product = np.empty(len(self.matrix), np.float32)
-        for start in range(0, len(product), _ROWS_AT_ONCE):
-            rows = slice(start, start + _ROWS_AT_ONCE)
-            product[rows] = self.matrix[rows].astype(np.float32) @ centred
-        return unit(product * self.scale)
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
     """Learned visual words `words`, float32 (K, D). `sha256` is the hash of network and words together, which a map
-    stores. `whitening` is that of the VLAD vectors made with these words (None: they are not whitened)."""
+    stores."""
 
     words: Singles
     sha256: str
-    whitening: Whitening | None = None
 
 
-def _read(name: str, command: str) -> tuple[bytes, dict[str, Array], Singles]:
-    """Read the file of words `name` in a folder of models. Returns its bytes, its arrays by name, and its words,
-    float32. Raises ModelError, which ends with the `command` that makes the file, if it is missing or damaged."""
+def load_words(model: str, kind: str, count: int) -> Words:
+    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
+    Raises ModelError, which ends with the command that makes the file, if it is missing or damaged, or if they were
+    learned on another network (see `Card.fingerprint`)."""
+    name = f"{model}_{kind}{count}.npz"
+    recipe = "python models/recipes/train_words.py"
+    command = f"make them with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
     path = find_model(name)
     if path is None:
         raise ModelError(f"There are no words {name} in the folders of models: {command}.")
     try:
         content = read_file(path, _MAX_FILE_BYTES)
         arrays = arrays_of(content, _MAX_FILE_BYTES)
-        return content, arrays, arrays["words"].astype(np.float32)
+        words = arrays["words"].astype(np.float32)
     except (OSError, ValueError, KeyError, MemoryError) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
-
-
-def load_words(model: str, kind: str, count: int) -> Words:
-    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-    Raises ModelError as `_read` does, and if they were learned on another network (see `Card.fingerprint`)."""
-    name = f"{model}_{kind}{count}.npz"
-    recipe = "python models/recipes/train_words.py"
-    command = f"make them with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
-    content, arrays, words = _read(name, command)
     learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != wanted:
         raise ModelError(
@@ -78,14 +51,7 @@ def load_words(model: str, kind: str, count: int) -> Words:
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
-    if "whitening" not in arrays:
-        return Words(words, sha256)
-    nothing = np.empty(0, np.float32)
-    mean, matrix, scale = (arrays.get(key, nothing) for key in ("mean", "whitening", "whitening_scale"))
-    if mean.shape != (words.size,) or matrix.shape != (scale.size, words.size):
-        raise ModelError(f"{name} holds a whitening that does not fit its words: {command}.")
-    mean, scale = mean.astype(np.float32), scale.astype(np.float32).ravel()
-    return Words(words, sha256, Whitening(mean=mean, matrix=matrix, scale=scale))
+    return Words(words, sha256)
 
 
 def local_descriptors(features: Singles) -> Singles:

@@ -3,8 +3,7 @@
 
 The file MODEL_KIND<COUNT>.npz, which `edgevpr.techniques.words.load_words` reads, holds `words` float16 (K, D), rounded
 to steps of 1/256 so that ten thousand of them take little room, and `model_sha256`, the fingerprint of the card whose
-feature map they describe. If asked for, it also holds the whitening of the VLAD vectors made of the words (Jégou and
-Chum, ECCV 2012).
+feature map they describe.
 """
 
 import argparse
@@ -15,22 +14,20 @@ from pathlib import Path
 import numpy as np
 from training_pictures import read_pictures
 
-from edgevpr.core.arrays import Array, Image, Ints, Singles
+from edgevpr.core.arrays import Image, Ints, Singles
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import own_models
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.techniques.regions import describe, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
-from edgevpr.techniques.words import local_descriptors, nearest, sharpness_of, vlad
+from edgevpr.techniques.words import local_descriptors, nearest
 
 REGIONS = {"regions": 400, "bow": 200}  # regions per picture, as in `region_vlad` and `cross_region_bow`
 _POINTS = 60_000  # the fewest local descriptors to learn words from, if there are as many ...
 _POINTS_PER_WORD = 12  # ... and the fewest per word
 _ROUNDS = 10
 _STEP = 256
-_ALIKE = 1e-9  # variance of vectors of length 1 that are the same but for rounding
-_LEAST_VARIANCE = 1e-3  # of the largest: a smaller variance is mostly noise, which whitening must not amplify
 _JUDGED = 5000  # of the points: enough to tell how well the words fit
 _BLOCK_VALUES = 8_000_000  # distances held at once: 32 MB
 
@@ -42,28 +39,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", default="calc", metavar="NAME", help="the card of the backbone (calc)")
     parser.add_argument("--kind", required=True, choices=("vlad", *REGIONS), help="what the words are of")
     parser.add_argument("--count", type=int, required=True, metavar="N", help="the number of words")
-    parser.add_argument("--whiten", type=int, metavar="D", help="also learn a whitening to D values (vlad)")
     parser.add_argument("--out", type=Path, default=own_models(), metavar="DIR", help="(your models folder)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     args = parser.parse_args(argv)
-    if args.whiten and args.kind != "vlad":
-        raise UsageError(f"--whiten is for --kind vlad: leave it out for {args.kind}.")
     backbone, rng = open_backbone(args.model, "features"), np.random.default_rng(args.seed)
     points, pictures = _descriptors(args.images, backbone, args.kind, args.count, rng)
-    if len(points) < 2 * args.count or (args.whiten or 0) >= pictures:
+    if len(points) < 2 * args.count:
         raise UsageError(
-            f"{pictures} usable images give {len(points)} descriptors: give more images, at most {len(points) // 2} "
-            "words (--count), and fewer values of a whitening (--whiten) than images."
+            f"{pictures} usable images give {len(points)} descriptors: give more images, or at most {len(points) // 2} "
+            "words (--count)."
         )
     *_, centres = progress(kmeans(points, args.count, _ROUNDS, rng), _ROUNDS, "learning")
     stored = (np.rint(centres * _STEP) / _STEP).astype(np.float16)
     words = stored.astype(np.float32)
-    arrays = {"words": stored, "model_sha256": np.array(backbone.sha256)}
-    if args.whiten:
-        arrays |= _whitening(backbone, args.images, pictures, words, args.whiten)
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{args.model}_{args.kind}{args.count}.npz"
-    np.savez_compressed(path, **arrays)
+    np.savez_compressed(path, words=stored, model_sha256=np.array(backbone.sha256))
     some = points[:: max(1, len(points) // _JUDGED)]
     distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
     print(
@@ -127,28 +118,6 @@ def _assigned(points: Singles, centres: Singles) -> tuple[Ints, Singles]:
         own = np.einsum("nd,nd->n", block, block)
         distance[start : start + rows] = own - 2 * closeness[np.arange(len(block)), best]
     return numbers, distance
-
-
-def _whitening(
-    backbone: Backbone, folders: Sequence[str], pictures: int, words: Singles, length: int
-) -> dict[str, Array]:
-    """Learn a whitening: the principal components of the pictures' VLAD vectors, each over the root of its variance."""
-    sharpness = sharpness_of(words)
-    vectors = np.empty((pictures, words.size), np.float32)
-    for row, picture in enumerate(read_pictures(folders, "whitening")):
-        vectors[row] = vlad(local_descriptors(backbone.run(picture)), words, sharpness)
-    mean = vectors.mean(axis=0)
-    vectors -= mean
-    # There are fewer pictures than values, so the components come from the small product of pictures with pictures.
-    variance, mixing = np.linalg.eigh((vectors @ vectors.T).astype(np.float64) / len(vectors))
-    variance, mixing = variance[::-1][:length], mixing[:, ::-1][:, :length]
-    if not variance[0] > _ALIKE:
-        raise UsageError("The images are all alike, and a whitening needs what tells them apart: give others.")
-    variance = np.maximum(variance, _LEAST_VARIANCE * variance[0])
-    matrix = (mixing / (np.sqrt(len(vectors)) * variance)).T.astype(np.float32) @ vectors
-    scale = np.abs(matrix).max(axis=1) / 127
-    whitening = np.rint(matrix / scale[:, None]).astype(np.int8)
-    return {"mean": mean, "whitening": whitening, "whitening_scale": scale.astype(np.float32)}
 
 
 if __name__ == "__main__":

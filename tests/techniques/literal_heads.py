@@ -142,12 +142,3 @@ def bag_of_words(local, words):
         present[distances.index(min(distances))] = 1
     length = math.sqrt(sum(present))
     return np.array([n / length for n in present])
-
-
-def whitened(vector, mean, matrix, scale):
-    rows = [
-        factor * sum(float(w) * (float(v) - float(m)) for w, v, m in zip(row, vector, mean, strict=True))
-        for row, factor in zip(matrix, scale, strict=True)
-    ]
-    length = math.sqrt(sum(v * v for v in rows))
-    return np.array([v / length for v in rows])

@@ -15,7 +15,7 @@ def test_grids_of_other_sizes_are_laid_middle_on_middle():
     large, small = np.array([4 * 9 + 4, 4 * 9 + 5, 5 * 9 + 4]), np.array([2 * 5 + 2, 2 * 5 + 3, 3 * 5 + 2])
     assert displacement(large, small, (9, 5), (1.0, 1.0)).shift_cells == (0.0, 0.0)
     assert displacement(small, large + 1, (5, 9), (1.0, 1.0)).shift_cells == (1.0, 0.0)
-    assert displacement(large, small, (9, 5), (1.0, 1.0)).agreeing == 3
+    assert displacement(large, small, (9, 5), (1.0, 1.0)).coverage == 3 / 25
 
 
 def count_by_hand(asking, best, side, counts):
@@ -33,13 +33,13 @@ def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
     rng = np.random.default_rng(len(counts))
     asking = np.sort(rng.choice(49, 40, replace=False))
     best = rng.integers(0, 49, 40)
-    assert displacement(asking, best, (7, 7), counts).share == pytest.approx(count_by_hand(asking, best, 7, counts))
+    assert displacement(asking, best, (7, 7), counts).score == pytest.approx(count_by_hand(asking, best, 7, counts))
 
 
 def test_a_step_at_the_edge_of_what_is_possible_is_found():
     asking, best = np.full(5, 48), np.zeros(5, int)  # from the last region to the first
     found = displacement(asking, best, (7, 7), (1.0, 1.0, 0.75, 0.5))
-    assert found.share == 1.0
+    assert found.score == 1.0
     assert found.shift_cells == (-6.0, -6.0)
 
 
@@ -47,7 +47,7 @@ def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
     asking = np.arange(900)[np.arange(900) % 30 < 25]
     moved = np.where(np.arange(len(asking)) % 4, 1, 2)  # three of four moved by one cell, one by two
     found = displacement(asking, asking + moved, (30, 30), (1.0, 0.5))
-    assert found.share == pytest.approx(0.75 + 0.25 * 0.5, abs=0.01)
+    assert found.score == pytest.approx(0.75 + 0.25 * 0.5, abs=0.01)
     assert found.shift_cells == pytest.approx(((0.75 * 1 + 0.125 * 2) / 0.875, 0), abs=0.01)
     assert found.covariance_cells2[2] == pytest.approx(1 / 12)
     assert found.covariance_cells2[0] > found.covariance_cells2[2]
@@ -83,8 +83,8 @@ def test_a_camera_that_looks_down_finds_how_far_it_has_turned(turned_deg):
 def test_a_region_that_many_resemble_agrees_once():
     asking, best = np.arange(20, 27), np.array([120, 121, 121, 121, 121, 121, 150])
     found = displacement(asking, best, (31, 31), (1.0, 1.0, 1.0, 1.0))
-    assert found.agreeing == 2, "120 and 121; 150 has moved by another step"
-    assert found.share == pytest.approx(6 / 7)
+    assert found.coverage == 2 / 31**2, "120 and 121; 150 has moved by another step"
+    assert found.score == pytest.approx(6 / 7)
 
 
 def support_by_hand(asking, regions, reference, step):

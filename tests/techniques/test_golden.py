@@ -19,12 +19,6 @@ def test_filled_bins_is_the_printed_algorithm(seed):
     np.testing.assert_allclose(entropy.filled_bins(image), literal.filled_bins(image), atol=1e-6)
 
 
-@pytest.mark.parametrize("radius", [0, 1, 3, 7])
-def test_filled_bins_of_any_disc(radius):
-    image = textured(3, 33, 40)
-    np.testing.assert_allclose(entropy.filled_bins(image, radius), literal.filled_bins(image, radius), atol=1e-6)
-
-
 def test_filled_bins_of_radius_5_tops_out_below_one():
     all_different = np.add.outer(11 * np.arange(20), np.arange(20)).astype(np.uint8)  # in any 11x11 pixels
     assert entropy.filled_bins(all_different).max() == pytest.approx(np.log2(81) / 8, abs=1e-6)

@@ -30,5 +30,5 @@ def test_nearly_as_many_regions_agree_as_if_all_numbers_were_compared():
     query, place = (technique.encode(scene[at : at + 512, at : at + 512]) for at in (0, 32))
     asking = np.flatnonzero(query.good)
     best = (query.regions[asking] @ place.regions.T).argmax(axis=1)
-    in_full = displacement(asking, best, (31, 31), (1.0, 1.0, 0.75, 0.5)).share
+    in_full = displacement(asking, best, (31, 31), (1.0, 1.0, 0.75, 0.5)).score
     assert technique.match(query, place.fine).score > 0.95 * in_full > 0.4

@@ -32,13 +32,13 @@ def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0) -> np.ndarray
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
     grounds = [_picture(seed) for seed in range(12)]
-    grids = np.stack([placecode.grid(_blocks(_view(ground))) for ground in grounds])
+    grids = np.stack([placecode.grid(_blocks(_view(ground)), np.ones((31, 31), bool))[0] for ground in grounds])
     mean = grids.mean(axis=0)
     return grounds, mean, placecode.pack(grids, mean)
 
 
 def _ask(image: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    return placecode.hypotheses(*placecode.seen_grid(_blocks(image), np.ones((31, 31), bool)), mean)
+    return placecode.hypotheses(*placecode.grid(_blocks(image), np.ones((31, 31), bool)), mean)
 
 
 def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
@@ -70,7 +70,7 @@ def test_what_a_mask_hides_says_nothing(town):
     image[:, 256:] = 0  # part of the aircraft
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
-    grid, in_view = placecode.seen_grid(_blocks(image), seen)
+    grid, in_view = placecode.grid(_blocks(image), seen)
     asked = placecode.hypotheses(grid, in_view, mean)
     assert placecode.scan(asked, codes).argmax() == 2
     assert _best_shift(asked, codes[2]) == [0, 0]

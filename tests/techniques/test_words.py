@@ -45,7 +45,6 @@ def test_words_are_read_and_belong_to_their_file(folder):
     write(folder, words=np.ones((3, 2), np.float16))
     second = words.load_words("tiny", "vlad", 3)
     assert second.sha256 != first.sha256
-    assert second.whitening is None
 
 
 def test_words_that_are_missing_name_the_command(folder):
@@ -66,7 +65,6 @@ def test_words_of_another_network_are_refused(folder):
         ({"words": np.zeros((2, 2), np.float16)}, r"must hold 3 words.*\(2, 2\)"),
         ({"words": np.full((3, 2), np.nan, np.float16)}, "must hold 3 words"),
         ({"words": np.array([{}, {}, {}], object)}, "cannot be read"),
-        ({"whitening": np.zeros((2, 5), np.int8)}, "whitening that does not fit"),
     ],
 )
 def test_damaged_words_are_refused(folder, changes, says):
@@ -80,19 +78,6 @@ def test_a_file_that_is_none_is_refused(folder, content):
     (folder / "tiny_vlad3.npz").write_bytes(content)
     with pytest.raises(ModelError, match="tiny_vlad3"):
         words.load_words("tiny", "vlad", 3)
-
-
-def test_whitening_of_8_bits(folder):
-    rng = np.random.default_rng(1)
-    count, length = 80, 150  # more rows than are multiplied at once
-    mean, scale = rng.normal(size=2 * count).astype(np.float32), rng.random(length).astype(np.float32)
-    whitening = rng.integers(-127, 128, (length, 2 * count)).astype(np.int8)
-    write(folder, count=count, mean=mean, whitening=whitening, whitening_scale=scale)
-    learned = words.load_words("tiny", "vlad", count)
-    assert len(learned.whitening.scale) == length
-    vector = rng.normal(size=2 * count).astype(np.float32)
-    found = learned.whitening(vector)
-    np.testing.assert_allclose(found, literal.whitened(vector, mean, whitening, scale), rtol=1e-3, atol=1e-5)
 
 
 def test_bag_of_words():
