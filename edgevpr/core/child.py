@@ -24,30 +24,25 @@ def ask_child(module: str, job: Any, limit_s: float, what: str) -> Any:
     Raises EdgevprError if the child takes longer or crashes, and for an error that the work itself raised. `what` names
     the work at the beginning of the message, such as "Trying hog".
     """
-    # The child gets its own session, so that only the parent process receives Ctrl-C.
-    process = subprocess.Popen(
-        [sys.executable, "-m", module],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        encoding="utf-8",
-        errors="replace",  # a library may print bytes of a damaged file
-        start_new_session=True,
-    )
     try:
-        answer, said = process.communicate(json.dumps({"parent_pid": os.getpid(), "job": job}), timeout=limit_s)
+        process = subprocess.run(
+            [sys.executable, "-m", module],
+            input=json.dumps({"parent_pid": os.getpid(), "job": job}),
+            capture_output=True,
+            timeout=limit_s,
+            encoding="utf-8",
+            errors="replace",  # a library may print bytes of a damaged file
+            start_new_session=True,  # so that only the parent process receives Ctrl-C
+        )
     except subprocess.TimeoutExpired:
         raise EdgevprError(f"{what} took longer than {limit_s:g} s: it has no end, or is too slow here.") from None
-    finally:
-        process.kill()
-        process.wait()
     if process.returncode < 0:
         hint = "memory ran out" if process.returncode == -signal.SIGKILL else "a library does not suit this processor"
         raise EdgevprError(f"{what} was ended by {signal.Signals(-process.returncode).name}: {hint}.")
     try:
-        reply = json.loads(answer)
+        reply = json.loads(process.stdout)
     except ValueError:  # it failed, or a library has ended it
-        why = (said.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:200]
+        why = (process.stderr.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:200]
         raise EdgevprError(f"{what} failed ({why}): install edgevpr and its packages again.") from None
     if reply["problem"]:
         raise EdgevprError(reply["problem"])
