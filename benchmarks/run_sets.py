@@ -30,7 +30,7 @@ from edgevpr.lab.evaluate.asking import MatchOptions
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate
 from edgevpr.lab.evaluate.knowing import lacking
-from edgevpr.runtime.preflight.accuracy import PATH as ACCURACY
+from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import file_sha256
 

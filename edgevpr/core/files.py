@@ -108,17 +108,15 @@ def require_folder(path: Path) -> None:
         raise UsageError(f"{path}: there is no such folder: make it first.")
 
 
-def write_whole(path: Path, write: Callable[[Path], T], instead: bool = True) -> T:
+def write_whole(path: Path, write: Callable[[Path], T]) -> T:
     """Write a file completely or not at all: call `write` with the path of a temporary file that it must write, flush
     that to the disk, and rename it to `path`. Return the result of `write`. If anything fails, the temporary file is
-    deleted. With `instead`, an existing file is replaced; without it, FileExistsError is raised."""
+    deleted. An existing file is replaced."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         result = write(unfinished)
         with open(unfinished, "rb") as handle:
             os.fsync(handle.fileno())
-        if not instead:
-            open(path, "x").close()  # fails if the file exists; a hard link would be atomic, but FAT has none
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)

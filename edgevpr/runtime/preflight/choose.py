@@ -1,26 +1,62 @@
 """Choice of a technique for a board, by accuracy and cost.
 
-An option is a technique in one form with one number of candidates. The front is the list of all options that fit the
-board, can be trusted, and are not both less accurate and dearer (in CPU time) than another. If a least accuracy is
-asked for, the cheapest of the front that reaches it is chosen, else the most accurate. A technique that accepted a
-wrong place on the image sets is never chosen automatically: its fixes would be sent.
+The accuracy of each technique, for a camera that looks down or forward, is that which `make results` measured on image
+sets. Its figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
+
+An option is a technique in one form with one number of candidates. Of those that fit the board, the most accurate is
+chosen. A technique that accepted a wrong place on the image sets is never chosen automatically: its fixes would be
+sent.
 """
 
+import json
 import math
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 from edgevpr import techniques
-from edgevpr.core.config import LOWEST_RATE_HZ
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.power.boards import Board
-from edgevpr.runtime.preflight import accuracy
-from edgevpr.runtime.preflight.accuracy import Accuracy
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
+ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
 _NAMED = 3  # options whose objections are told where nothing can be chosen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accuracy:
+    """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is right, 0..1, the mean
+    over the `sets` image sets that nothing was tuned on, with `queries` queries in total.
+
+    The other fields are numbers of queries. `asked`: all queries of all image sets, also of those used for tuning.
+    `accepted`: their best place was accepted. `accepted_wrong`: it was accepted, and wrong. `accepted_elsewhere`: it
+    was accepted, and not even a neighbour of the right place.
+    """
+
+    recall_at_1: float
+    sets: int
+    queries: int
+    asked: int
+    accepted: int
+    accepted_wrong: int
+    accepted_elsewhere: int
+
+    @property
+    def beside(self) -> str:
+        """Number of accepted places that were wrong but neighbours of the right one, as text for a table such as
+        " (+3 beside)"; empty for none."""
+        count = self.accepted_wrong - self.accepted_elsewhere
+        return f" (+{count} beside)" if count else ""
+
+    def __str__(self) -> str:
+        return (
+            f"recall@1 {self.recall_at_1:.2f} on {self.sets} image sets, {self.accepted} of {self.asked} accepted, "
+            f"{self.accepted_elsewhere} wrong{self.beside}"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,8 +74,8 @@ class Demand:
 class Fit:
     """Says if a technique fits on a board, and what it takes there. `t_query_s`: wall seconds of a query. `cpu_s`: its
     CPU-seconds of all cores together. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
-    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: most queries per second. `shortfalls`: why it
-    does not fit (empty: it fits). `remedies`: changes that would make it fit, such as "at up to 2 Hz"."""
+    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: most queries per second. `misfit`: reason why
+    it does not fit, as words that follow a name (None: it fits)."""
 
     t_query_s: float
     cpu_s: float
@@ -47,14 +83,7 @@ class Fit:
     map_disk_mb: float
     process_ram_mb: float
     reachable_hz: float
-    shortfalls: tuple[str, ...]
-    remedies: tuple[str, ...] = ()
-
-    @property
-    def misfit(self) -> str | None:
-        """Reason why it does not fit, and what would make it fit, as words that follow a name; None if it fits."""
-        would = f"; it would fit {' or '.join(self.remedies)}" if self.remedies else ""
-        return f"does not fit: {' and '.join(self.shortfalls)}{would}" if self.shortfalls else None
+    misfit: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,80 +121,61 @@ class Option:
 def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
     """Yield the options of the technique `name`: with its default number of candidates, then with each smaller number
     whose accuracy was measured. `label` is technique and form; `costs` are those on `board`."""
-    measured = accuracy.fewer_candidates(label, demand.camera)
+    measured = fewer_candidates(label, demand.camera)
     for candidates in (None, *(count for count in measured if count < (costs.candidates or 0))):
         fewer = replace(costs, candidates=candidates or costs.candidates)
         yield Option(
-            label=accuracy.labelled(label, candidates),
+            label=_labelled(label, candidates),
             name=name,
             candidates=candidates,
             costs=fewer,
             fit=fit(board, fewer, demand),
-            accuracy=accuracy.of(label, demand.camera, candidates),
+            accuracy=accuracy_of(label, demand.camera, candidates),
         )
 
 
-def front(wanted: Iterable[Option]) -> list[Option]:
-    """Return those of the `wanted` options that are on the front (see the module), the cheapest first. An option is
-    trusted if it has no `objection`."""
-    best_so_far: list[Option] = []
-    sound = [option for option in wanted if option.objection is None]
-    for option in sorted(sound, key=lambda option: (option.fit.cpu_s, -option.recall)):
-        if not best_so_far or option.recall > best_so_far[-1].recall:
-            best_so_far.append(option)
-    return best_so_far
+def accuracy_of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
+    """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
 
-
-def best(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> Option | None:
-    """Choose an option of the front: the cheapest with a recall@1 of at least `min_recall` (None: the most accurate).
-    Options of the board's own technique (`board.technique`) go before all others. Returns None if none is suitable.
-
-    Without `min_recall`, the board's own technique is chosen even if it was not measured, since the profile names it.
+    `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
+    if fewer than the technique's default (None: the default).
     """
-    own = [option for option in wanted if option.name == board.technique]
-    unmeasured = [option for option in own if option.accuracy is None and not option.fit.misfit]
-    for among in (own, wanted):
-        reaching = [option for option in front(among) if option.recall >= (min_recall or 0.0)]
-        if reaching:
-            return reaching[0] if min_recall is not None else reaching[-1]
-        if unmeasured and min_recall is None:
-            return unmeasured[0]
-    return None
+    figures = _accuracies()[camera or "forward"].get(_labelled(label, candidates))
+    return Accuracy(**figures) if figures else None
 
 
-def nothing_to_choose(wanted: Sequence[Option], board: Board, min_recall: float | None = None) -> str:
+def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
+    """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
+    names = _accuracies()[camera or "forward"]
+    known = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
+    return tuple(sorted((int(found[1]) for found in known if found), reverse=True))
+
+
+def best(wanted: Sequence[Option], board: Board) -> Option | None:
+    """Choose the most accurate option without an objection, the cheaper one (in CPU time) of two alike. Options of the
+    board's own technique (`board.technique`) go before all others, even if none was measured, since the profile names
+    it. Returns None if no option is suitable."""
+    sound = [option for option in wanted if option.objection is None]
+    own = [option for option in sound if option.name == board.technique]
+    unmeasured = (each for each in wanted if each.name == board.technique and not (each.accuracy or each.fit.misfit))
+    if not own and (named := next(unmeasured, None)):
+        return named
+    return max(own or sound, key=lambda option: (option.recall, -option.fit.cpu_s), default=None)
+
+
+def nothing_to_choose(wanted: Sequence[Option], board: Board) -> str:
     """Return the reason why `best` returned None."""
-    if sound := front(wanted):
-        return f"nothing that fits has a recall@1 of {min_recall:g}; the most is {sound[-1].recall:.2f}"
     against = (f"{option.label} {option.objection}" for option in wanted[:_NAMED])
     return f"nothing is chosen for {board.title} by itself: {', and '.join(against)}"
 
 
 def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     """Check whether a technique fits: its index into the budget of RAM for the map, its process into the board's
-    memory, its queries into the CPU time. If one does not, look for changes of the demand that would make it fit.
+    memory, its queries into the CPU time.
 
     A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
     the share `cpu_share` of the cores.
     """
-    found = _fit(board, costs, demand)
-    if not found.shortfalls:
-        return found
-
-    def would_fit(**change: float) -> bool:
-        return not _fit(board, costs, replace(demand, **change)).shortfalls  # type: ignore[arg-type]  # a field's type
-
-    most_places = bisect_left(range(1, demand.places), True, key=lambda places: not would_fit(places=places))
-    rate_hz, budget_mb = _rounded_down(found.reachable_hz), math.ceil(found.map_ram_mb)
-    remedies = {
-        f"with up to {most_places} places": most_places > 0,
-        f"at up to {rate_hz:g} Hz": rate_hz >= LOWEST_RATE_HZ and would_fit(rate_hz=rate_hz),
-        f"with a budget of {budget_mb} MB": would_fit(budget_mb=budget_mb),
-    }
-    return replace(found, remedies=tuple(remedy for remedy, helps in remedies.items() if helps))
-
-
-def _fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     usable_cores = board.cores * board.cpu_share
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
@@ -187,7 +197,7 @@ def _fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
         map_disk_mb=costs.disk_bytes_per_place * demand.places / 1e6,
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
-        shortfalls=tuple(shortfalls),
+        misfit=f"does not fit: {' and '.join(shortfalls)}" if shortfalls else None,
     )
 
 
@@ -223,6 +233,16 @@ def described(board: Board, option: Option, demand: Demand) -> str:
         f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"
     )
     return f"{figures}; it {found.misfit}" if found.misfit else figures
+
+
+def _labelled(label: str, candidates: int | None) -> str:
+    return label if candidates is None else f"{label}, {candidates} candidates"
+
+
+@cache
+def _accuracies() -> dict[str, dict[str, dict[str, Any]]]:
+    content: dict[str, dict[str, dict[str, Any]]] = json.loads(ACCURACY_PATH.read_text("utf-8"))
+    return content
 
 
 def _rounded_down(value: float) -> float:

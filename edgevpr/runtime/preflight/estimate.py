@@ -7,13 +7,12 @@ measured on some machine. `edgevpr profile` shows it.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from edgevpr.core.errors import UsageError
 from edgevpr.core.types import QueryCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
-from edgevpr.runtime.preflight.choose import Demand, Option, best, front, nothing_to_choose, options
-from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
+from edgevpr.runtime.preflight.choose import Demand, Option, best, nothing_to_choose, options
+from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -22,31 +21,19 @@ class FlightPlan(Demand):
     """Plan of a flight: its demands of a technique (`Demand`), and what its energy is computed from.
 
     `flight_min`: minutes in the air. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's energy
-    that reaches the board, 0..1. `hover_w`: watts that the aircraft draws to hover (None: not given). `min_recall`:
-    least recall@1 asked for (None: the highest that fits). Raises UsageError for a number that is not finite or not
-    above 0.
+    that reaches the board, 0..1. `hover_w`: watts that the aircraft draws to hover (None: not given).
     """
 
     flight_min: float
     pack: Pack
     regulator_efficiency: float
     hover_w: float | None = None
-    min_recall: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("places", "rate_hz", "flight_min", "budget_mb", "hover_w", "min_recall"):
-            value, most = getattr(self, name), 1 if name == "min_recall" else float("inf")
-            if value is not None and not (0 < value <= most and value < float("inf")):
-                below = ", up to 1" if most == 1 else ""
-                raise UsageError(f"`{name}` is {value:g}: give a number above 0{below}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueEstimate:
     """Estimate of one technique, in one form, on the board. `option` has its costs there, its fit and its accuracy.
 
-    `on_front`: it is on the front (see the module `choose`). `measured`: True for costs that were stored earlier, False
-    for costs measured just now.
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
     `flight_mah`: charge that the board draws in the flight. `flight_marginal_mah`: the part of it that the queries add
     (equation 5.7). All charges are drawn from the pack; `flight_pack_frac` is `flight_mah` as a share of its capacity.
@@ -55,8 +42,6 @@ class TechniqueEstimate:
     """
 
     option: Option
-    on_front: bool
-    measured: bool
     query: QueryCost
     flight_mah: float
     flight_marginal_mah: float
@@ -70,17 +55,15 @@ class FlightEstimate:
     """Estimates of all techniques on one board.
 
     `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
-    "unscaled" (this machine's, since the speed score of one of them is missing). `measured_on`: date of the stored
-    figures (None: none were used). `recommended`: label of the option to use (None: there is none). `reason`: why it
-    is recommended, or why none is, in a sentence. `notes`: remarks on the estimate. `unusable`: techniques that cannot
-    be used here, each with the reason.
+    "unscaled" (this machine's, since the speed score of one of them is missing). `recommended`: label of the option
+    to use (None: there is none). `reason`: why it is recommended, or why none is, in a sentence. `notes`: remarks on
+    the estimate. `unusable`: techniques that cannot be used here, each with the reason.
     """
 
     board: str
     title: str
     times: str
     ratios: Ratios | None
-    measured_on: str | None
     plan: FlightPlan
     techniques: tuple[TechniqueEstimate, ...]
     recommended: str | None
@@ -89,40 +72,25 @@ class FlightEstimate:
     unusable: dict[str, str]
 
 
-def estimate(
-    board: Board,
-    here: Board,
-    trials: Iterable[Trial],
-    plan: FlightPlan,
-    map_technique: str | None = None,
-    measured_on: str | None = None,
-) -> FlightEstimate:
-    """Estimate every technique of `trials`, in their order, for a flight of `board`.
-
-    The trials were made on the machine `here`; costs that were stored are of the date `measured_on`. `map_technique` is
-    the technique that an existing map was built with (None: no map).
-    """
+def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
+    """Estimate every technique of `trials`, which were made on the machine `here`, for a flight of `board`."""
     trials = list(trials)
-    wanted: list[tuple[Option, bool]] = []
+    rows: list[TechniqueEstimate] = []
     for trial in trials:
         if trial.costs:
-            work = counted_work(trial.name, {**trial.parameters, **trial.settings})
-            costs = on_board(trial.costs, here, board, work)
+            costs = on_board(trial.costs, here, board, counted_work(trial.name, trial.parameters))
             found = options(board, trial.label, trial.name, costs, plan)
-            wanted += [(option, trial.measured) for option in found]
-    on_front = front(option for option, _ in wanted)
-    rows = tuple(_estimated(option, board, plan, measured, option in on_front) for option, measured in wanted)
+            rows += [_estimated(option, board, plan) for option in found]
     ratio = ratios(here, board)
-    recommended, reason = _recommended(rows, board, plan, map_technique)
+    recommended, reason = _recommended(rows, board, plan)
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)
     return FlightEstimate(
         board=board.name,
         title=board.title,
         times="unscaled" if ratio is None else "measured" if is_same(here, board) else "scaled",
         ratios=ratio,
-        measured_on=measured_on if any(row.measured for row in rows) else None,
         plan=plan,
-        techniques=rows,
+        techniques=tuple(rows),
         recommended=recommended,
         reason=reason,
         notes=(*weights, *_notes(board, here, ratio, plan)),
@@ -130,7 +98,7 @@ def estimate(
     )
 
 
-def _estimated(option: Option, board: Board, plan: FlightPlan, measured: bool, on_front: bool) -> TechniqueEstimate:
+def _estimated(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
     costs, match = option.costs, option.costs.match(plan.places)
     query = query_cost(costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
     flight_s = 60 * plan.flight_min
@@ -146,8 +114,6 @@ def _estimated(option: Option, board: Board, plan: FlightPlan, measured: bool, o
         lost_min, lost_marginal_min = without - recognising, idling - recognising
     return TechniqueEstimate(
         option=option,
-        on_front=on_front,
-        measured=measured,
         query=query,
         flight_mah=idle_mah + marginal_mah,
         flight_marginal_mah=marginal_mah,
@@ -157,28 +123,20 @@ def _estimated(option: Option, board: Board, plan: FlightPlan, measured: bool, o
     )
 
 
-def _recommended(
-    rows: tuple[TechniqueEstimate, ...], board: Board, plan: FlightPlan, map_technique: str | None
-) -> tuple[str | None, str]:
-    """Choose among the options of `map_technique` (None: among all). Returns `recommended` and `reason` as in
-    `FlightEstimate`."""
-    usable = {row.option.label: row for row in rows if map_technique in (None, row.option.name)}
-    served = f"the map was built with {map_technique}, and " if map_technique else ""
-    if not usable:
-        return None, f"None: {served}no technique can be used here."
-    wanted = [row.option for row in usable.values()]
-    taken = best(wanted, board, plan.min_recall)
+def _recommended(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) -> tuple[str | None, str]:
+    """Return `recommended` and `reason` as in `FlightEstimate`."""
+    wanted = [row.option for row in rows]
+    if not wanted:
+        return None, "None: no technique can be used here."
+    taken = best(wanted, board)
     if taken is None:
-        return None, f"None: {served}{nothing_to_choose(wanted, board, plan.min_recall)}."
-    row, fit = usable[taken.label], taken.fit
-    if taken.accuracy is None:
-        why = "it is what the board's profile names, and it was never measured"
-    elif plan.min_recall is None:
+        return None, f"None: {nothing_to_choose(wanted, board)}."
+    row, fit = rows[wanted.index(taken)], taken.fit
+    why = "it is what the board's profile names, and it was never measured"
+    if taken.accuracy:
         why = f"nothing that fits finds more: {taken.accuracy}"
-    else:
-        why = f"it is the cheapest with a recall@1 of at least {plan.min_recall:g}: {taken.accuracy}"
     return taken.label, (
-        f"{taken.label}: {served}{why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+        f"{taken.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
         f"{fit.reachable_hz:.3g} Hz where {plan.rate_hz:g} are asked, {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
         f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh a flight beside the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} of the idle board."
@@ -195,11 +153,10 @@ def _notes(board: Board, here: Board, ratio: Ratios | None, plan: FlightPlan) ->
         )
     elif not is_same(here, board):
         doubt = "" if score.verified and own_score.verified else "unverified; "
-        apart = f"; its products are not known apart: {UNKNOWN_PRODUCTS:g} of its single thread"
         yield (
             f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
             f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({doubt}the board by "
-            f"{score.source}; this machine by {own_score.source}){'' if score.products or score.arm64_mips else apart}."
+            f"{score.source}; this machine by {own_score.source})."
         )
         if score.arm64_mips:
             yield (

@@ -120,9 +120,9 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
 
 
 def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
-    """Copy a network's file and card to the user's models folder, if the network works. The SHA-256 on the card must be
-    that of the file; if the card has none, it is added. Returns the figures of the network and the path of the new
-    card. Raises EdgevprError if the network does not work, or cannot be added."""
+    """Copy a network's file and card to the user's models folder, each completely or not at all, if the network works.
+    The SHA-256 on the card must be that of the file; if the card has none, it is added. Returns the figures of the
+    network and the path of the new card. Raises EdgevprError if the network does not work, or another has its name."""
     card = read_card(card_path, needs_hash=False)
     found = file_sha256(file)
     if card.sha256 not in ("", found):
@@ -135,24 +135,18 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
     verified = verify(tried, threads)
     text = _text_of(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
-    install(file, found, target, card.file, text)
-    return verified, target
-
-
-def install(file: Path, sha256: str, card_path: Path, file_name: str, text: str) -> None:
-    """Copy a network's `file`, whose hash is `sha256`, as `file_name` into the folder of `card_path`, then write the
-    card's `text` there, each completely or not at all. Raises ModelError if another network has either name."""
-    target = card_path.with_name(file_name)
-    card_differs = card_path.exists() and _text_of(card_path) != text
-    if card_differs or (target.exists() and file_sha256(target) != sha256):
+    network = target.with_name(card.file)
+    card_differs = target.exists() and _text_of(target) != text
+    if card_differs or (network.exists() and file_sha256(network) != found):
         raise ModelError(
-            f"{card_path if card_differs else target} is there already and is of another network: take it away, or "
-            "name yours otherwise."
+            f"{target if card_differs else network} is there already and is of another network: take it away, or name "
+            "yours otherwise."
         )
-    card_path.parent.mkdir(parents=True, exist_ok=True)
-    if not target.exists():
-        write_whole(target, lambda unfinished: shutil.copyfile(file, unfinished))
-    write_whole(card_path, lambda unfinished: unfinished.write_text(text, "utf-8"))
+    network.parent.mkdir(parents=True, exist_ok=True)
+    if not network.exists():
+        write_whole(network, lambda unfinished: shutil.copyfile(file, unfinished))
+    write_whole(target, lambda unfinished: unfinished.write_text(text, "utf-8"))
+    return verified, target
 
 
 def _text_of(card_path: Path) -> str:

@@ -10,8 +10,17 @@ from edgevpr.core.errors import MapError, ModelError
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
-from edgevpr.runtime.preflight import accuracy
-from edgevpr.runtime.preflight.choose import Demand, Option, best, described, nothing_to_choose, options, preferred
+from edgevpr.runtime.preflight.choose import (
+    Demand,
+    Option,
+    accuracy_of,
+    best,
+    described,
+    fewer_candidates,
+    nothing_to_choose,
+    options,
+    preferred,
+)
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.preflight.scale import counted_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
@@ -133,7 +142,7 @@ def trusted_candidates(technique: Technique) -> tuple[int, ...]:
     """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
     from the right one on the image sets, largest first."""
     label, camera = _label(technique), _camera(technique)
-    measured = ((count, accuracy.of(label, camera, count)) for count in accuracy.fewer_candidates(label, camera))
+    measured = ((count, accuracy_of(label, camera, count)) for count in fewer_candidates(label, camera))
     return tuple(count for count, figures in measured if figures and not figures.accepted_elsewhere)
 
 

@@ -56,8 +56,7 @@ def ratios(here: Board, board: Board) -> Ratios | None:
     """
     if is_same(here, board):
         return Ratios(1.0, 1.0)
-    mine, other = here.benchmark_score, board.benchmark_score
-    products, own_products, passes, own_passes = _products(other), _products(mine), _passes(other), _passes(mine)
+    (products, passes), (own_products, own_passes) = _speeds(board.benchmark_score), _speeds(here.benchmark_score)
     if not (products and own_products and passes and own_passes):
         return None
     return Ratios(products / own_products, passes / own_passes)
@@ -78,29 +77,25 @@ def on_board(
         return costs
     # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
     # rows of the index is passes.
-    by = {
-        "encode": ratio.products if costs.is_network else ratio.passes,
-        "match_per_place": ratio.passes if costs.candidates is None else ratio.products,
-        "compare_once": ratio.products,
-        "scan_per_place": ratio.passes,
-        "scan_once": ratio.passes,
-    }
-    most_cores = {"encode": board.threads} if costs.is_network else {}
-    times = {
-        stage: _scaled(getattr(costs, stage), by_ratio, board, most_cores.get(stage)) for stage, by_ratio in by.items()
-    }
-    return replace(costs, **times)  # type: ignore[arg-type]  # they are fields of TechniqueCosts
+    encode_by, threads = (ratio.products, board.threads) if costs.is_network else (ratio.passes, None)
+    match_by = ratio.passes if costs.candidates is None else ratio.products
+    return replace(
+        costs,
+        encode=_scaled(costs.encode, encode_by, board, threads),
+        match_per_place=_scaled(costs.match_per_place, match_by, board),
+        compare_once=_scaled(costs.compare_once, ratio.products, board),
+        scan_per_place=_scaled(costs.scan_per_place, ratio.passes, board),
+        scan_once=_scaled(costs.scan_once, ratio.passes, board),
+    )
 
 
-def _products(score: MachineSpeed) -> float | None:
-    counted_hz = score.arm64_mips and 1e6 * score.arm64_mips / float(_counted()["products"])
-    by_single = score.single and UNKNOWN_PRODUCTS * score.single
-    return score.products or (counted_hz / REFERENCE_PRODUCTS_HZ if counted_hz else by_single)
-
-
-def _passes(score: MachineSpeed) -> float | None:
-    counted_hz = score.arm64_mips and 1e6 * score.arm64_mips / float(_counted()["passes"])
-    return score.passes or (counted_hz / REFERENCE_PASSES_HZ if counted_hz else score.single)
+def _speeds(score: MachineSpeed) -> tuple[float | None, float | None]:
+    """Return the speed of one thread at products and at passes, each None if nothing tells it."""
+    products, passes = score.single and UNKNOWN_PRODUCTS * score.single, score.single
+    if mips := score.arm64_mips:
+        products = 1e6 * mips / float(_counted()["products"]) / REFERENCE_PRODUCTS_HZ
+        passes = 1e6 * mips / float(_counted()["passes"]) / REFERENCE_PASSES_HZ
+    return score.products or products, score.passes or passes
 
 
 def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:

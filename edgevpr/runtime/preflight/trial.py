@@ -4,7 +4,7 @@ library that crashes on this processor fails only its own trial.
 `python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints a Trial as JSON.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
-from edgevpr.techniques.card import load_card, weights_of
+from edgevpr.techniques.card import weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long; the check before a flight has no time for that
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
@@ -26,8 +26,8 @@ class Trial:
     unique name.
 
     Once it was tried, it has its `costs`, or the `problem`, a sentence that says why it cannot be used here.
-    `parameters`: all parameters of the technique when it was tried. `model`: fingerprint of its network. `weights`:
-    name of the network's weights (both None: no network). `measured`: the costs were stored earlier.
+    `parameters`: all parameters of the technique when it was tried. `weights`: name of its network's weights (None: no
+    network).
     """
 
     label: str
@@ -35,10 +35,8 @@ class Trial:
     settings: dict[str, Any]
     costs: TechniqueCosts | None = None
     problem: str | None = None
-    model: str | None = None
     weights: str | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
-    measured: bool = False
 
 
 def offers(
@@ -56,45 +54,27 @@ def offers(
     return tuple(listed)
 
 
-def try_each(
-    wanted: Iterable[Trial], threads: int, known: Callable[[Trial], Trial | None] = lambda offer: None
-) -> Iterator[Trial]:
-    """Yield each of the `wanted` trials with its result. `known` returns the result of a trial made earlier (None:
-    there is none; it is made now in a child process). A technique that cannot be used has one result, labelled with its
-    name. `threads`: number of threads for networks."""
+def try_each(wanted: Iterable[Trial], threads: int) -> Iterator[Trial]:
+    """Make each of the `wanted` trials in a child process, and yield it with its result. A technique that cannot be
+    used has one result, labelled with its name. `threads`: number of threads for networks."""
     refused = set()
     for offer in wanted:
-        if trial := known(offer):
-            yield trial
-        elif offer.name not in refused:
+        if offer.name not in refused:
             try:
-                model_of(offer.name, offer.settings)  # raises if the card already shows that it cannot be used
                 job = {"threads": threads, "trial": asdict(offer)}
-                yield trial_of(ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}"))
+                answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}")
+                yield build(Trial, answer, "a trial")
             except EdgevprError as error:
                 refused.add(offer.name)
                 yield replace(offer, label=offer.name, problem=str(error))
 
 
-def model_of(name: str, settings: dict[str, Any]) -> str | None:
-    """Return the fingerprint of the network that a technique would use now; None if it uses none. Raises ModelError."""
-    parameters = techniques.parameters(name)
-    if "threads" not in parameters:  # every network has this parameter, and nothing else has
-        return None
-    return load_card(settings.get("model") or parameters.get("model", name)).fingerprint
-
-
-def trial_of(fields: dict[str, Any]) -> Trial:
-    """Make a Trial from the output of `asdict`. Raises ConfigError for anything else."""
-    return build(Trial, fields, "a trial")
-
-
 def _try_here(job: dict[str, Any]) -> dict[str, Any]:
-    offer = trial_of(job["trial"])
+    offer = build(Trial, job["trial"], "a trial")
     technique = made_for(job["threads"], offer.name, offer.settings)
-    costs, spec = probe(technique, tried_s=_TRIED_S), technique.spec
-    model, weights = model_of(offer.name, offer.settings), weights_of(spec)
-    return asdict(replace(offer, costs=costs, model=model, weights=weights, parameters=spec.parameters))
+    spec = technique.spec
+    costs = probe(technique, tried_s=_TRIED_S)
+    return asdict(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters))
 
 
 if __name__ == "__main__":

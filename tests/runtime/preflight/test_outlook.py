@@ -8,7 +8,7 @@ from example_costs import REGIONS
 from edgevpr.core.config import load_config
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight import accuracy, pick
+from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.pick import outlook, trusted_candidates
 from edgevpr.runtime.recognise.opening import open_recogniser
 
@@ -58,10 +58,10 @@ def test_only_numbers_that_accepted_nothing_wrong_are_for_the_governor(recording
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
         assert trusted_candidates(recogniser.technique) == (20, 10)
-        measured = accuracy.of
+        measured = pick.accuracy_of
         with monkeypatch.context() as changed:
             wrong = replace(measured("cohog", "forward", 10), accepted_elsewhere=1)
-            changed.setattr(accuracy, "of", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
+            changed.setattr(pick, "accuracy_of", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
             assert trusted_candidates(recogniser.technique) == (20,)
     config = load_config(None, {"map": str(recording / "cohog.gpkg"), "match.matching": "thesis"})
     recogniser = open_recogniser(config, load_board("this"))
