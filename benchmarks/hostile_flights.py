@@ -65,11 +65,7 @@ def behind_s(fixes: Sequence[ReceivedFix], sent_s: dict[int, float]) -> np.ndarr
     its position was sent to the time that it gives for its own."""
     east_m = [to_metres(fix.lat_deg, fix.lon_deg)[0] for fix in fixes]
     numbers = (np.array(east_m) - _BEGIN_EAST_M) / _STEP_M
-    return _claimed_s(fixes) - np.interp(numbers, list(sent_s), list(sent_s.values()))
-
-
-def _claimed_s(fixes: Sequence[ReceivedFix]) -> np.ndarray:
-    return np.array([fix.t_sent_s - fix.processing_s for fix in fixes])
+    return np.array([fix.t_frame_s for fix in fixes]) - np.interp(numbers, list(sent_s), list(sent_s.values()))
 
 
 def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
@@ -120,7 +116,7 @@ def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Pat
         fixes = received()
     camera.close()
     begin_s = 0.0 if stream.is_whole else camera.sent_s[film.whole_at_first]
-    fixes = [fix for fix, claimed_s in zip(fixes, _claimed_s(fixes), strict=True) if claimed_s > begin_s]
+    fixes = [fix for fix in fixes if fix.t_frame_s > begin_s]
     older_s = behind_s(fixes, camera.sent_s)
     return {
         "stream": stream.name,

@@ -19,7 +19,6 @@ from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.ports import Port, open_port
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
-DEFAULT_VEHICLE = "arduplane"
 _QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
 _WAITING_BYTES = 65_536  # of a port that accepts none: messages beyond that are lost
 
@@ -56,12 +55,11 @@ def run_autopilot(
     stop: threading.Event | None = None,
     *,
     track: FlownTrack | None = None,
-    vehicle: str = DEFAULT_VEHICLE,
+    vehicle: str = "arduplane",
     gps: bool = False,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
-    """Simulate an autopilot at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost. Its UTC is that of
-    this machine.
+    """Simulate an autopilot at `link_url` with `serve`. Its UTC is that of this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
@@ -76,7 +74,8 @@ def run_autopilot(
 
 
 def serve(controller: FlightController, link_url: str, stop: threading.Event | None = None) -> AutopilotSummary:
-    """Connect `controller` to `link_url` until one of the events that end `run_autopilot`; return what it received."""
+    """Connect `controller` to `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
+    received."""
     address = parse_link(link_url)
     try:
         transport = open_port(address)
@@ -141,7 +140,7 @@ class _Conversation:
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256
         if sender == self._companion and not _is_question(message):
-            self._controller.begin()
+            self._controller.brain.motion.begin(self._controller.brain.now_s)
         if message.get_type() == "HEARTBEAT":
             is_companion = message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER
             if is_companion or self._companion is None:

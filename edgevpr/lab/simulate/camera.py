@@ -46,8 +46,8 @@ class CameraPose:
     """Position and attitude of the camera. Positions are metres from the scene's south-west corner and over its ground.
     Angles are degrees of the airframe: heading clockwise from north, roll right wing down, pitch nose up."""
 
-    east_m: float
-    north_m: float
+    east_m: float = 0.0
+    north_m: float = 0.0
     height_m: float
     heading_deg: float
     roll_deg: float = 0.0

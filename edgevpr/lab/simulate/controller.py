@@ -21,22 +21,19 @@ VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "px4-copter": lambda motion: Px4("copter", motion),
     "px4-plane": lambda motion: Px4("plane", motion),
 }
-_START_UTC_S = 1_770_000_000.0  # the UTC at its start, unless given
 _HEARTBEAT_HZ = 1.0
 # Messages that do not exist where the position of the vehicle is unknown.
 _WHERE = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ReceivedFix:
-    """An accepted position fix as it arrived. `t_sent_s` and `processing_s` are as sent: the sender's clock at sending,
-    and the age of the position then."""
+    """An accepted position fix as it arrived. `t_frame_s` is the time of the position, by the sender's clock."""
 
     lat_deg: float
     lon_deg: float
     accuracy_m: float
-    t_sent_s: float
-    processing_s: float
+    t_frame_s: float
 
 
 class FlightController:
@@ -46,7 +43,7 @@ class FlightController:
     `brain` is the simulated firmware."""
 
     def __init__(
-        self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = _START_UTC_S
+        self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = 1_770_000_000.0
     ) -> None:
         if vehicle not in VEHICLES:
             raise UsageError(f"There is no vehicle {vehicle!r}: choose one of {', '.join(VEHICLES)}.")
@@ -63,7 +60,6 @@ class FlightController:
         self._interval_s = dict(self._default_s)
         self._due_s = dict.fromkeys(self._interval_s, 0.0)
         self.brain.start_utc_s = start_utc_s
-        self._has_begun = False
         if not gps:
             self.brain.lose_gps()
 
@@ -79,12 +75,6 @@ class FlightController:
     def set(self, name: str, value: float) -> None:
         """Set a parameter, as PARAM_SET does. For example, SIM_GPS1_ENABLE 0 switches GPS off."""
         self.brain.parameters.set(name, value)
-
-    def begin(self) -> None:
-        """Note that an onboard computer in flight has been heard. The first call starts the motion along the track."""
-        if not self._has_begun:
-            self._has_begun = True
-            self.brain.motion.begin(self.brain.now_s)
 
     def advance(self, now_s: float) -> list[Message]:
         """Simulate up to `now_s` in steps of STEP_S seconds; return the messages sent meanwhile."""
@@ -128,7 +118,12 @@ class FlightController:
         is_known = number in self.reports or number in SILENT
         match command.command:
             case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE if command.get_type() == "COMMAND_INT":
-                return self._judge(command), []  # PX4 would take it as COMMAND_LONG too, with a latitude in float32
+                # PX4 would take it as COMMAND_LONG too, with a latitude in float32.
+                self.answers.append(result := self.brain.take_fix(command))
+                if result == OK:
+                    t_frame_s = command.param1 - command.param2
+                    self.fixes.append(ReceivedFix(command.x / 1e7, command.y / 1e7, command.param3, t_frame_s))
+                return result, []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if is_known:
                 self._stream(number, command.param2)
                 return OK, []
@@ -153,21 +148,6 @@ class FlightController:
     def _made(self, number: int) -> list[Message]:
         message = self.reports[number](self.brain) if number in self.reports else None
         return [message] if message else []
-
-    def _judge(self, command: Message) -> int:
-        result = self.brain.take_fix(command)
-        self.answers.append(result)
-        if result == OK:
-            self.fixes.append(
-                ReceivedFix(
-                    lat_deg=command.x / 1e7,
-                    lon_deg=command.y / 1e7,
-                    accuracy_m=command.param3,
-                    t_sent_s=command.param1,
-                    processing_s=command.param2,
-                )
-            )
-        return result
 
     def _set_origin(self, message: Message) -> list[Message]:
         lat_deg, lon_deg = message.latitude / 1e7, message.longitude / 1e7

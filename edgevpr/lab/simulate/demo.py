@@ -4,8 +4,7 @@ import json
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.wholeflight import flight_of
 
 _SEED = 1
@@ -55,76 +53,30 @@ _LEGEND = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedAnswer:
-    """One query: `at` is the position where it was taken, `named` that of the place recognised. Distances from `at` in
-    metres: `error_m` to that place, `nearest_m` to the nearest place of the map, and `fix_off_m` to the fix (None: the
-    match was not accepted)."""
+    """One query: `at` is the position where it was taken, `named` that of the place recognised. `is_right`: that place
+    is near enough; `on_map`: the map has such a place. `fix_off_m` is the distance from `at` to the fix, in metres
+    (None: the match was not accepted)."""
 
     query: str
     reference_image: str
     at: Position
     named: Position
     score: float
-    error_m: float
-    nearest_m: float
+    is_right: bool
+    on_map: bool
     fix_off_m: float | None
-
-    @property
-    def right(self) -> bool:
-        return self.error_m <= RIGHT_M
-
-    @property
-    def on_map(self) -> bool:
-        """True where the map has a right place for the query."""
-        return self.nearest_m <= RIGHT_M
 
     @property
     def colour(self) -> tuple[int, int, int]:
         """The colour of its outcome in the picture."""
         if self.fix_off_m is None:
             return _REJECTED
-        return _RIGHT if self.right else _WRONG
+        return _RIGHT if self.is_right else _WRONG
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DemoSummary:
-    """Results of the demonstration. `costs` are means over the queries, by the names in the flight log. `used_mah` is
-    the charge of the whole flight, `marginal_mah` the part of it that recognising added. `heard` is the summary of the
-    simulated flight controller, by the names of `AutopilotSummary`."""
-
-    places: int
-    answers: list[JudgedAnswer]
-    costs: dict[str, float]
-    used_mah: float
-    marginal_mah: float
-    heard: dict[str, Any]
-    picture: Path
-
-    def __str__(self) -> str:
-        on_map = [answer for answer in self.answers if answer.on_map]
-        accepted = [answer for answer in self.answers if answer.fix_off_m is not None]
-        errors_m = [answer.fix_off_m or 0.0 for answer in accepted] or [np.nan]
-        off_map = len(self.answers) - len(on_map)
-        off_map_rejected = off_map - sum(not answer.on_map for answer in accepted)
-        recall = sum(answer.right for answer in on_map) / max(len(on_map), 1)
-        cost = self.costs
-        return f"""
-places            {self.places} in the map
-queries           {len(self.answers)}: {len(on_map)} over the map, {off_map} beyond it
-recall@1          {recall:.2f} of those over the map (best place within {RIGHT_M:g} m)
-accepted          {len(accepted)}, {sum(not answer.right for answer in accepted)} of them wrong
-rejected          {len(self.answers) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
-position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
-largest {max(errors_m):.1f} m \
-(of the accepted; places are 21 m apart)
-a query           {1000 * cost["cpu_s"]:.0f} ms of CPU (encode {1000 * cost["t_encode_s"]:.0f} ms, \
-match {1000 * cost["t_match_s"]:.0f} ms), {cost["rss_mb"]:.0f} MB of RAM
-battery           {self.used_mah:.3f} mAh, {self.marginal_mah:.3f} mAh of them for recognising
-flight controller {self.heard["fixes_accepted"]} position fixes accepted, {self.heard["fixes_denied"]} denied
-picture           {self.picture}"""
-
-
-def run_demo(folder: str | Path) -> DemoSummary:
-    """Generate both flights, map the first one, fly the second one against a simulated flight controller.
+def run_demo(folder: str | Path) -> str:
+    """Generate both flights, map the first one, fly the second one against a simulated flight controller; return what
+    came out, as text.
 
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails.
@@ -141,42 +93,48 @@ def run_demo(folder: str | Path) -> DemoSummary:
     ):
         for _ in progress(write_flight(folder / name, scene, flight), len(flight.poses), label):
             pass
-    heard = _flown(folder, len(later.poses))
+    heard = _flown(folder)
     answers = read_answers(log_path, folder / "flight-1", folder / "flight-2")
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
-    lines = list(flight_of(log_path))
-    costs = [line["costs"] for line in lines if line["kind"] == "query"]
-    return DemoSummary(
-        places=len(mapping.poses),
-        answers=answers,
-        costs={name: sum(cost[name] for cost in costs) / len(costs) for name in costs[0]},
-        used_mah=lines[-1]["used_mah"],
-        marginal_mah=lines[-1]["marginal_mah"],
-        heard=heard,
-        picture=picture_path,
-    )
+    return f"""{summary_of(answers)}
+flight controller {heard["fixes_accepted"]} position fixes accepted, {heard["fixes_denied"]} denied
+picture           {picture_path}
+page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
 
-def _flown(folder: Path, queries: int) -> dict[str, Any]:
+def summary_of(answers: Sequence[JudgedAnswer]) -> str:
+    """Return the results as text."""
+    on_map = [answer for answer in answers if answer.on_map]
+    accepted = [answer for answer in answers if answer.fix_off_m is not None]
+    errors_m = [answer.fix_off_m or 0.0 for answer in accepted] or [np.nan]
+    off_map = len(answers) - len(on_map)
+    off_map_rejected = off_map - sum(not answer.on_map for answer in accepted)
+    recall = sum(answer.is_right for answer in on_map) / max(len(on_map), 1)
+    return f"""
+queries           {len(answers)}: {len(on_map)} over the map, {off_map} beyond it
+recall@1          {recall:.2f} of those over the map (best place within {RIGHT_M:g} m)
+accepted          {len(accepted)}, {sum(not answer.is_right for answer in accepted)} of them wrong
+rejected          {len(answers) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
+position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
+largest {max(errors_m):.1f} m (of the accepted; places are 21 m apart)"""
+
+
+def _flown(folder: Path) -> dict[str, Any]:
     """Map the first flight of a demonstration and fly the second one; return the report of the flight controller."""
-    map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
+    map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
+    build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
+    fly = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
     # The flight controller is started first: it listens long before the map is built.
     command = _command("simulate", "autopilot", "--link", f"udpin:{address}", "--json")
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as autopilot:
         try:
-            build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
-            mapping = _command(*build)
-            _require_success(mapping, subprocess.run(mapping, stdout=subprocess.DEVNULL).returncode)
-            flags = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
-            flying = _command("run", "--map", map_path, "--source", second, *_CAMERA, *flags)
-            with subprocess.Popen(flying, stdout=subprocess.DEVNULL) as flight:
-                for _ in progress(_queries(log_path, flight), queries, "flying"):
-                    pass
-            _require_success(flying, flight.returncode)
+            for step in (build, ("run", "--map", map_path, "--source", second, *_CAMERA, *fly)):
+                done = subprocess.run(_command(*step), stdout=subprocess.DEVNULL)
+                _require_success(done.args, done.returncode)
         finally:
             autopilot.terminate()
         said, _ = autopilot.communicate()
@@ -187,17 +145,6 @@ def _flown(folder: Path, queries: int) -> dict[str, Any]:
 
 def _command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "edgevpr", *map(str, arguments)]
-
-
-def _queries(log_path: Path, flight: subprocess.Popen[bytes]) -> Iterator[int]:
-    """Follow the growing flight log until the flight ends, and yield the number of each query in it, from 0."""
-    seen, ended = 0, False
-    while not ended:
-        ended = flight.poll() is not None
-        done = sum(line["kind"] == "query" for line in read_log(log_path)) if log_path.exists() else 0
-        yield from range(seen, done)
-        seen = done
-        time.sleep(0.1)
 
 
 def _require_success(command: list[str], code: int) -> None:
@@ -222,8 +169,8 @@ def read_answers(log_path: Path, mapped: Path, flown: Path) -> list[JudgedAnswer
                     at=at,
                     named=named,
                     score=line["score"],
-                    error_m=_apart_m(at, named),
-                    nearest_m=min(_apart_m(at, place) for place in places.values()),
+                    is_right=_apart_m(at, named) <= RIGHT_M,
+                    on_map=any(_apart_m(at, place) <= RIGHT_M for place in places.values()),
                     fix_off_m=_apart_m(at, Position(fix["lat_deg"], fix["lon_deg"])) if line["accepted"] else None,
                 )
             )

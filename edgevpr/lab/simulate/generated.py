@@ -1,10 +1,9 @@
 """Two flights over one generated landscape: the first makes a map; the second comes back hours later and also leaves
 the mapped land. `edgevpr simulate flight` writes them, and `demo` flies them."""
 
-import csv
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timezone
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image
 from edgevpr.core.geodesy import EARTH_RADIUS_M
 from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.brush import Scene
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
 from edgevpr.lab.simulate.landscape import make_scene
@@ -88,32 +88,41 @@ def later_flight(seed: int) -> GeneratedFlight:
 
 
 def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> Iterator[str]:
-    """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position and attitude of every image.
+    """Write the pictures of a flight over a scene with `write_shots`."""
+    ground = lit(scene, flight.light, flight.seed)
+    rng = np.random.default_rng((flight.seed, 3))
+
+    def shots() -> Iterator[tuple[GeoTag, Image]]:
+        for number, pose in enumerate(flight.poses):
+            tag = GeoTag(
+                position=to_position(pose),
+                heading_deg=pose.heading_deg % 360,
+                t_utc_s=flight.start_utc.timestamp() + number * flight.interval_s,
+                roll_deg=pose.roll_deg,
+                pitch_deg=pose.pitch_deg,
+                height_m=pose.height_m,
+            )
+            yield tag, photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
+
+    return write_shots(Path(folder), shots(), flight.camera.jpeg_quality)
+
+
+def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], quality: int) -> Iterator[str]:
+    """Write `folder`/images/*.jpg, and in the end `folder`/positions.csv with the true position and attitude of each.
+    A shot is its tag and its picture, uint8 (H, W, 3) BGR; without a picture it is left out.
 
     Yields the name of every image once it is written. Raises OSError where the folder cannot be written.
     """
-    ground = lit(scene, flight.light, flight.seed)
-    rng = np.random.default_rng((flight.seed, 3))
-    images = Path(folder) / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    with open(Path(folder) / "positions.csv", "w", encoding="utf-8", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon", "alt", "rel_alt", "yaw_deg", "roll_deg", "pitch_deg", "time"))
-        for number, pose in enumerate(flight.poses):
-            name, at = f"frame_{number:04d}.jpg", to_position(pose)
-            taken = flight.start_utc + timedelta(seconds=number * flight.interval_s)
-            where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
-            attitude = (f"{pose.heading_deg % 360:.2f}", f"{pose.roll_deg:.2f}", f"{pose.pitch_deg:.2f}")
-            frame = photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
-            write_jpeg(images / name, frame, flight.camera.jpeg_quality)
-            table.writerow((name, *where, *attitude, f"{taken:%Y:%m:%d %H:%M:%S}"))
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    written: dict[str, GeoTag] = {}
+    for number, (tag, picture) in enumerate(shots):
+        if picture is not None:
+            name = f"frame_{number:04d}.jpg"
+            _, jpeg = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))
+            (folder / "images" / name).write_bytes(jpeg.tobytes())
+            written[name] = tag
             yield name
-
-
-def write_jpeg(path: Path, picture: Image, quality: int) -> None:
-    """Write a picture, uint8 (H, W, 3) BGR, as JPEG. Raises OSError where it cannot be written."""
-    _, jpeg = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))
-    path.write_bytes(jpeg.tobytes())
+    write_positions(folder / "positions.csv", written)
 
 
 def fly_and_write(folder: Path, which: str, seed: int) -> str:

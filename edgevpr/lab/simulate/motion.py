@@ -9,10 +9,7 @@ from pathlib import Path
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.types import Position
 from edgevpr.frames.positions import read_positions
-
-_FASTEST_M_S = 327.0  # the largest that GLOBAL_POSITION_INT can hold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +41,7 @@ class Motion:
     is_known = False
 
     def begin(self, now_s: float) -> None:
-        """Note that at `now_s` an onboard computer in flight was first heard."""
+        """Note that at `now_s` an onboard computer in flight was heard."""
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move for `dt_s` seconds, up to `now_s`, and return the state then."""
@@ -61,7 +58,7 @@ class AlongTrack(Motion):
         self._start_s = math.inf
 
     def begin(self, now_s: float) -> None:
-        self._start_s = now_s
+        self._start_s = min(self._start_s, now_s)
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
         return truth_at(self._track, max(0.0, now_s - self._start_s))
@@ -69,30 +66,27 @@ class AlongTrack(Motion):
 
 def read_track(csv_path: str | Path) -> list[TrueState]:
     """Read the rows of a positions.csv with position and time, sorted by time. Raises UsageError if there are none."""
-    timed = [
-        (tag.t_utc_s, tag) for tag in read_positions(csv_path).values() if tag.position and tag.t_utc_s is not None
-    ]
-    if not timed:
-        raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
-    timed.sort(key=lambda each: each[0])
     track = []
-    for t_utc_s, tag in timed:
-        at = tag.position or Position(0.0, 0.0)
-        angles = (math.nan if each is None else each for each in (tag.roll_deg, tag.pitch_deg, tag.heading_deg))
-        roll_deg, pitch_deg, heading_deg = angles
-        track.append(
-            TrueState(
-                lat_deg=at.lat_deg,
-                lon_deg=at.lon_deg,
-                alt_m=at.alt_m or 0.0,
-                height_m=math.nan if tag.height_m is None else tag.height_m,
-                roll_deg=roll_deg,
-                pitch_deg=pitch_deg,
-                heading_deg=heading_deg,
-                t_s=t_utc_s - timed[0][0],
+    for tag in read_positions(csv_path).values():
+        if tag.position and tag.t_utc_s is not None:
+            angles = (math.nan if each is None else each for each in (tag.roll_deg, tag.pitch_deg, tag.heading_deg))
+            roll_deg, pitch_deg, heading_deg = angles
+            track.append(
+                TrueState(
+                    lat_deg=tag.position.lat_deg,
+                    lon_deg=tag.position.lon_deg,
+                    alt_m=tag.position.alt_m or 0.0,
+                    height_m=math.nan if tag.height_m is None else tag.height_m,
+                    roll_deg=roll_deg,
+                    pitch_deg=pitch_deg,
+                    heading_deg=heading_deg,
+                    t_s=tag.t_utc_s,
+                )
             )
-        )
-    return track
+    if not track:
+        raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
+    start_s = min(state.t_s for state in track)
+    return sorted((replace(state, t_s=state.t_s - start_s) for state in track), key=lambda state: state.t_s)
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:
@@ -105,13 +99,12 @@ def truth_at(track: FlownTrack, t_s: float) -> TrueState:
     ahead = track[leg]
     share = (t_s - passed.t_s) / (ahead.t_s - passed.t_s)
     way_m = from_to(passed.lat_deg, passed.lon_deg, ahead.lat_deg, ahead.lon_deg)
-    east_m_s, north_m_s = (each / (ahead.t_s - passed.t_s) for each in (way_m.real, way_m.imag))
     return replace(
         passed,
         lat_deg=passed.lat_deg + share * (ahead.lat_deg - passed.lat_deg),
         lon_deg=passed.lon_deg + share * (ahead.lon_deg - passed.lon_deg),
         alt_m=passed.alt_m + share * (ahead.alt_m - passed.alt_m),
-        velocity_m_s=complex(*(max(-_FASTEST_M_S, min(_FASTEST_M_S, each)) for each in (east_m_s, north_m_s))),
+        velocity_m_s=way_m / (ahead.t_s - passed.t_s),
         t_s=t_s,
     )
 

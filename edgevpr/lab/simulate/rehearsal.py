@@ -12,11 +12,10 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, offset_m
 from edgevpr.core.types import Position
-from edgevpr.frames.positions import GeoTag, read_positions, write_positions
+from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
-from edgevpr.lab.simulate.generated import wander, write_jpeg
-from edgevpr.mapmaking.cuttings import MOST_WITHOUT_DATA
-from edgevpr.mapmaking.lattice import extent_words
+from edgevpr.lab.simulate.generated import wander, write_shots
+from edgevpr.mapmaking.cuttings import MOST_WITHOUT_DATA, extent_words
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
@@ -78,16 +77,9 @@ def poses_of(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     for shot, sway in zip(shots, sways.T.tolist(), strict=True):
         is_told = shot.roll_deg is not None or shot.pitch_deg is not None
         roll_deg, pitch_deg, yaw_deg = (shot.roll_deg or 0.0, shot.pitch_deg or 0.0, 0.0) if is_told else sway
-        poses.append(
-            CameraPose(
-                east_m=0.0,
-                north_m=0.0,
-                height_m=shot.height_m or 0.0,
-                heading_deg=((shot.heading_deg or 0.0) + yaw_deg) % 360,
-                roll_deg=roll_deg,
-                pitch_deg=pitch_deg,
-            )
-        )
+        heading_deg = ((shot.heading_deg or 0.0) + yaw_deg) % 360
+        over_m = shot.height_m or 0.0
+        poses.append(CameraPose(height_m=over_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
     return poses
 
 
@@ -118,28 +110,24 @@ def seen_from(
 def write_rehearsal(
     folder: Path, orthophoto: Orthophoto, shots: list[GeoTag], fov_deg: float, seed: int
 ) -> Iterator[str]:
-    """Write `folder`/images/*.jpg, and `folder`/positions.csv with the true position and attitude of every picture.
-
-    Yields the name of each picture once it is written; those that would show ground beyond the orthophoto are left out.
-    Raises UsageError if that leaves none, and OSError if the folder cannot be written.
-    """
+    """Write the pictures with `write_shots`; those that would show ground beyond the orthophoto are left out. Raises
+    UsageError if that leaves none."""
     camera = Camera()
     camera = replace(camera, focal_px=float(camera.width / 2 / np.tan(np.radians(fov_deg / 2))))
     rng = np.random.default_rng((seed, 3))
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    written: dict[str, GeoTag] = {}
-    for number, (shot, pose) in enumerate(zip(shots, poses_of(shots, seed), strict=True)):
-        picture = seen_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
-        if picture is not None:
-            name = f"frame_{number:05d}.jpg"
-            written[name] = replace(
-                shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg
-            )
-            write_jpeg(folder / "images" / name, picture, camera.jpeg_quality)
-            yield name
-    if not written:
+
+    def taken() -> Iterator[tuple[GeoTag, Image | None]]:
+        for shot, pose in zip(shots, poses_of(shots, seed), strict=True):
+            picture = seen_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
+            tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
+            yield tag, picture
+
+    names = write_shots(folder, taken(), camera.jpeg_quality)
+    first = next(names, None)
+    if first is None:
         raise UsageError(
             f"No picture of the track shows {orthophoto.path}, which is at {extent_words(orthophoto.extent_deg)}: "
             "pictures that leave it are not taken."
         )
-    write_positions(folder / "positions.csv", written)
+    yield first
+    yield from names

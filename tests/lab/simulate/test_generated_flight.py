@@ -11,7 +11,7 @@ import pytest
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.camera import ground_to_pixel
-from edgevpr.lab.simulate.demo import DemoSummary, read_answers
+from edgevpr.lab.simulate.demo import read_answers, summary_of
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -104,19 +104,13 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
             log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted, located=located)
         log.write("end")
     answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map", tmp_path / "query")
-    assert [(answer.on_map, answer.right) for answer in answers] == [(True, True), (True, False), (False, False)]
-    assert answers[0].error_m == pytest.approx(11.12, abs=0.01)
+    assert [(answer.on_map, answer.is_right) for answer in answers] == [(True, True), (True, False), (False, False)]
     assert [answer.fix_off_m for answer in answers] == [
         pytest.approx(5.56, abs=0.01),
         pytest.approx(88.96, abs=0.1),
         None,
     ]
-    heard = {"fixes_accepted": 0, "fixes_denied": 0}
-    heard = {"fixes_accepted": 0, "fixes_denied": 0}
-    costs = dict.fromkeys(("cpu_s", "t_encode_s", "t_match_s", "rss_mb"), 0.0)
-    summary = {"costs": costs, "used_mah": 0.0, "marginal_mah": 0.0, "picture": tmp_path}
-    said = str(DemoSummary(places=2, answers=answers, heard=heard, **summary)).split("\n")
-    assert [re.findall(r"[\d.]+", line) for line in said[2:7]] == [
+    assert [re.findall(r"[\d.]+", line) for line in summary_of(answers).split("\n")[1:]] == [
         ["3", "2", "1"],  # queries, on the map, beyond it
         ["1", "0.50", "55"],
         ["2", "1"],  # accepted, wrong

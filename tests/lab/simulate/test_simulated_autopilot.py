@@ -121,10 +121,10 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
 
 
 def test_it_says_how_fast_it_flies_along_the_track():
-    points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001), (21.0, 51.0, 8.0)
+    points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001)
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
-    velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 20.5, 30.0)]
-    expected = [11.12j, 11.12j, 7.15 + 0j, -71.47 + 327j, 0j]
+    velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
+    expected = [11.12j, 11.12j, 7.15 + 0j, 0j]
     assert [each.real for each in velocities] == pytest.approx([each.real for each in expected], abs=0.01)
     assert [each.imag for each in velocities] == pytest.approx([each.imag for each in expected], abs=0.01), (
         "north first"
