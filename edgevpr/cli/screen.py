@@ -5,7 +5,7 @@ import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from typing import Any, TextIO
+from typing import TextIO
 
 from edgevpr.core.text import shown
 
@@ -20,14 +20,10 @@ def guarded_output() -> Iterator[None]:
 
 
 class LineFormatter(logging.Formatter):
-    """Formats each log message as one line, so that a file name with a line break cannot fake a second message. The
-    traceback that follows an unexpected error keeps its lines."""
+    """Formats each log message as one line, so that a file name with a line break cannot fake a second message."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return shown(super().formatMessage(record))
-
-    def formatException(self, ei: Any) -> str:
-        return shown(super().formatException(ei), keep="\n")
 
 
 class _Guarded(io.TextIOBase):

@@ -2,8 +2,10 @@
 function returns the lines of one result; JSON has the same values by their names (see `show`)."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from edgevpr.cli.shared import lines_of
 from edgevpr.core.text import aligned, nines, shown
 
 if TYPE_CHECKING:
@@ -99,14 +101,7 @@ def of_check(found: "MapCheck") -> Iterator[str]:
 def of_networks(found: Sequence["Listed"], folders: list[str]) -> Iterator[str]:
     """Yield the networks on this machine: what each is, and what uses it, or why it cannot be used."""
     for each in found:
-        yield f"{each.name:<20} {'WRONG' if each.problem else 'ok   '}  {each.title or ''}"
-        if each.title:
-            unused = f"none, unless told: --param model={each.name}"
-            yield f"{'':<27} {each.licence}; {each.source}"
-            yield f"{'':<27} {each.file}; {' and '.join(each.outputs)}"
-            yield f"{'':<27} used by {', '.join(each.techniques) or unused}"
-        if each.problem:
-            yield f"{'':<27} {each.problem}"
+        yield from lines_of({each.name: {name: value for name, value in asdict(each).items() if name != "name"}})
     yield f"{len(found)} networks in {' and '.join(folders)}"
 
 
