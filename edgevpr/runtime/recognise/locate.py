@@ -7,13 +7,13 @@ the same position, and their mean is more exact. Without a pose, as ahead, the p
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.core.arrays import Covariance, Doubles
 from edgevpr.core.geodesy import axes_of, moved, offset_m
-from edgevpr.core.types import Candidate, Pose, Position
+from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
@@ -60,30 +60,17 @@ class Located:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Lies:
-    """Estimate of how the query lies on a place, which has this id, position and pose. `step` (2,) is the shift from
-    the place's middle to the query's middle, to the right and down, as a share of the place's longest side, with its
-    `covariance` (2, 2). `rotation_deg` and `height_ratio` are as in `FineMatch`."""
+class _Said:
+    """Position of the aircraft as computed from one place. `at_m` (2,) is metres east and north of the best place. It
+    has two covariances (2, 2): `of_step` by the errors of the match, `of_pose` by those of the place's pose.
+    `rotation_deg` and `height_ratio`, of the query on the place, are as in `FineMatch`."""
 
     place_id: int
-    position: Position
-    pose: Pose
-    step: Doubles
-    covariance: Doubles
-    rotation_deg: float
-    height_ratio: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Said:
-    """Position of the aircraft as computed from one place (`lies`). `at_m` (2,) is metres east and north of the best
-    place. It has two covariances (2, 2): `of_step` by the errors of the match, `of_pose` by those of the place's
-    pose."""
-
-    lies: _Lies
     at_m: Doubles
     of_step: Doubles
     of_pose: Doubles
+    rotation_deg: float
+    height_ratio: float | None
 
     def agrees_with(self, other: "_Said") -> bool:
         """Return True if both positions are about the same. Relative to each other, poses are known far better than on
@@ -109,34 +96,34 @@ def located(
     and the first five with at least half of the best one's score determine the position. Those with such a score whose
     position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
     """
-    best = _by_vote(found[0], cells)
-    if best is None:
+    best, pose, aside = found[0].place, found[0].place.pose, view.aside or (0.0, 0.0)
+    first = _said(found[0], best, cells, aside)
+    if first is None or best.position is None or pose is None:
         return None
-    laid = [(candidate.match.score, _by_vote(candidate, cells)) for candidate in found]
-    heard = [(score, lies) for score, lies in laid if lies and _shows_the_same(lies, best)]
+    others = ((each.match.score, _said(each, best, cells, aside)) for each in found[1:])
+    said = [(found[0].match.score, first), *((score, each) for score, each in others if each)]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
-        heard.insert(0, (heard[0][0], _by_landmarks(best, proof)))
-    said = [(score, _said(lies, best.position, view.aside or (0.0, 0.0))) for score, lies in heard]
-    first, least = said[0][1], _LIKE_THE_BEST * found[0].match.score
+        first = _said(found[0], best, cells, aside, proof) or first
+        said.insert(0, (found[0].match.score, first))
+    least = _LIKE_THE_BEST * found[0].match.score
     agreeing = [(score, each) for score, each in said if first.agrees_with(each)]
     at_m, covariance = _joined([each for score, each in agreeing if score >= least][:_SAYING])
-    way, footprint_m = first.lies, best.pose.footprint_m
     if view.lean_m is not None:
         at_m = at_m + view.lean_m
     elif view.aside is None:
-        covariance += (UNTOLD_TILT * footprint_m * (way.height_ratio or 1.0)) ** 2 * np.eye(2)
+        covariance += (UNTOLD_TILT * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, apart_m = None, [(score, float(np.hypot(*(each.at_m - first.at_m)))) for score, each in said]
-    against = [(score, off_m) for score, off_m in apart_m if score >= least and off_m > _CONTRADICTS * footprint_m]
+    against = [(score, off_m) for score, off_m in apart_m if score >= least and off_m > _CONTRADICTS * pose.footprint_m]
     if sum(score for score, _ in against) > _OUTWEIGHS * sum(score for score, _ in agreeing):
         objection = f"places of the same ground say positions that are {max(against)[1]:.0f} m apart"
     lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
         position=Position(lat_deg, lon_deg, best.position.alt_m),
         covariance_m2=triple(covariance),
-        heading_deg=(best.pose.up_deg + way.rotation_deg) % 360,
-        height_ratio=way.height_ratio and way.height_ratio * view.zoom,
-        footprint_m=footprint_m * (way.height_ratio or 1.0),
-        places=tuple(dict.fromkeys(each.lies.place_id for _, each in agreeing)),
+        heading_deg=(pose.up_deg + first.rotation_deg) % 360,
+        height_ratio=first.height_ratio and first.height_ratio * view.zoom,
+        footprint_m=pose.footprint_m * (first.height_ratio or 1.0),
+        places=tuple(dict.fromkeys(each.place_id for _, each in agreeing)),
         objection=objection,
     )
 
@@ -185,61 +172,49 @@ def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
     return at_m, of_step + np.mean([each.of_pose for each in said], axis=0)
 
 
-def _by_vote(candidate: Candidate, cells: int | None) -> _Lies | None:
-    """Return how the query lies on a place by the shift of its match, the displacement vote; None if the match has no
-    shift or rotation, or the place no pose. `cells` is as in `located`."""
-    match, place = candidate.match, candidate.place
+def _said(
+    found: Candidate, best: Place, cells: int | None, aside: tuple[float, float], proof: Agreement | None = None
+) -> _Said | None:
+    """Compute the position of the aircraft from one place, by the shift of its match or, with `proof`, by the landmarks
+    that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture is too far
+    away to show the same ground. `cells` is as in `located`, and `aside` as in `View`."""
+    match, place, pose = found.match, found.place, found.place.pose
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
-    if place.position is None or place.pose is None:
+    if place.position is None or pose is None or best.position is None or best.pose is None:
         return None
-    covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
-    # The match's covariance is that of single votes; their mean has a fraction of it.
-    covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
-    return _Lies(
-        place_id=place.place_id,
-        position=place.position,
-        pose=place.pose,
-        step=np.array(match.shift_cells) / cells,
-        covariance=covariance,
-        rotation_deg=match.rotation_deg,
-        height_ratio=match.height_ratio,
-    )
-
-
-def _by_landmarks(best: _Lies, proof: Agreement) -> _Lies:
-    """Return how the query lies on the best place by its landmarks: `best` with shift, rotation and scale of
-    `proof`."""
-    covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
-    step, rotation_deg = np.array(proof.shift_share), proof.rotation_deg or 0.0
-    return replace(best, step=step, covariance=covariance, rotation_deg=rotation_deg, height_ratio=proof.scale)
-
-
-def _shows_the_same(lies: _Lies, best: _Lies) -> bool:
-    """Return True if both places can show the middle of the query: their own middles are not too far apart."""
-    room_m = (lies.pose.footprint_m + best.pose.footprint_m) / 2
-    return float(np.hypot(*_off_m(best.position, lies.position))) <= room_m
-
-
-def _said(lies: _Lies, origin: Position, aside: tuple[float, float]) -> _Said:
-    """Compute the position of the aircraft from one place. `origin` is the position of the best place, and `aside` the
-    point below the aircraft in the query's picture, as in `View`."""
-    pose = lies.pose
+    off_m = _off_m(best.position, place.position)
+    if float(np.hypot(*off_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
+        return None
+    if proof:
+        rotation_deg, height_ratio, step = proof.rotation_deg or 0.0, proof.scale, np.array(proof.shift_share)
+        covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
+    else:
+        rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
+        # The match's covariance is that of single votes; their mean has a fraction of it.
+        covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
+        covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
-    ratio, turn = lies.height_ratio or 1.0, math.radians(lies.rotation_deg)
+    ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
     right, up = aside
-    dx = lies.step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
-    dy = lies.step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
+    dx = step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
+    dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
     axes = axes_of(pose.up_deg)
-    off_m = pose.footprint_m * (axes @ (dx, -dy))
-    length_m = float(np.hypot(*off_m))
-    towards = off_m / length_m if length_m else np.zeros(2)
+    step_m = pose.footprint_m * (axes @ (dx, -dy))
+    length_m = float(np.hypot(*step_m))
+    towards = step_m / length_m if length_m else np.zeros(2)
     aslant = np.array([-towards[1], towards[0]])
-    of_pose = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
-    of_pose += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
-    upwards = lies.covariance * [[1, -1], [-1, 1]]  # y up instead of down
-    of_step = pose.footprint_m**2 * (axes @ upwards @ axes.T) + of_pose
-    return _Said(lies, _off_m(origin, lies.position) + off_m, of_step, matrix_of(pose.covariance_m2))
+    by_length = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
+    by_length += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
+    upwards = covariance * [[1, -1], [-1, 1]]  # y up instead of down
+    return _Said(
+        place_id=place.place_id,
+        at_m=off_m + step_m,
+        of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
+        of_pose=matrix_of(pose.covariance_m2),
+        rotation_deg=rotation_deg,
+        height_ratio=height_ratio,
+    )
 
 
 def _off_m(origin: Position, position: Position) -> Doubles:
