@@ -1,7 +1,6 @@
-"""What the tests of this room share: trees of files that stand for a machine's /proc and /sys, and a fake clock."""
+"""What the tests of this room share: trees of files that stand for a machine's /proc and /sys."""
 
 import pytest
-from fakes import FakeClock
 
 
 @pytest.fixture
@@ -16,8 +15,3 @@ def tree(tmp_path):
         return tmp_path
 
     return write
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()

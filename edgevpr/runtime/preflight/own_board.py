@@ -14,7 +14,7 @@ from edgevpr.runtime.preflight.scale import is_same
 
 def write_profile(path: Path) -> str:
     """Measure this machine and write its profile to a new file, completely or not at all: the speed by the
-    micro-benchmark (two seconds), the power by the machine's meter, if it has one (two minutes). Returns a sentence on
+    micro-benchmark (two seconds), the power by the machine's meter, if it has one (a minute). Returns a sentence on
     the power.
 
     Raises UsageError before the work if the name does not end in .yaml, the folder does not exist, or the file exists
@@ -30,9 +30,8 @@ def write_profile(path: Path) -> str:
     board, power = own_profile(micro_benchmark()), NO_METER
     if meter := next(iter(find_meters()), None):
         said = f"measuring power with the {meter.title}: load"
-        fit = calibrate(meter, progress=lambda share: print(f"{said} {share:.0%}", file=sys.stderr))
-        board = fit.applied_to(board, meter)
-        power = f"Power: {fit.idle_w:.3g} W idle, {fit.full_w:.3g} W with every core busy: {board.source}."
+        board = calibrate(board, meter, progress=lambda share: print(f"{said} {share:.0%}", file=sys.stderr))
+        power = f"Power: {board.idle_w:.3g} W idle, {board.full_w:.3g} W with every core busy: {board.source}."
     write_whole(path, lambda unfinished: unfinished.write_text(profile_text(board), "utf-8"))
     return power
 

@@ -1,6 +1,7 @@
 """The profile of this machine, as measured; and the speed that costs measured here are scaled from."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -27,8 +28,8 @@ def test_the_score_that_is_scaled_from_is_measured_unless_both_are_published():
     assert scaled_from(x86, x86) == x86
 
 
-def meter_at(held, watts, title="INA3221 (hwmon1), channel VDD_IN", certain=True):
-    return Meter(title=title, look=lambda: watts(held[-1]), certain=certain)
+def meter_at(held, watts):
+    return SimpleNamespace(title="INA3221 (hwmon1), channel VDD_IN", read_w=lambda: watts(held[-1]))
 
 
 @pytest.fixture
@@ -62,11 +63,14 @@ def test_without_a_meter_the_power_is_that_of_a_shipped_profile_and_it_is_said(m
     assert load_board(str(tmp_path / "mine.yaml")).benchmark_score == SCORE
 
 
-def test_a_meter_that_says_nonsense_leaves_no_file(monkeypatch, tmp_path, held):
-    monkeypatch.setattr(calibrate, "find_meters", lambda: (meter_at(held, lambda share: float("nan")),))
+def test_a_meter_that_says_nonsense_leaves_no_file(monkeypatch, tmp_path):
+    for name in ("in1_input", "curr1_input"):
+        (tmp_path / name).write_text("nan")
+    monkeypatch.setattr(calibrate, "find_meters", lambda: (Meter(tmp_path, 1, "VDD_IN"),))
+    monkeypatch.setattr(calibrate.time, "sleep", lambda seconds: None)
     with pytest.raises(MeterError, match="nan W"):
         write_profile(tmp_path / "mine.yaml")
-    assert not list(tmp_path.iterdir())
+    assert not (tmp_path / "mine.yaml").exists()
 
 
 def test_a_file_is_never_overwritten(tmp_path):
