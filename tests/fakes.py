@@ -15,10 +15,10 @@ from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import Fixes, Sending
+from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
 from edgevpr.mavlink.peer import Listener
-from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock

@@ -14,8 +14,8 @@ from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.motion import TrueState
+from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Fix, Severity
-from edgevpr.mavlink.requests import Wish
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.clock import Clock
 

@@ -14,11 +14,10 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
+from edgevpr.mavlink.ground import PAUSED, Requests, Texts, Wish, Wished
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
-from edgevpr.mavlink.requests import Requests, Wish, Wished
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
-from edgevpr.mavlink.texts import Texts
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
 
 MESSAGES_MAX = 64
@@ -35,8 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """The settings of a link.
-
+    """The settings of a link:
     - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
     - `max_fix_age_s`: a fix that has waited longer, in seconds, is never sent.
     - `clock`: the monotonic clock, in seconds, of all time stamps of the link.
@@ -61,8 +59,8 @@ class LinkSettings:
 class Conversation:
     """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
     `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, and the count of messages `sent`, by
-    name. Use it inside turns only. `copy_message` is called with every queued message but the fixes, `copy_text` with
-    every text: for the link to the ground."""
+    name. `copy_message` is called with every queued message, `copy_text` with every text: for the link to the ground.
+    """
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -92,8 +90,8 @@ class Conversation:
 
     @property
     def waits(self) -> bool:
-        """True if a message or a text waits to be sent."""
-        return bool(self._messages or self.texts)
+        """True if a message or a text waits to be sent, or a fix for its answer."""
+        return bool(self._messages or self.texts or self.fixes)
 
     def send(self, *outgoing: Message) -> None:
         """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
@@ -104,7 +102,7 @@ class Conversation:
 
     def send_fix(self, fix: Fix) -> Sending:
         """Queue a position fix. It is sent within `max_fix_age_s` seconds, and only while the autopilot is heard, or
-        never. The returned `Sending` holds the outcome as soon as that is known."""
+        never. The returned `Sending` will hold the outcome."""
         return self.fixes.put(fix, self._clock())
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
@@ -117,18 +115,15 @@ class Conversation:
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """From now on request the autopilot's reports of position, its accuracy, attitude and height: at once, and
-        again whenever the reports of position or attitude have stopped."""
+        """From now on request the autopilot's reports of position, attitude and so on, and again whenever they stop."""
         self._ask_position_s = self._clock()
 
     def offer(self, wishes: Collection[Wish]) -> None:
-        """Set which requests to the flight (see `Wish`) are accepted from ground stations from now on; the others are
-        refused. Before the first call all are refused."""
+        """Set which requests to the flight are accepted from ground stations from now on; at first none is."""
         self.requests.offered = wishes
 
     def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the requests to the flight that ground stations have made, and that were accepted, since the last
-        call; each with its sender."""
+        """Return the requests to the flight that were accepted since the last call, each with its sender."""
         return self.requests.take()
 
     def vehicle(self) -> Vehicle | None:
@@ -136,10 +131,9 @@ class Conversation:
         return self.autopilot.vehicle
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame. Roll
-        and pitch are None if no attitude was received within 0.3 s of it. `t_fix_s` is when the newest fix was sent
-        that may be part of the reported position; on a continuous channel it is now. Returns None as `vehicle` does:
-        before the first report, and if the last one had no position."""
+        """Return the last report, with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame, as
+        far as velocity and attitude are known; None as `vehicle` does. Roll and pitch are None if no attitude was
+        received within 0.3 s of it. On a continuous channel, `t_fix_s` is now."""
         vehicle = self.autopilot.vehicle_at(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
@@ -184,7 +178,6 @@ class Conversation:
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
                 if news := self.autopilot.identity.news:
-                    self.fixes.forget_row()
                     self.fixes.break_off("another autopilot has taken its place")
                     self.announce(Severity.WARNING, news, "autopilot")
             if self.autopilot.answer:
@@ -194,9 +187,8 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Stop waiting for answers that take more than a second. Queue a text for the ground station about each change
-        since the last call: the autopilot falls silent or is heard again; fixes are no longer answered or are answered
-        again; fixes are refused or accepted again."""
+        """Queue a text for the ground station about each change since the last call: the autopilot falls silent or is
+        heard again; fixes are answered in another way, or not in time (see `Fixes.news`)."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)
         if is_there and self._is_there is False:
@@ -210,8 +202,7 @@ class Conversation:
             self.announce(*news)
 
     def break_off(self, lost_fixes: int) -> None:
-        """Reset what ends when the port is lost: the wait for answers to fixes, the presence of the autopilot, and
-        incomplete messages. `lost_fixes` is the number of fixes thrown away with the port."""
+        """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
         self.autopilot.forget_presence()
         self.reader.forget_partial_message()
@@ -231,7 +222,7 @@ class Conversation:
             self._ask_for_position(system_id, now_s)
             if self.channel.is_continuous and (state := self._state(system_id, now_s)):
                 return state, None
-            if why := self.requests.why_no_fix() or self.fixes.why_not(now_s):
+            if why := PAUSED if self.requests.is_paused else self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif sending := self.fixes.next(now_s):
                 if self.channel is Channel.SENSOR:
@@ -249,7 +240,7 @@ class Conversation:
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel: a position or, once, the origin of the autopilot's local
-        frame. None: it is not due yet, or the position or the origin is not known."""
+        frame. None: it is not due, or something is not known."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
@@ -285,8 +276,7 @@ class Conversation:
             self.send(*messages.report_requests(system_id, self.autopilot.firmware, self._asked_for_state))
 
     def _hear_request(self, message: Message, now_s: float) -> None:
-        us = self._packer.srcSystem, self._packer.srcComponent
-        self.send(*self.requests.hear(message, us, now_s))
+        self.send(*self.requests.hear(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
     def _hear_answer(self, answer: str, now_s: float) -> None:
         readiness = self.autopilot.readiness

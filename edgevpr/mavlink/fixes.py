@@ -1,10 +1,9 @@
-"""Position fixes on their way to the autopilot: the fixes that wait to be sent, those that wait for an answer, and the
-processing of the answers. Used by `conversation` inside turns only (see `turns`).
+"""Position fixes on their way to the autopilot: those that wait to be sent, and those that wait for an answer. Used by
+`conversation` inside turns only (see `turns`).
 
 A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
-answers, so it is matched to the oldest fix sent less than a second ago. With one fix a second, and an answer within
-some tens of milliseconds, there is only one such fix. After a second a fix counts as unanswered, so that after a
-lost answer others are matched wrongly for a second at most. An answer that matches no fix is only counted.
+answers, so it is matched to the oldest fix sent less than a second ago: with one fix a second, and an answer within
+some tens of milliseconds, there is only one such fix. An answer that matches no fix is only counted.
 """
 
 import logging
@@ -14,29 +13,25 @@ from dataclasses import dataclass
 from threading import Event
 
 from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.mavlink.ground import News
 from edgevpr.mavlink.messages import Fix, Severity
-from edgevpr.mavlink.texts import News
 from edgevpr.mavlink.vehicle import GPS_IN_USE, Reason
 
 FIXES_MAX = 8
 # The longest that a fix may wait, from `put` on and in all buffers together, unless the configuration says another.
-# This limits what the link adds to the age of a frame; types.FIX_MAX_AGE_S limits the age itself, which is mostly the
-# time that matching took and which the autopilot is told. A fix must keep both limits.
+# types.FIX_MAX_AGE_S limits the age of its frame, which the autopilot is told. A fix must keep both limits.
 MAX_FIX_WAIT_S = 1.0
 UNANSWERED_MAX = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
 TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent at this interval
-# An answer takes some tens of milliseconds, over a radio up to half a second. This time after
-# the last fix, the stop of the sending is announced; this time after the first answer, all older answers have arrived.
-ANSWERED_WITHIN_S = 1.0
+ANSWERED_WITHIN_S = 1.0  # an answer takes some tens of milliseconds, over a radio up to half a second
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class FixAnswer:
-    """The autopilot's answer to a fix: `result` is the name of a MAV_RESULT, `why` the reason for a refusal in words
-    (None: accepted), `latency_s` the time from sending to answer. `result` and `latency_s` are None if no answer came
-    in time."""
+    """The autopilot's answer to a fix: `result` is the name of a MAV_RESULT (None: none came in time), `why` the reason
+    in words (None: accepted), `latency_s` the time from sending to answer."""
 
     result: str | None
     why: str | None
@@ -46,7 +41,7 @@ class FixAnswer:
 class Sending:
     """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False with the
     reason in `why`. `t_sent_s` is when the fix was handed to the port, `outcome` the answer of the autopilot; both are
-    None until then. Once the fix is queued, only the link's thread changes these fields."""
+    None until then."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -58,7 +53,7 @@ class Sending:
 
     @property
     def answer(self) -> str | None:
-        """The autopilot's answer, the name of a MAV_RESULT; None if there is none (yet)."""
+        """The name of a MAV_RESULT; None if there is no answer (yet)."""
         return self.outcome.result if self.outcome else None
 
     def settle(self, sent: bool, why: str | None = None) -> None:
@@ -86,17 +81,13 @@ class Fixes:
         self._last_answer: tuple[str, Reason] | None = None
         self._news: list[News] = []  # the newest about an answer
         self._sent_s = -math.inf
-        self.forget_row()
+        self._row = 0  # fixes without an answer, in a row
+        self._is_stopped = False  # as the ground station was last told
+        self._resumes_s = -math.inf
 
     def __len__(self) -> int:
         """Return the number of fixes that wait for their answers."""
         return len(self._under_way)
-
-    def forget_row(self) -> None:
-        """Restart the count of unanswered fixes in a row: the fixes so far went to another autopilot."""
-        self._row = 0
-        self._is_stopped = False  # as the ground station was last told
-        self._resumes_s = -math.inf
 
     @property
     def t_fix_s(self) -> float:
@@ -117,12 +108,11 @@ class Fixes:
         return sending
 
     def next(self, now_s: float) -> Sending | None:
-        """Drop the fixes that have waited too long; return the oldest of the others, or None if there is none."""
+        """Drop the fixes that have waited too long; return the oldest of the others, None without any."""
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
     def drop_stale(self, now_s: float) -> None:
-        """Drop the fixes that have waited too long."""
         for sending in self._waiting:
             if now_s > sending.due_s:
                 self._drop(sending, f"no autopilot was there to take it within {self._max_wait_s:g} s")
@@ -136,7 +126,7 @@ class Fixes:
         self._waiting.clear()
 
     def why_not(self, now_s: float) -> str | None:
-        """Return the reason why no fix may be sent now, or None if one may be sent."""
+        """Return the reason why no fix may be sent now (None: it may)."""
         if self._row >= UNANSWERED_MAX and now_s - self._sent_s < TRIED_AGAIN_AFTER_S:
             return "not sent: five fixes in a row had no answer"
         if now_s < self._resumes_s:
@@ -144,8 +134,7 @@ class Fixes:
         return None
 
     def note_sent(self, sending: Sending, now_s: float, has_answer: bool) -> None:
-        """Note that a fix was handed to the port. Without `has_answer` its message is one that is never answered, and
-        the autopilot is assumed to use it."""
+        """Note that a fix was handed to the port. Without `has_answer` its message is one that is never answered."""
         sending.t_sent_s = now_s
         if has_answer:
             self._row += 1
@@ -164,7 +153,7 @@ class Fixes:
 
     def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
         """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns the fix that it is
-        matched to, or None if no fix waits. Any answer ends the series of unanswered fixes."""
+        matched to, or None if no fix waits."""
         if self._is_stopped:
             # The answers to all those fixes may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWERED_WITHIN_S
@@ -191,7 +180,7 @@ class Fixes:
         return sending
 
     def time_out(self, now_s: float) -> None:
-        """Stop waiting for the answers to the fixes sent more than a second ago; they count as unanswered."""
+        """Count the fixes sent more than a second ago as unanswered."""
         while self._under_way and self._under_way[0][1].sent and now_s - self._under_way[0][0] > ANSWERED_WITHIN_S:
             self._give_up(f"it had no answer within {ANSWERED_WITHIN_S:g} s")
 
@@ -201,9 +190,8 @@ class Fixes:
             self._give_up(reason)
 
     def news(self, why_silent: Reason, now_s: float) -> list[News]:
-        """Return the texts for the ground station about what has changed since the last call: the sending of fixes has
-        stopped, because none is answered (for the likely reason `why_silent`), or has resumed; or the autopilot answers
-        fixes in another way than before."""
+        """Return texts for the ground station about what has changed since the last call: fixes are no longer answered
+        (for the likely reason `why_silent`) or are answered again, or are answered in another way."""
         self.time_out(now_s)
         is_stopped, news = self._row >= UNANSWERED_MAX, self._news
         self._news = []
@@ -225,7 +213,7 @@ class Fixes:
         sending.settle(False, why)
 
     def _give_up(self, reason: str) -> None:
-        """Stop waiting for the answer to the oldest fix sent; the autopilot may use that fix all the same."""
+        """Give up the oldest fix sent; the autopilot may use it all the same."""
         sent_s, sending = self._under_way.popleft()
         self._taken_s = max(self._taken_s, sent_s)
         if sending.sent:

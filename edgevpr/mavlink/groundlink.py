@@ -1,11 +1,10 @@
 """The second link, to a ground station. It gets copies of the status messages and texts of the first link, and never a
 position fix. Used by the flight where `mavlink.ground` is set.
 
-No message is forwarded from one link to the other. That is the work of a router: here it would let a stranger on the
-ground speak to the flight controller.
+No message is forwarded from one link to the other: that would let a stranger on the ground speak to the flight
+controller.
 """
 
-import math
 import time
 from collections.abc import Callable
 from copy import copy
@@ -17,14 +16,11 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import Message, mavlink
 
 FOR_PEOPLE = frozenset(("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS"))
-# With two stations at one listening port, the first is answered until its heartbeats (1 Hz) have stopped for this time.
-SILENT_AFTER_S = 5.0
 
 
 class GroundLink(Link):
-    """The link to the ground station, beside the link `flight` to the flight controller. It sends the system id,
-    component id and health that `flight` sends. It has its own thread and port, so that a lost ground station delays no
-    fix, but shares the turns of `flight` (see `turns`)."""
+    """The link to the ground station, beside the link `flight` to the flight controller. It has its own thread and
+    port, so that a lost ground station delays no fix, but shares the turns of `flight`."""
 
     name = "ground"
 
@@ -48,35 +44,25 @@ class GroundLink(Link):
 
 
 class GroundConversation(Conversation):
-    """The conversation with a ground station: it sends heartbeats and what is queued, and obeys requests. No sender on
-    this link is taken for the autopilot."""
+    """The conversation with a ground station: it sends heartbeats and what is queued, and obeys requests of any sender,
+    none of which is taken for the autopilot."""
 
     def __init__(self, flight: Conversation, settings: LinkSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings, clock)
         self.requests = flight.requests
         self._flight = flight
-        self._station: Sender | None = None
-        self._station_heard_s = -math.inf
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message, with the health and the system id of the link to the flight controller.
-        Returns None if nothing is due, else the packet, and None in place of a fix."""
+        """Choose and pack the next message, with the health and the system id of the link to the flight controller."""
         self._health, self._health_set_s = self._flight._health, self._flight._health_set_s
         self._packer.srcSystem = self._flight._packer.srcSystem
         return super().next_packet()
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
-        """Process bytes received from `sender` at `now_s`. Returns True if they contain a heartbeat of the ground
-        station to which we answer. Requests are obeyed from every sender."""
+        """Process bytes received from `sender` at `now_s`. Returns True if they contain the heartbeat of a ground
+        station: the one that beat last is answered."""
         beats = False
         for message in self.reader.feed(data, sender):
-            if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS:
-                beats |= self._is_answered(sender, now_s)
+            beats |= message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS
             self._hear_request(message, now_s)
         return beats
-
-    def _is_answered(self, sender: Sender | None, now_s: float) -> bool:
-        if sender != self._station and now_s - self._station_heard_s <= SILENT_AFTER_S:
-            return False
-        self._station, self._station_heard_s = sender, now_s
-        return True

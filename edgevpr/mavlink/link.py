@@ -15,8 +15,7 @@ from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
-from edgevpr.mavlink.line import Line
-from edgevpr.mavlink.ports import Port, open_port
+from edgevpr.mavlink.ports import Line, Port, open_port
 from edgevpr.mavlink.turns import Turns
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
@@ -38,12 +37,10 @@ class LinkStats:
     """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
     `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
-    from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or because a
-    ground station has paused the flight. `refused_why` says why the last refused fix was refused (None: none was).
-    `commands` counts the commands addressed to us on any link, by result, and `ignored_requests` the other messages to
-    us that had no effect.
-    `refused_signatures` counts the messages whose signature or time stamp is wrong, by reason. `reopened` is how many
-    times the port was opened again, `bad_bytes` the number of received bytes that belong to no valid message.
+    from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or because of
+    a pause. `refused_why` is about the last refused fix (None: none was). `commands` and `ignored_requests` count the
+    requests on any link (see `Requests`). `refused_signatures` are counted by reason. `reopened` is how many times the
+    port was opened again, `bad_bytes` the number of received bytes that belong to no valid message.
     """
 
     connected: bool
@@ -67,15 +64,13 @@ class LinkStats:
 
     @property
     def fixes_sent(self) -> int:
-        """Number of position fixes sent."""
         return self.sent.get("COMMAND_INT", 0)
 
 
 def _in_turn(
     method: Callable[Concatenate[Conversation, P], T], *, sends: bool = False
 ) -> Callable[Concatenate["Link", P], T]:
-    """Make a method of `Link` from one of `Conversation`: it calls that method inside a turn. If it `sends`, the link's
-    thread is woken."""
+    """Make a method of `Link` that calls one of `Conversation` inside a turn and, if it `sends`, wakes the thread."""
 
     def done_in_turn(link: "Link", /, *values: P.args, **named: P.kwargs) -> T:
         with link.turn(method.__name__):
@@ -89,9 +84,8 @@ def _in_turn(
 
 
 class Link:
-    """The link to one flight controller. It sends the queued messages and a heartbeat once a second, receives, and
-    reopens the port whenever the connection is lost. `Conversation` decides what is sent, and processes what is
-    received.
+    """The link to one flight controller. It sends, receives, and reopens the port whenever the connection is lost.
+    `Conversation` decides what is sent, and processes what is received.
 
     All methods but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
     """
@@ -114,11 +108,8 @@ class Link:
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 
     def start(self) -> None:
-        """Open the port and start the thread.
-
-        Raises LinkError for a fault that only the user can correct. A missing device or server is no error: the thread
-        tries to open it again and again, and `stats` gives the reason.
-        """
+        """Open the port and start the thread. Raises LinkError for a fault that only the user can correct. A missing
+        device or server is no error: the thread tries to open it again and again, and `stats` gives the reason."""
         try:
             self._line = self._opened()
         except OSError as error:
@@ -130,7 +121,7 @@ class Link:
 
     def turn(self, what: str) -> AbstractContextManager[None]:
         """Return a context manager that takes a turn: until it ends, the link sends and processes nothing and its time
-        stands still, so that several calls act at the same moment. `what` names the turn on the tape."""
+        stands still. `what` names the turn on the tape."""
         return self._turns.taken(what)
 
     send = _in_turn(Conversation.send, sends=True)
@@ -154,7 +145,6 @@ class Link:
             return self._tape.read("port", self._port)[0] and self._conversation.autopilot.listens(self._turns.now_s())
 
     def stats(self) -> LinkStats:
-        """Return the counts and the state of the link."""
         with self.turn("stats"):
             said, autopilot, fixes = self._conversation, self._conversation.autopilot, self._conversation.fixes
             connected, trouble, reopened = self._tape.read("port", self._port)
@@ -180,8 +170,7 @@ class Link:
             )
 
     def close(self) -> None:
-        """Send the queued messages and texts, wait for the answers to the fixes sent, both for half a second at most,
-        and close the port."""
+        """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
         with self.turn("close"):
             self._conversation.texts.hurry()
         self._closing.set()
@@ -291,7 +280,7 @@ class Link:
         self._note_trouble(error)
 
     def _close_line(self) -> int:
-        """Close the port, if it is open, and return the number of fixes thrown away with it."""
+        """Close the port, and return the number of fixes thrown away with it."""
         line, self._line = self._line, None
         return line.close() if line else 0
 
@@ -306,8 +295,7 @@ class Link:
         with suppress(OSError):
             while self._line and self._line.port.connected and time.monotonic() < give_up_s:
                 self._turn(self._line, timeout_s=0.01)
-                is_all_answered = not len(self._conversation.fixes)  # so that the final counts include all answers
-                if not self._conversation.waits and self._line.is_idle and is_all_answered:
+                if not self._conversation.waits and self._line.is_idle:
                     break
 
     def _close_all(self) -> None:

@@ -1,6 +1,5 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
-Used by the link and the flight. A position goes out as command 43003 or message 296 (single fixes), or as GPS_INPUT or
-ODOMETRY (a continuous position).
+Used by the link and the flight.
 
 `t_mono_s` is a time of the system's monotonic clock in seconds, the only clock of a link: an autopilot keeps a single
 time correction for all messages of a link.
@@ -41,10 +40,7 @@ class Severity(IntEnum):
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A position fix: latitude and longitude of the vehicle at `t_frame_s`, when the frame was taken (monotonic clock),
-    and `accuracy_m`, the standard deviation of one axis.
-
-    Raises ValueError for a position off the Earth, for an accuracy that is not finite and above zero, and for a time
-    that is not finite.
+    and `accuracy_m`, the standard deviation of one axis. Raises ValueError for what is no position, accuracy or time.
     """
 
     lat_deg: float
@@ -80,22 +76,14 @@ class MotionState:
 
 def heartbeat(health: Health) -> Message:
     """Make the HEARTBEAT (0) of an onboard computer."""
-    return mavlink.MAVLink_heartbeat_message(
-        type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-        autopilot=mavlink.MAV_AUTOPILOT_INVALID,
-        base_mode=0,
-        custom_mode=0,
-        system_status=health,
-        mavlink_version=3,
-    )
+    kind, autopilot = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, system_status=health, mavlink_version=3)
 
 
 def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
-
-    The time from `fix.t_frame_s` to `t_sent_s` is sent as the processing time, which tells the autopilot how old the
-    position is. `t_sent_s` is sent as a float32: accurate to 8 ms after one day, to 60 ms after ten days.
-    """
+    The age of the fix is sent as the processing time, and `t_sent_s` as a float32: accurate to 8 ms after one day, to
+    60 ms after ten days."""
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
         target_component=AUTOPILOT,
@@ -168,7 +156,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
     ArduPilot computes a standard deviation as the cube root of the sum of the squared variances
     (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
-    the height is sent as zero, because the height is not measured by us.
+    the height, which we do not measure, is sent as zero.
     """
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     east, north, down = state.velocity_m_s
@@ -204,8 +192,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
-    (511). Many autopilots send none of these reports to a companion computer unless asked. `firmware` is a
-    MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more reports, at higher rates."""
+    (511). `firmware` is a MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more, at higher rates."""
     rates_hz = _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
@@ -279,10 +266,7 @@ def computer_status(
 
 
 def status_text(severity: Severity, text: str) -> Message:
-    """Make a STATUSTEXT (253), cut to 50 bytes.
-
-    The text is not sent in chunks: if one chunk is lost, or the ground station knows no chunks, it cannot be read.
-    """
+    """Make a STATUSTEXT (253), cut to 50 bytes: not every ground station can read a text in chunks."""
     data = text.encode()
     if len(data) > TEXT_BYTES:
         data = data[: TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."

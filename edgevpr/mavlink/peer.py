@@ -21,16 +21,13 @@ FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a 
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 _MILLI_G_M_S2 = 9.80665e-3
 
-# A flight controller that restarts is back within 20 s; other senders in the meantime are not it.
-RETAKEN_AFTER_S = 30.0
-STEADY_S = 5.0  # another address takes over after heartbeats for this time (not after one stray packet),
-GAP_S = 2.5  # without a longer gap: they come once a second, and one may be lost
+RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
 
 log = logging.getLogger(__name__)
 
 
 class Speaker(NamedTuple):
-    """The sender of an autopilot's messages: its system id, and its address (None if the link has one sender only)."""
+    """The sender of an autopilot's messages; its address is None if the link has one sender only."""
 
     system_id: int
     address: Sender | None
@@ -42,12 +39,11 @@ class Speaker(NamedTuple):
 
 class Identity:
     """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
-    id. A sender with another system id never takes its place. A sender with the same system id at another address takes
-    its place once our autopilot has been silent for 30 s, if its own heartbeats have come steadily for 5 s.
+    id. A sender with another system id never takes its place; one with the same at another address does so once our
+    autopilot has been silent for 30 s.
 
     `kept` is our autopilot (None: not heard yet). `news` is a short text if the last message has made a sender at
-    another address our autopilot, else None. `foreign_messages` counts the messages that were refused, because they
-    came from another autopilot or address.
+    another address our autopilot, else None. `foreign_messages` counts the messages of others.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -55,13 +51,12 @@ class Identity:
         self.foreign_messages = 0
         self._configured = system_id
         self._spoke_s = -math.inf
-        self._other: tuple[Speaker, float, float] | None = None  # times of its first and last unbroken heartbeat
         self._has_warned = False
         self.news: str | None = None
 
     def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
         """Return True if a message of this speaker comes from our autopilot. `beats`: the message is the heartbeat of
-        an autopilot, by which the speaker may become ours. Messages of others are counted."""
+        an autopilot, by which the speaker may become ours."""
         self.news = None
         if beats and speaker != self.kept and self._is_next(speaker, now_s):
             self._take(speaker, now_s)
@@ -80,7 +75,7 @@ class Identity:
         self.foreign_messages += self.kept is not None or self._configured is not None
 
     def _is_next(self, speaker: Speaker, now_s: float) -> bool:
-        """Note the heartbeat of a speaker that is not our autopilot; return True if it becomes ours now."""
+        """Return True if a speaker that is not our autopilot becomes ours by its heartbeat."""
         kept = self.kept
         if kept is None and self._configured in (None, speaker.system_id):
             return True
@@ -92,16 +87,11 @@ class Identity:
                 speaker,
                 kept or f"system {self._configured}",
             )
-        if kept is None or speaker.system_id != kept.system_id:
-            return False
-        other, first_s, last_s = self._other or (speaker, now_s, now_s)
-        if other != speaker or now_s - last_s > GAP_S:
-            first_s = now_s
-        self._other = speaker, first_s, now_s
-        return now_s - self._spoke_s >= RETAKEN_AFTER_S and now_s - first_s >= STEADY_S
+        is_same = kept is not None and speaker.system_id == kept.system_id
+        return is_same and now_s - self._spoke_s >= RETAKEN_AFTER_S
 
     def _take(self, speaker: Speaker, now_s: float) -> None:
-        before, self.kept, self._other, self._has_warned = self.kept, speaker, None, False
+        before, self.kept, self._has_warned = self.kept, speaker, False
         if before is None:
             log.info("autopilot heard: %s", speaker)
         else:
@@ -113,9 +103,8 @@ class Identity:
 
 class Listener:
     """Base class of an object that navigates by the reports of the autopilot, and gives the positions that a continuous
-    channel sends; this one does nothing. The methods are called in the link's thread; they never block and never raise.
-    All times are of the monotonic clock, in seconds.
-    """
+    channel sends; this one does nothing. The link's thread calls the methods, which never block and never raise. All
+    times are of the monotonic clock, in seconds."""
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
@@ -151,7 +140,6 @@ class Autopilot:
         self._forget()
 
     def _forget(self) -> None:
-        """Reset all that was known of the autopilot and its vehicle."""
         self.interview, self.readiness = Interview(), Readiness()
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
@@ -169,13 +157,12 @@ class Autopilot:
         return now_s - self._heard_s <= SILENT_AFTER_S
 
     def forget_presence(self) -> None:
-        """Regard the autopilot as absent until its next heartbeat: after the port is reopened, the other end may be
-        another one."""
+        """Regard the autopilot as absent until its next heartbeat: another one may be at a port that was reopened."""
         self._heard_s = -math.inf
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame, as
-        far as velocity and attitude are known. None: there is no report, or it had no position."""
+        """Return the last report, moved to `t_mono_s` as far as velocity and attitude are known (see
+        `Conversation.vehicle_at`)."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh_at(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
@@ -242,9 +229,8 @@ class Autopilot:
         """Process a GLOBAL_POSITION_INT. A position off the Earth, or at 0, 0, which an autopilot sends that has none,
         sets `vehicle` to None."""
         gps, lat_deg, lon_deg = self._best_gps(now_s), message.lat / 1e7, message.lon / 1e7
-        has_gps = False
-        if gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M:
-            has_gps = True
+        has_gps = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
+        if gps and has_gps:
             self.certainty.note_known(gps.sd_m, now_s)
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
             self.vehicle = None

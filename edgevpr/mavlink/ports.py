@@ -1,8 +1,8 @@
-"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open. Used by `link`, `asking`
-and the simulated autopilot.
+"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all behave alike after
+every fault: pymavlink's own connections may spin, hang or raise. Used by `link`, `asking` and the simulated autopilot.
 
-This thin layer over `socket` and pyserial has the same behaviour after every fault. pymavlink's own connections may
-spin, hang or raise.
+A `Line` is an open port together with the packets written into it. It makes sure that no position fix leaves late from
+a buffer, be it ours or that of the operating system.
 """
 
 import errno
@@ -12,16 +12,21 @@ import socket
 import stat
 import struct
 import termios
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, Sender
+from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.wire import Tap, untapped
 
 CONNECT_TIMEOUT_S = 1.0
 TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
 TCP_SEND_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
 READ_BYTES = 65_536
+LOST = "the link was lost before it had left"
+STUCK_S = 0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
 
 
 class Port:
@@ -60,14 +65,13 @@ class Port:
         """From now on send to the sender of the last bytes read. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
-        """Return the number of bytes written that have not left the operating system, or (TCP) are not confirmed."""
+        """Return the number of bytes written that have not left the system, or (TCP) are not confirmed."""
         return 0
 
     def throw_away(self) -> None:
         """Make `close` discard the bytes that have not left, instead of letting them leave later."""
 
     def close(self) -> None:
-        """Close the port."""
         self._sock.close()
 
 
@@ -178,25 +182,18 @@ _OPENERS: dict[str, Callable[[str, int], Port]] = {
     "tcp": TcpPort,
     "serial": SerialPort,
 }
-_NOT_PERMITTED = "the system does not permit it: take a port above 1023 and the address of one host"
-_NOT_OPENED = "this user may not open the device: add the user to the group that owns it (often `dialout`)"
 _ADVICE = {  # by error, and whether the link is a serial one
     (errno.EADDRINUSE, False): "the port is in use by another program: stop that one, or take another port",
     (errno.EWOULDBLOCK, True): "the device is in use by another program: stop that one",
-    (errno.EACCES, True): _NOT_OPENED,
-    (errno.EPERM, True): _NOT_OPENED,
-    (errno.EACCES, False): _NOT_PERMITTED,
-    (errno.EPERM, False): _NOT_PERMITTED,
+    (errno.EACCES, True): "this user may not open the device: add the user to its group (often `dialout`)",
+    (errno.EACCES, False): "the system does not permit it: take a port above 1023 and the address of one host",
 }
 
 
 def open_port(address: LinkAddress) -> Port:
-    """Open the port of a link.
-
-    Raises LinkAddressError for an address that is wrong (an unknown host, a file that is no device, the address of a
-    network), LinkError for another fault that the user must correct (a port in use, no permission), and OSError for a
-    fault that may end by itself (a device that is not plugged in, a server that is not running).
-    """
+    """Open the port of a link. Raises LinkAddressError for an address that is wrong (an unknown host, a file that is no
+    device, the address of a network), LinkError for another fault that the user must correct (a port in use, no
+    permission), and OSError for a fault that may end by itself (no device, no server)."""
     is_serial = address.kind == "serial"
     try:
         return _OPENERS[address.kind](address.where, address.number)
@@ -206,9 +203,7 @@ def open_port(address: LinkAddress) -> Port:
         kind = LinkError if is_unasked or address.where.endswith(".local") else LinkAddressError
         raise kind(f"{address}: there is no host {address.where!r}: correct it, or give an IP address.") from error
     except ValueError as error:
-        raise LinkAddressError(
-            f"{address}: it cannot be opened ({error}): correct the device or the baud rate."
-        ) from error
+        raise LinkAddressError(f"{address} cannot be opened ({error}): correct the device or the baud rate.") from error
     except OSError as error:
         if not (advice := _ADVICE.get((error.errno or 0, is_serial))):
             raise
@@ -225,3 +220,79 @@ def _udp_socket(attach: Callable[[socket.socket, Sender], None], host: str, port
         sock.close()
         raise
     return sock
+
+
+class Line:
+    """Writes packets to a port, one after another.
+
+    A fix counts as sent when all its bytes have left the operating system (over TCP: when the other end has confirmed
+    them). If that has not happened by the fix's `Sending.due_s`, `departed` raises ConnectionError; closing the port
+    then throws the bytes away. `tap` is called with each packet that the port has accepted in full. `unsent` are the
+    bytes of the last packet that the port has not accepted yet.
+    """
+
+    def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
+        self.port, self._clock, self._tap = port, clock, tap
+        self._packet = self.unsent = b""
+        self._taken = 0  # number of bytes that the port has accepted so far
+        self._leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
+        self._blocked_since_s: float | None = None
+
+    @property
+    def is_watched(self) -> bool:
+        """True while a fix has not left the operating system: the link must then look often whether it has."""
+        return bool(self._leaving)
+
+    @property
+    def is_idle(self) -> bool:
+        """True if every byte has left the operating system."""
+        return not self.unsent and self.port.unsent() == 0
+
+    def put(self, packet: bytes, sending: Sending | None) -> None:
+        """Set the next packet to be written, and the fix that it contains (None: it contains none). The port must have
+        accepted the previous packet in full."""
+        self._packet = self.unsent = packet
+        if sending:
+            self._leaving.append((self._taken + len(packet), sending))
+
+    def write(self) -> None:
+        """Write as much of the packet as the port accepts without blocking. Raises OSError if the connection is lost,
+        and if the port has accepted no byte for STUCK_S seconds."""
+        if not self.unsent:
+            return
+        taken = self.port.write(self.unsent)
+        self.unsent = self.unsent[taken:]
+        self._taken += taken
+        if not self.unsent:
+            self._tap(self._packet)
+        if taken:
+            self._blocked_since_s = None
+        elif self._blocked_since_s is None:
+            self._blocked_since_s = self._clock()
+        elif self._clock() - self._blocked_since_s > STUCK_S:
+            raise ConnectionError("the port takes no more bytes")
+
+    def departed(self) -> list[Sending]:
+        """Return the fixes that have left the operating system since the last call, and mark them as sent. Raises
+        ConnectionError if none has left and the oldest one is past its `due_s`."""
+        departed = []
+        # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
+        now_s = self._clock()
+        left = self._taken - self.port.unsent() if self._leaving else 0
+        while self._leaving and self._leaving[0][0] <= left:
+            departed.append(self._leaving.popleft()[1])
+            departed[-1].settle(True)
+        if not departed and self._leaving and now_s > self._leaving[0][1].due_s:
+            raise ConnectionError("a position fix has waited too long in it")
+        return departed
+
+    def close(self) -> int:
+        """Close the port, throw away all bytes that have not left, mark their fixes as not sent, and return the number
+        of these fixes."""
+        with suppress(OSError):
+            if not self.is_idle:
+                self.port.throw_away()
+        self.port.close()
+        for _, sending in self._leaving:
+            sending.settle(False, LOST)
+        return len(self._leaving)

@@ -1,9 +1,8 @@
-"""Signing of MAVLink 2: the key, the signatures of sent and received messages, and their time stamps. Used by the links
-and by `edgevpr check` and `doctor`.
+"""Signing of MAVLink 2: the key, the signatures of sent and received messages, and their time stamps, which never go
+back, neither in a flight nor from one flight to the next. Used by the links and by `edgevpr check` and `doctor`.
 
 pymavlink signs what is sent. Its check of what arrives is not used: it would store the time stamp of a message before
-it compares the signature, so that one forged message from the far future would shut out all true ones. Time stamps
-(integers, in units of TICKS_S) never go back, neither in a flight nor from one flight to the next.
+it compares the signature, so that one forged message from the far future would shut out all true ones.
 """
 
 import hashlib
@@ -57,8 +56,7 @@ class TimeStamps:
     the start, which raises ConfigError if the file is damaged or cannot be made, and from then on every half minute.
 
     With `is_kept` False the file is only read, for a program that asks before the flight: that may run as root, and the
-    service could not overwrite a file of root. The program has a link id, and so a stream, of its own, and ends within
-    the minute by which the autopilot lets a new stream be late.
+    service could not overwrite a file of root. It ends within the minute that an autopilot lets a new stream be late.
     """
 
     def __init__(
@@ -77,14 +75,14 @@ class TimeStamps:
         self._keep(may_fail=not path.exists())
 
     def next(self) -> int:
-        """Return the time stamp for the next message to be sent; it is larger than all before."""
+        """Return the time stamp for the next message to be sent, larger than all before."""
         with self._lock:
             self._move_on(max(self._largest + 1, self._now()))
             return min(self._largest, _LATEST)
 
     def refusal(self, stream: Stream, stamp: int) -> str | None:
-        """Return in a few words why a message of `stream` with the time stamp `stamp` is refused, or None if it is
-        admitted. The time stamp of an admitted message is kept: call this only if the message's signature is right.
+        """Return in a few words why a message with this time stamp is refused, or None if it is admitted; its time
+        stamp is then kept, so the signature must be right.
 
         Time stamps of a stream must increase. The first of a new stream must be within a minute of the largest, but the
         very first stream may be ahead by any time: so a board without a clock chip learns the time.
@@ -102,7 +100,7 @@ class TimeStamps:
             return None
 
     def _now(self) -> int:
-        """Return the current time stamp, by the system's clock or, if later, counted from the largest one learnt."""
+        """Return the time stamp of now, by the system's clock or, if later, counted from the largest one learnt."""
         by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
         return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
 
@@ -117,8 +115,7 @@ class TimeStamps:
             Thread(target=self._keep, name="signing time", daemon=True).start()
 
     def _keep(self, may_fail: bool = False) -> None:
-        """Write the newest time stamp to be kept. If that fails, log one warning or, with `may_fail`, raise
-        ConfigError."""
+        """Write the time stamp to be kept. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
         if not self._is_kept:
             return
         try:
@@ -126,19 +123,17 @@ class TimeStamps:
                 write_whole(self._path, lambda path: path.write_text(f"{self._kept}\n"))
         except OSError as error:
             if may_fail:
-                raise ConfigError(
-                    f"{self._path}: the time of signed messages cannot be kept there ({error.strerror}): correct "
-                    "`mavlink: {signing_state: ...}`."
-                ) from error
+                why = f"the time of signed messages cannot be kept there ({error.strerror})"
+                raise ConfigError(f"{self._path}: {why}: correct `mavlink: {{signing_state: ...}}`.") from error
             if not self._has_warned:
                 self._has_warned = True
                 log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
 
 
 class Signing:
-    """Signs the messages that one link sends. Admits received messages that are signed with the same key and are not
-    older than earlier ones. `refused` counts the others by reason; each reason is logged once. Without a key (no
-    `stamps`) nothing is signed, and every message is admitted."""
+    """Signs the messages that one link sends, and admits those received that are signed with the same key and not older
+    than earlier ones. `refused` counts the others by reason; each reason is logged once. Without a key (no `stamps`)
+    nothing is signed, and every message is admitted."""
 
     def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()
@@ -146,16 +141,16 @@ class Signing:
         self._verdicts: list[str | None] = []
 
     def of_ground(self) -> "Signing":
-        """Return a new object with the same key and time stamps, and the link id of the link to the ground."""
+        """Return the signing of the link to the ground: the same key and time stamps, but another link id."""
         return Signing(self._key, self._stamps, TO_GROUND)
 
     def take_verdicts(self) -> list[str | None]:
-        """Return, for each message since the last call, why it was refused, or None if it was admitted."""
+        """Return, for each message since the last call, why it was refused (None: admitted)."""
         verdicts, self._verdicts = self._verdicts, []
         return verdicts
 
     def stamp(self, packer: Message) -> None:
-        """Prepare a pymavlink packer, so that it signs its next message."""
+        """Make a pymavlink packer sign its next message."""
         if self._stamps:
             signing = packer.signing
             signing.sign_outgoing, signing.secret_key, signing.link_id = True, self._key, self._link_id
@@ -192,9 +187,8 @@ NOT_SIGNING = Signing()
 
 
 def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> Signing:
-    """Read the key and the kept time, and return the object that signs; without a key, one that does not. `state_path`
-    is the file of the kept time (None: beside the key); with `to_ask` (questions before the flight) it is only read.
-    Raises ConfigError."""
+    """Open the signing with the key of a file (None: no signing). `state_path` is the file of the kept time (None:
+    beside the key); with `to_ask` (questions before the flight) it is only read. Raises ConfigError."""
     if key_path is None:
         return NOT_SIGNING
     key = read_key(key_path)
@@ -212,14 +206,13 @@ def read_key(path: str) -> bytes:
     if mode & 0o077 and not _is_credential(path, mode):
         raise ConfigError(f"{path}: others may open the signing key (mode {mode:04o}): `chmod 600 {path}`.")
     if len(key) != KEY_BYTES:
-        size = f"only {len(key)}" if len(key) < KEY_BYTES else "more"
-        raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, and this file has {size}: {_MAKE_ONE}.")
+        raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, and this file has not: {_MAKE_ONE}.")
     return key
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Return True if the file is a credential that systemd gives to this service alone. It is readable by an access
-    list for the service's user, which its mode shows as a right of the group to read."""
+    """Return True if the file is a credential that systemd gives to this service alone, by an access list, which shows
+    in the mode as a right of the group to read."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from pathlib import Path
 
-from edgevpr.core.appending import append, is_at, keep_within, open_appending, set_aside, sync
+from edgevpr.core.appending import append, keep_within, open_appending, set_aside, sync
 from edgevpr.core.errors import EdgevprError
 
 MOST_BYTES = 256_000_000  # of one file, days of a usual link; with the one before it there are at most twice as many
@@ -26,15 +26,14 @@ class Tlog:
     """An open tlog. For each packet it holds the microseconds since 1970 (8 bytes, big endian), then the packet. Close
     it, or use it as a context manager.
 
-    An existing file is appended to. A thread of its own writes once a second: with a slow disk no caller waits, but
-    packets are left out when too many wait. A full disk ends the log, but not the flight.
+    An existing file is appended to. A thread of its own writes once a second, so that no caller waits. A disk that is
+    full or too slow ends the log, but not the flight.
     """
 
     def __init__(self, path: str | Path) -> None:
         """Open the file. Raises EdgevprError if it cannot be opened."""
         self._path = Path(os.path.realpath(path))
         self._waiting: deque[bytes] = deque()  # time stamps with their packets
-        self._missing = 0  # number of packets left out
         self._closing, self._ended = threading.Event(), False
         try:
             self._file = open_appending(self._path)
@@ -55,11 +54,8 @@ class Tlog:
     def record(self, packet: bytes) -> None:
         """Queue a packet to be written. Any thread may call this; it never blocks and never raises."""
         stamp = struct.pack(">Q", time.time_ns() // 1000 & ~3)  # the last two bits would be the number of a link
-        if not self._ended:
-            if len(self._waiting) < WAITING_MAX:
-                self._waiting.append(stamp + packet)
-            else:
-                self._missing += 1
+        if not self._ended and len(self._waiting) < WAITING_MAX:
+            self._waiting.append(stamp + packet)
 
     def close(self) -> None:
         """Write the queued packets, for two seconds at most, and close the file."""
@@ -67,8 +63,6 @@ class Tlog:
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
             _log.warning("The end of the tlog %s may be missing: the disk is too slow.", self._path)
-        elif self._missing:
-            _log.warning("The tlog %s misses %d packets: the disk was too slow.", self._path, self._missing)
 
     # The methods below run in the log's own thread.
 
@@ -90,15 +84,14 @@ class Tlog:
             self._file.close()
 
     def _write(self) -> None:
+        if len(self._waiting) == WAITING_MAX:
+            raise OSError(errno.EIO, "the disk is too slow for it")
         records = b"".join(self._waiting.popleft() for _ in range(len(self._waiting)))
         if not records:
             return
-        is_full = os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES
-        is_there = is_at(self._file, self._path)  # neither moved nor deleted in flight
-        if is_there and is_full:
+        if os.fstat(self._file.fileno()).st_size + len(records) > MOST_BYTES:
             set_aside(self._path)
             keep_within(self._path, MOST_BYTES)
-        if is_full or not is_there:
             self._file.close()
             self._file = open_appending(self._path)
         disk = os.fstatvfs(self._file.fileno())

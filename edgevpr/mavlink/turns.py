@@ -1,6 +1,5 @@
 """Turns: the lock of a conversation. A turn is the time in which one thread, that of a link or of the flight, uses the
-conversation alone, while its clock stands still. Turns are recorded on the tape, the record of all that comes into a
-flight (`core.types.Tape`), so that the flight can be replayed."""
+conversation alone, while its clock stands still. Turns are recorded on the tape, so that a flight can be replayed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,8 +10,8 @@ from edgevpr.core.types import NO_TAPE, Tape
 
 
 class Turns:
-    """Gives turns to one thread at a time. All that happens in a turn has the same time, so a conversation depends only
-    on that time and on its input, and a replay gives the same result. `tape` records the turns in their order."""
+    """Gives turns to one thread at a time. A conversation depends only on the times of its turns and on its input, so a
+    replay gives the same result."""
 
     def __init__(self, clock: Callable[[], float], tape: Tape = NO_TAPE) -> None:
         self._clock, self._tape = clock, tape
@@ -26,21 +25,18 @@ class Turns:
 
     @contextmanager
     def taken(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn (wait for the lock, then hold it) in the flight's thread. `what` is the name of
-        the turn on the tape. Inside another turn of the same thread this has no effect: it is part of that turn."""
+        """Context manager: take a turn in the flight's thread. `what` is its name on the tape. Inside another turn of
+        the same thread this has no effect: it is part of that turn."""
         with self._lock:
             if self._t_s is not None:
                 yield
                 return
-            self._t_s = self._tape.read(f"turn: {what}", self._clock)
-            try:
+            with self.again(self._tape.read(f"turn: {what}", self._clock)):
                 yield
-            finally:
-                self._t_s = None
 
     @contextmanager
     def again(self, t_s: float) -> Iterator[None]:
-        """Context manager, for a replay: repeat a link's turn that was taken at `t_s`."""
+        """Context manager: let the time stand still at `t_s`; in a replay, this repeats a link's turn."""
         self._t_s = t_s
         try:
             yield
@@ -54,10 +50,10 @@ class Turns:
         record; a turn without a step is not recorded."""
         steps: list[tuple[Any, ...]] = []
         with self._lock:
-            self._t_s = t_s = self._clock()
+            t_s = self._clock()
             try:
-                yield lambda *step: steps.append(step)
+                with self.again(t_s):
+                    yield lambda *step: steps.append(step)
             finally:
-                self._t_s = None
                 if steps:
                     self._tape.note(name, t_s, steps)

@@ -1,9 +1,7 @@
 """The one import of pymavlink: its dialect and rotations, and the parser from bytes to messages.
-Used by the whole package.
 
 `ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would take
-another 1 MB of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise
-where a link of this package must not. A tap is a function that gets a copy of each packet, such as that of the tlog.
+another 1 MB of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise.
 """
 
 import math
@@ -18,19 +16,18 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 __all__ = ["Message", "PacketReader", "Tap", "mavlink", "parameter_value", "quaternion", "rotmat", "untapped"]
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
-Tap = Callable[[bytes], object]  # gets the bytes of every whole packet, sent or received
+Tap = Callable[[bytes], object]  # gets the bytes of every whole packet, sent or received: the tlog
 
 _SENDERS_MAX = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
 
 
 def untapped(packet: bytes) -> None:
-    """Do nothing with a packet: the tap of a link without a tlog (a file of all packets)."""
+    """Do nothing with a packet: the tap of a link without a tlog."""
 
 
 class PacketReader:
     """Parses received bytes, separately for each sender, so that an incomplete message of one does not swallow the
-    bytes of another. `admits` decides which messages are yielded; `tap` gets each packet. Invalid bytes are dropped and
-    counted."""
+    bytes of another. `admits` decides which messages are yielded; `tap` gets each packet."""
 
     def __init__(self, admits: Callable[[Message], bool] = lambda message: True, *, tap: Tap = untapped) -> None:
         self._admits, self._tap = admits, tap
@@ -64,8 +61,7 @@ class PacketReader:
                 yield message
 
     def _parser_of(self, sender: Hashable) -> mavlink.MAVLink:
-        parser = self._parsers.pop(sender, None)
-        if parser is None:
+        if (parser := self._parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
             parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
             if len(self._parsers) == _SENDERS_MAX:

@@ -13,9 +13,8 @@ from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_unt
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.line import Line
 from edgevpr.mavlink.messages import Fix, Severity, status_text
-from edgevpr.mavlink.ports import open_port
+from edgevpr.mavlink.ports import Line, open_port
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

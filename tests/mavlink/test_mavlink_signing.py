@@ -221,10 +221,10 @@ def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode
             read_key(str(path))
 
 
-@pytest.mark.parametrize(("content", "says"), [(b"", "only 0"), (KEY[:31], "only 31"), (KEY + b"\n", "more")])
-def test_a_key_of_another_length_is_refused(key_file, content, says):
+@pytest.mark.parametrize("content", [b"", KEY[:31], KEY + b"\n"])
+def test_a_key_of_another_length_is_refused(key_file, content):
     key_file.write_bytes(content)
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match="32 bytes"):
         read_key(str(key_file))
 
 

@@ -7,8 +7,8 @@ import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
+from edgevpr.mavlink.ground import SPACING_S, WAITING_MAX, Texts
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.texts import SPACING_S, WAITING_MAX, Texts
 
 WARNING, INFO = Severity.WARNING, Severity.INFO
 

@@ -7,7 +7,7 @@ import math
 import pytest
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.requests import ANSWERED_MAX, PAUSED, Requests, Wish
+from edgevpr.mavlink.ground import ANSWERED_MAX, PAUSED, Requests, Wish
 from edgevpr.mavlink.wire import mavlink
 
 US, STATION = (7, 197), (255, 190)

@@ -1,7 +1,6 @@
 """The tlog on real links and files, read back by pymavlink's own reader and by its mavlogdump."""
 
 import os
-import shutil
 import struct
 import subprocess
 import sys
@@ -182,9 +181,8 @@ def test_a_slow_disk_keeps_nobody_waiting_and_fills_no_memory(path, caplog, monk
             log.record(packet(number))
         assert len(log._waiting) <= tlog.WAITING_MAX
         go_on.set()
-    found = numbers(path)
-    assert found == list(range(len(found)))
-    assert f"misses {20_000 - len(found)}" in caplog.text
+    assert numbers(path) == [0], "what came before the gap"
+    assert "has ended (the disk is too slow for it)" in caplog.text
 
 
 def test_there_are_never_more_than_two_files_of_the_largest_size(path, monkeypatch):
@@ -197,17 +195,6 @@ def test_there_are_never_more_than_two_files_of_the_largest_size(path, monkeypat
     assert max(path.stat().st_size, older.stat().st_size) <= 1000
     found = numbers(older) + numbers(path)
     assert found == list(range(200 - len(found), 200)), "the newest"
-
-
-def test_a_log_that_is_moved_in_flight_goes_on_in_a_new_file(path, monkeypatch):
-    monkeypatch.setattr(tlog, "WRITE_S", 0.01)
-    with Tlog(path) as log:
-        log.record(packet(1))
-        wait_until(lambda: path.stat().st_size)
-        moved = shutil.move(path, path.with_name("moved.tlog"))
-        log.record(packet(2))
-        wait_until(lambda: path.exists() and path.stat().st_size)
-    assert (numbers(moved), numbers(path)) == ([1], [2])
 
 
 def test_a_file_that_cannot_be_opened_is_one_sentence(tmp_path):

@@ -1,8 +1,8 @@
 """Carrying out of what ground stations request in flight: recognition pauses and resumes, learning stops and resumes.
 The loop of `flight` and `vitals` use it."""
 
+from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.requests import Wish, Wished
 from edgevpr.runtime.flight.world import Crew
 
 _TEXTS = {

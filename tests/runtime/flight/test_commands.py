@@ -7,7 +7,7 @@ from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import Flight, of_kind
 from pictures import textured
 
-from edgevpr.mavlink.requests import Wish
+from edgevpr.mavlink.ground import Wish
 from edgevpr.runtime.flight import systemd
 
 

@@ -1,16 +1,25 @@
-"""Requests that arrive over the links: all that the ground station, or any other sender, may ask of this companion
-computer. A request that is not handled here has no effect; there are no parameters that could be set. A wish is a
-request that only the flight itself can fulfil, such as a pause. Used by `conversation` and the flight."""
+"""The people on the ground: the requests that arrive over the links, and the texts for the ground station. A wish is a
+request that only the flight itself can fulfil, such as a pause. A request that is not handled here has no effect; there
+are no parameters that could be set. Used by `conversation` inside turns only (see `turns`), and by the flight."""
 
+import logging
+import math
 from collections import Counter
 from collections.abc import Collection
 from enum import IntEnum
 from typing import NamedTuple
 
+from edgevpr.mavlink.messages import Severity, status_text
 from edgevpr.mavlink.wire import Message, mavlink
 
 ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
 PAUSED = "not sent: paused by the ground"
+SPACING_S = 5.0
+WAITING_MAX = 16
+
+News = tuple[Severity, str, str]  # a change to be announced to the ground station: severity, text and topic
+
+log = logging.getLogger(__name__)
 
 
 class Wish(IntEnum):
@@ -30,30 +39,25 @@ class Wished(NamedTuple):
 
 
 class Requests:
-    """Answers the requests of all links, and keeps the wishes until the main loop of the flight takes them. Use it
-    inside turns only (see `turns`).
+    """Answers the requests of all links, and keeps the wishes until the main loop of the flight takes them.
 
     `offered` are the wishes that the flight can fulfil, none at first; others are refused. `results` counts commands by
     the name of their result. `ignored` counts the other messages addressed to us that had no effect: an unknown kind,
-    or too many a second.
+    or too many a second. `is_paused`: no fix may be sent, as soon as a pause has been accepted.
     """
 
     def __init__(self) -> None:
         self.offered: Collection[Wish] = ()
         self.results: Counter[str] = Counter()
         self.ignored = 0
+        self.is_paused = False
         self._waiting: dict[bool, Wished] = {}  # the newest about learning (True), and about pausing (False)
-        self._is_paused = False
         self._second_s, self._answered = 0.0, 0
 
     def take(self) -> tuple[Wished, ...]:
         """Return the wishes that have arrived since the last call; of two on the same subject only the newer one."""
         waiting, self._waiting = tuple(self._waiting.values()), {}
         return waiting
-
-    def why_no_fix(self) -> str | None:
-        """Return the reason why no fix may be sent, as soon as a pause has been accepted; None: fixes may be sent."""
-        return PAUSED if self._is_paused else None
 
     def hear(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
         """Process a message and return the replies to be sent. `us` is our (system id, component id). A TIMESYNC is
@@ -84,7 +88,7 @@ class Requests:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
         is_about_learning = wish in (Wish.LEARN, Wish.LEARN_NOTHING)
         if not is_about_learning:
-            self._is_paused = wish is Wish.PAUSE
+            self.is_paused = wish is Wish.PAUSE
         self._waiting[is_about_learning] = Wished(wish, f"{sender[0]}/{sender[1]}")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
@@ -93,6 +97,55 @@ class Requests:
             self._second_s, self._answered = now_s, 0
         self._answered += 1
         return self._answered <= ANSWERED_MAX
+
+
+class Texts:
+    """The texts that wait to be sent, one in five seconds, warnings before notes (texts of severity INFO).
+
+    Of the texts of one `topic` the newest counts: it replaces a waiting one, and is dropped if it equals the last text
+    sent. But a note does not replace a waiting warning: it is sent after it.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[tuple[str, Severity], str] = {}  # the oldest first
+        self._last: dict[str, str] = {}  # the last text sent of each topic
+        self._spacing_s = SPACING_S
+        self._sent_s = -math.inf
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        """Queue a text. A text without a `topic` is a topic of its own, and may be sent again."""
+        topic = topic or text
+        if severity is Severity.WARNING:
+            self._waiting.pop((topic, Severity.INFO), None)
+        self._waiting[topic, severity] = text
+        follows_warning = severity is Severity.INFO and (topic, Severity.WARNING) in self._waiting
+        if not follows_warning and self._last.get(topic) == text:
+            del self._waiting[topic, severity]
+        if len(self._waiting) > WAITING_MAX:
+            lost_text = self._waiting.pop(self._oldest(Severity.INFO))
+            log.warning("the ground is not told, since too many texts wait: %s", lost_text)
+
+    def next(self, now_s: float) -> Message | None:
+        """Return the STATUSTEXT that is to be sent now; None if no text waits, or the last one was too recent."""
+        if not self._waiting or now_s - self._sent_s < self._spacing_s:
+            return None
+        topic, severity = chosen = self._oldest(Severity.WARNING)
+        text = self._waiting.pop(chosen)
+        if topic != text:
+            self._last[topic] = text
+        self._sent_s = now_s
+        return status_text(severity, f"edgevpr: {text}")
+
+    def hurry(self) -> None:
+        """Send the remaining texts without pauses: the link is about to be closed."""
+        self._spacing_s = 0.0
+
+    def _oldest(self, severity: Severity) -> tuple[str, Severity]:
+        """Return the key of the oldest waiting text of this severity, or of the oldest of all if there is none."""
+        return next((key for key in self._waiting if key[1] is severity), next(iter(self._waiting)))
 
 
 def _asks(message: Message, us: tuple[int, int]) -> bool:
