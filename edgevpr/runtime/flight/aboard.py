@@ -16,7 +16,8 @@ from edgevpr.core.errors import MapError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, identity_of
-from edgevpr.runtime.flight.metering import meter_of_queries
+from edgevpr.power.equations import parse_pack
+from edgevpr.power.meter import OwnMemory, QueryMeter
 from edgevpr.runtime.flight.world import World
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique
@@ -31,10 +32,8 @@ _log = logging.getLogger(__name__)
 
 
 def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
-    """Open the recogniser of a flight. Returns
-    - the recogniser,
-    - its learner (None: no places are learnt),
-    - why it cannot learn (None: it can, or is not asked to).
+    """Open the recogniser of a flight. Returns it, its learner (None: no places are learnt), and why it cannot learn
+    (None: it can, or is not asked to).
 
     If the map cannot be written (a memory card that has become read-only, a full disk), only the recogniser is opened:
     the places of the map can still be recognised. Raises an EdgevprError if the map cannot be opened.
@@ -66,7 +65,15 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
 def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
     """Measure how fast the technique is on this board, and set the recogniser to compare as many candidates as there is
     time for. Returns the expected performance (see `Outlook`)."""
-    recogniser.meter = meter_of_queries(config.battery, world.board, world.clock, world.tape)
+    memory = OwnMemory()
+    recogniser.meter = QueryMeter(
+        world.board,
+        parse_pack(config.battery.pack),
+        config.battery.regulator_efficiency,
+        wall_clock=world.clock.wall_s,
+        cpu_clock=world.clock.process_cpu_s,
+        memory_mb=lambda: world.tape.read("memory_mb", memory.look),
+    )
     found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
     recogniser.candidates = found.candidates
     return found
@@ -94,8 +101,8 @@ def rate_hz(config: Config, recogniser: Recogniser) -> float:
 
 
 def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
-    """Report, at the start of a flight, the technique that is used; warn if fixes would be too late or the board's
-    power is unverified. Return the fields of the first line of the flight log."""
+    """Report the technique that is used; warn if fixes would be too late or the board's power is unverified. Return the
+    fields of the first line of the flight log."""
     board = world.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)

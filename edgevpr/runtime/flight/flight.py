@@ -63,14 +63,7 @@ class Flight:
         self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
         self._governing = Governing(crew, self._pace)
         self._commands = Commands(crew)
-        remarks = (
-            lambda: self._commands.summary,
-            lambda: self._governing.held,
-            lambda: crew.learner.summary if crew.learner else None,
-            lambda: self._map_watch.summary,
-            lambda: crew.flight_log.state,
-        )
-        self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=remarks)
+        self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.tell,
             self._vitals.tell,
@@ -99,10 +92,8 @@ class Flight:
             link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
             source, source_uri = world.open_source(step_s), config.source.uri
             stack.callback(source.close)
-            if link and not source.is_live and config.mavlink.send_fixes:
-                _log.warning("%s is a recording: the fixes sent say where it was made, not where you are", source_uri)
-            if link and not source.is_live and learner:
-                _log.warning("%s is a recording: what it learns is put where the vehicle is now", source_uri)
+            if link and not source.is_live and (learner or config.mavlink.send_fixes):
+                _log.warning("%s is a recording: its fixes, and places learnt from it, do not say where you are", source_uri)
             herald = Herald(flight_log, link)
             autopilot = None
             if link:
@@ -148,10 +139,8 @@ class Flight:
         return 1 if self._tally.unusable + self._tally.failed else 0
 
     def totals(self) -> dict[str, Any]:
-        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`; `queries`; `dropped`,
-        pictures not read in time (None: the source is a recording); `refused`, the number of pictures that were not new
-        and whole, by reason; `latency_s`, age of the newest picture when it could be read, seconds (None: unknown);
-        `left_out`, the number of places of the map that cannot be read."""
+        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`; `queries`; those of the
+        `Source` (`dropped`, `refused`, `latency_s`); `left_out`, the number of places that cannot be read."""
         source = self._crew.source
         return {
             "queries": self._tally.queries,
@@ -161,6 +150,12 @@ class Flight:
             "latency_s": source.latency_s,
             "left_out": self._map_watch.left_out,
         }
+
+    def _remarks(self) -> tuple[str | None, ...]:
+        """Return what people should know beside the counts, each a few words (None: nothing)."""
+        learnt = self._crew.learner.summary if self._crew.learner else None
+        held, left_out = self._governing.governor.held, self._map_watch.summary
+        return self._commands.summary, held, learnt, left_out, self._crew.flight_log.state
 
     def _turn(self) -> None:
         """Run one pass of the loop, with one frame at most."""

@@ -37,15 +37,14 @@ _SYNC_EVERY_S = 1.0
 class FlightLog:
     """Writer of a flight log; with `path` None nothing is written. Close it (it is a context manager).
 
-    `path` is the log of the newest flight. Before the first line of this flight, the file of an earlier flight is set
-    aside, that is renamed to the next number (see `core.appending`). A file that reaches a quarter of `max_mb` (None:
-    no limit) is set aside too. The numbered files share the other three quarters: the oldest are deleted. Each further
-    file of a flight begins with a copy of the start line, to which two fields are added: `repeated` (true) and `part`,
-    the number of the file within the flight. A file that another process writes is not written.
+    `path` is the log of the newest flight. The file of an earlier flight is set aside, that is renamed to the next
+    number (see `core.appending`), and so is a file that reaches a quarter of `max_mb` (None: no limit). The numbered
+    files share the other three quarters: the oldest are deleted. Each further file of a flight begins with a copy of
+    the start line and two more fields: `repeated` (true) and `part`, the number of the file within the flight.
 
     Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
-    are synced to the disk (fdatasync) by the first line written a second or more after the last sync, or by the next
-    call of `sync_due`. A pulled battery costs at most the lines of the last two seconds.
+    are synced to the disk by the first line written a second or more after the last sync, or by the next call of
+    `sync_due`: a pulled battery costs at most the lines of the last two seconds.
 
     `state` is None while lines are written, else a sentence that says why not. `lost_lines` counts the lines that could
     not be written. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". If the
@@ -173,7 +172,9 @@ class FlightLog:
             return file
         sync(file)
         self._let_go()
-        self._delete_oldest()
+        if not math.isinf(self._part_bytes):
+            with suppress(OSError):
+                keep_within(self._at, self._part_bytes * (_PARTS - 1))
         return self._open()
 
     def _open(self) -> FileIO:
@@ -186,19 +187,6 @@ class FlightLog:
         if self._is_new:  # on another medium it may have the numbers of a file before it
             self._ours = None
         return file
-
-    def _delete_oldest(self) -> None:
-        """Delete the oldest numbered files until together they keep to three quarters of `max_mb`."""
-        if math.isinf(self._part_bytes):
-            return
-        try:
-            if keep_within(self._at, self._part_bytes * (_PARTS - 1)):
-                self._warn("Old flight logs are deleted, the oldest first: all stay within log.max_mb together.")
-        except OSError as error:
-            self._warn(
-                f"The oldest flight logs beside {self.path} cannot be deleted ({error.strerror}), so they grow past "
-                "log.max_mb: let the flight write to their folder."
-            )
 
     def _sync(self, file: FileIO, now_s: float) -> None:
         sync(file)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 from edgevpr.mavlink.messages import Severity
+from edgevpr.power.boards import Board
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.metering import LoadReading
 from edgevpr.runtime.flight.world import Crew
@@ -39,16 +40,6 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """Upper limits: share of all cores that this process uses (0..1), its memory, and the temperature of the board in
-    degrees Celsius."""
-
-    cpu_share: float
-    memory_max_mb: float
-    temperature_c: float
-
-
-@dataclass(frozen=True, slots=True)
 class Change:
     """Change from the setting `before` to the setting `after`, and the reason `why`. `back`: it is a change up, towards
     the setting asked for. If a limit is exceeded and nothing is left to lower, both settings are the same."""
@@ -70,21 +61,13 @@ def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[
     return tuple(found)
 
 
-def lowered(setting: Setting, asked: Setting) -> str:
-    """Describe in a few words what is lowered in `setting` compared with the one `asked` for; "" if nothing is."""
-    parts = (
-        f"{setting.rate_hz:g} of {asked.rate_hz:g} Hz" if setting.rate_hz != asked.rate_hz else "",
-        f"{setting.candidates} of {asked.candidates} candidates" if setting.candidates != asked.candidates else "",
-    )
-    return ", ".join(filter(None, parts))
-
-
 class Governor:
     """Decides which of the `settings` (from `steps`, highest first) is in force, from measurements of the load: it goes
-    down one setting when one of the `limits` is exceeded, and up when there is room again."""
+    down one setting when a limit of the `board`, or its temperature `limit_c` (degrees Celsius), is exceeded, and up
+    when there is room again."""
 
-    def __init__(self, limits: Limits, settings: Sequence[Setting]) -> None:
-        self._limits, self._settings, self._at = limits, list(settings), 0
+    def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
+        self._board, self._limit_c, self._settings, self._at = board, limit_c, list(settings), 0
         self._since_s: dict[str, float] = {}  # when each condition that holds has begun to hold
         self._changed_s = self._raised_s = -math.inf
         self._wait_s = _FIRST_WAIT_S
@@ -96,15 +79,20 @@ class Governor:
         return self._settings[self._at]
 
     @property
-    def asked(self) -> Setting:
-        """The highest setting, which is in force while no limit is exceeded."""
-        return self._settings[0]
+    def held(self) -> str | None:
+        """What is lowered, in a few words; None if nothing is."""
+        now, asked = self.setting, self._settings[0]
+        parts = (
+            f"{now.rate_hz:g} of {asked.rate_hz:g} Hz" if now.rate_hz != asked.rate_hz else "",
+            f"{now.candidates} of {asked.candidates} candidates" if now.candidates != asked.candidates else "",
+        )
+        return f"held to {', '.join(filter(None, parts))}" if now != asked else None
 
     def look(self, now_s: float, reading: LoadReading) -> Change | None:
         """Judge a measurement, and return the change to be made (None: no change). Call it about once a second; each
         measurement must cover a whole number of queries."""
         hot, over = self._load(reading)
-        most_mb = self._limits.memory_max_mb
+        most_mb = self._board.memory_max_mb
         has_room = self._has_room(reading, self._settings[max(0, self._at - 1)])
         over_s, room_s = self._held_s("over", now_s, over is not None), self._held_s("room", now_s, has_room)
         full_s = self._held_s("full", now_s, reading.rss_mb >= _NEAR_MEMORY * most_mb)
@@ -112,15 +100,15 @@ class Governor:
             self._told.discard("load")
         if reading.rss_mb <= _MEMORY_ROOM * most_mb:
             self._told.discard("memory")
-        if full_s >= _PATIENCE_S:
-            why = f"{reading.rss_mb:.0f} MB of memory taken, and {most_mb:.0f} allowed"
-            if change := self._nothing_left("memory", why):
-                return change
+        if full_s >= _PATIENCE_S and "memory" not in self._told:
+            return self._nothing_left("memory", f"{reading.rss_mb:.0f} MB of memory taken, and {most_mb:.0f} allowed")
         if over is not None and over_s >= _PATIENCE_S and not (hot and now_s - self._changed_s < _HEAT_PATIENCE_S):
             if hot:
                 self._wait_s = max(self._wait_s, _HEAT_PATIENCE_S)
             below = self._below(hot)
-            return self._nothing_left("load", over) if below is None else self._down(now_s, below, over)
+            if below is not None:
+                return self._down(now_s, below, over)
+            return None if "load" in self._told else self._nothing_left("load", over)
         if self._at > 0 and room_s >= self._wait_s:
             self._raised_s = now_s
             return self._changed(now_s, self._at - 1, "there is room again", back=True)
@@ -144,35 +132,33 @@ class Governor:
     def _load(self, reading: LoadReading) -> tuple[bool, str | None]:
         """Judge a measurement, except its memory. Returns two values: True if the board is too hot; a few words about
         the limit that is exceeded (None: none is)."""
-        limits, temperature_c = self._limits, reading.temperature_c
-        if temperature_c is not None and temperature_c >= limits.temperature_c:
-            return True, f"{temperature_c:.0f} degrees, and {limits.temperature_c:.0f} are the limit"
+        allowed, temperature_c = self._board.cpu_share, reading.temperature_c
+        if temperature_c is not None and temperature_c >= self._limit_c:
+            return True, f"{temperature_c:.0f} degrees, and {self._limit_c:.0f} are the limit"
         if reading.throttled:
             return True, "the board slows itself down"
-        if reading.cpu_share > limits.cpu_share:
-            return False, f"{reading.cpu_share:.0%} of all cores taken, and {limits.cpu_share:.0%} allowed"
+        if reading.cpu_share > allowed:
+            return False, f"{reading.cpu_share:.0%} of all cores taken, and {allowed:.0%} allowed"
         if reading.late_share > _LATE:
             return False, "queries come late, kept waiting by other programs or the disk"
         return False, None
 
     def _has_room(self, reading: LoadReading, then: Setting) -> bool:
         """Tell whether the load would stay clearly below all limits with the setting `then`."""
-        now, limits = self.setting, self._limits
+        now, board = self.setting, self._board
         more = 1 + _OF_CANDIDATES * (then.candidates / now.candidates - 1)
         more *= then.rate_hz / now.rate_hz
         return (
-            reading.cpu_share * more <= _ROOM * limits.cpu_share
+            reading.cpu_share * more <= _ROOM * board.cpu_share
             and reading.late_share * more <= _ROOM
             and not reading.throttled
-            and (reading.temperature_c is None or reading.temperature_c <= limits.temperature_c - _COOLER_C)
-            and reading.rss_mb <= _MEMORY_ROOM * limits.memory_max_mb
+            and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _COOLER_C)
+            and reading.rss_mb <= _MEMORY_ROOM * board.memory_max_mb
         )
 
-    def _nothing_left(self, what: str, why: str) -> Change | None:
-        """Return a change between equal settings, which reports that a limit is exceeded and no setting can be lowered.
-        `what` is the limit ("memory" or "load"); None if this has been reported for it already."""
-        if what in self._told:
-            return None
+    def _nothing_left(self, what: str, why: str) -> Change:
+        """Return a change between equal settings, which reports that a limit ("memory" or "load") is exceeded and no
+        setting can be lowered."""
         self._told.add(what)
         return Change(self.setting, self.setting, f"{why}, and nothing is left to lower")
 
@@ -197,28 +183,21 @@ class Governing:
 
     def __init__(self, crew: Crew, pace: Pace) -> None:
         self._crew, self._pace = crew, pace
-        recogniser = crew.recogniser
-        board, in_sequence = recogniser.meter.board, recogniser.sequence > 1
-        technique = recogniser.technique
+        recogniser, technique = crew.recogniser, crew.recogniser.technique
+        in_sequence = recogniser.sequence > 1
         asked = Setting(pace.rate_hz, recogniser.candidates or technique.candidates, technique.spec.form)
         settings = steps(asked, in_sequence, () if in_sequence else crew.fewer_candidates)
-        self._governor = Governor(Limits(board.cpu_share, board.memory_max_mb, crew.meter.limit_c), settings)
-
-    @property
-    def held(self) -> str | None:
-        """Description of the lowered settings, in a few words; None if nothing is lowered."""
-        what = lowered(self._governor.setting, self._governor.asked)
-        return f"held to {what}" if what else None
+        self.governor = Governor(recogniser.meter.board, crew.meter.limit_c, settings)
 
     def look(self) -> None:
         """Measure the load of the flight if the last measurement is a second old, and change the settings if needed."""
         crew = self._crew
-        if crew.meter.age_s < GOVERN_S:
+        if crew.meter.load.age_s < GOVERN_S:
             return
-        change = self._governor.look(crew.clock.mono_s(), crew.meter.reading())
+        change = self.governor.look(crew.clock.mono_s(), crew.meter.reading())
         if change is None:
             return
-        text = ground = self.held or "back to what was asked"
+        text = ground = self.governor.held or "back to what was asked"
         if change.before == change.after:
             text, ground = "over a limit of the board", "over a limit of its board, see its log"
         severity = Severity.INFO if change.back else Severity.WARNING

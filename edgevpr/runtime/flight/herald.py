@@ -25,12 +25,8 @@ class Herald:
         """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
         given). A text that still waits is replaced by a newer one of the same `topic`."""
         _log.log(logging.WARNING if severity is Severity.WARNING else logging.INFO, "%s", text)
-        self.announce(severity, ground or text, topic)
-
-    def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text for the ground station only (see `say`)."""
         if self._link:
-            self._link.announce(severity, text, topic)
+            self._link.announce(severity, ground or text, topic)
 
     def tell(
         self,
@@ -50,7 +46,7 @@ class Herald:
 
 class Trouble:
     """Reports a bad condition once when it begins, with the text `begun`, and once when it ends, with the text `over`.
-    `kind` is that of its lines in the flight log. `is_so`: the condition has begun and has not ended."""
+    `kind` is that of its lines in the flight log. `is_so`: the condition holds."""
 
     def __init__(self, herald: Herald, kind: str, begun: str, over: str) -> None:
         self.is_so = False

@@ -9,7 +9,7 @@ from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
 from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import MachineLoad, OwnLoad, OwnMemory, QueryMeter, RunningEnergy, Stage, machine_load, stage
+from edgevpr.power.meter import MachineLoad, OwnLoad, RunningEnergy, Stage, machine_load, stage
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -52,11 +52,6 @@ class FlightMeter:
         self.look_at_heat()
         self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
-
-    @property
-    def age_s(self) -> float:
-        """Seconds since the last `reading`."""
-        return self.load.age_s
 
     @property
     def used_mah(self) -> float:
@@ -119,16 +114,3 @@ class FlightMeter:
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)
-
-
-def meter_of_queries(battery: BatteryConfig, board: Board, clock: Clock, tape: Tape) -> QueryMeter:
-    """Make the meter of the cost of single queries in a flight."""
-    memory = OwnMemory()
-    return QueryMeter(
-        board,
-        parse_pack(battery.pack),
-        battery.regulator_efficiency,
-        wall_clock=clock.wall_s,
-        cpu_clock=clock.process_cpu_s,
-        memory_mb=lambda: tape.read("memory_mb", memory.look),
-    )

@@ -16,9 +16,8 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.consistency import Consistency
-from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import (
+    Consistency,
     Navigation,
     PositionedMatch,
     Whereabouts,
@@ -26,7 +25,7 @@ from edgevpr.runtime.flight.navigation import (
     reckons_by_gps,
     worst_sd,
 )
-from edgevpr.runtime.flight.path import over_ground
+from edgevpr.runtime.flight.path import INERTIAL, RECKONED, over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviations that are added to that of a fix: the attitude is known to half a degree, and the time of a frame

@@ -54,7 +54,9 @@ class Recording(Tape):
         self._closing = threading.Event()
         try:
             Path(folder).mkdir(mode=0o750, exist_ok=True)
-            self.path = _new_folder(Path(folder))
+            last = max((int(each.name.rpartition("-")[2]) for each in recordings(Path(folder))), default=0)
+            self.path = Path(folder) / f"flight-{last + 1:04d}"
+            self.path.mkdir(mode=0o750)
             (self.path / FRAMES).mkdir(mode=0o750)
             self._tape = open_appending(self.path / TAPE)
         except OSError as error:
@@ -80,7 +82,8 @@ class Recording(Tape):
     def note(self, kind: str, *values: Any) -> None:
         """Record an event on the tape. May be called from any thread and from a signal handler; never blocks."""
         if self.state is None:
-            self._waiting.append(without_passwords(json.dumps([kind, *values], default=_encoded)).encode() + b"\n")
+            line = json.dumps([kind, *values], default=lambda data: b64encode(data).decode())
+            self._waiting.append(without_passwords(line).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
         """Record a picture, and return its number in this recording (1, 2, ...), by which `frame_path` finds it."""
@@ -156,18 +159,13 @@ class Recording(Tape):
 
     def _delete_oldest(self) -> None:
         *earlier, _ = recordings(self.path.parent)
-        taken = {folder: _size(folder) for folder in earlier}
+        taken = {each: sum(file.stat().st_size for file in each.rglob("*") if file.is_file()) for each in earlier}
         for folder in earlier:
             if sum(taken.values()) <= self._most_bytes:
                 return
             shutil.rmtree(folder)
             del taken[folder]
             _log.info("the recording %s is deleted, to make room for this flight's", folder)
-
-
-def _encoded(data: bytes) -> str:
-    """Encode bytes as base64 text for JSON."""
-    return b64encode(data).decode()
 
 
 def frame_path(folder: Path, number: int) -> Path:
@@ -202,16 +200,3 @@ def recordings(folder: Path) -> list[Path]:
     """List the folders of the recordings in `folder`, oldest first."""
     numbered = [(int(found[1]), each) for each in folder.iterdir() if (found := _FOLDER.fullmatch(each.name))]
     return [each for _, each in sorted(numbered)]
-
-
-def _new_folder(folder: Path) -> Path:
-    while True:
-        last = max((int(each.name.rpartition("-")[2]) for each in recordings(folder)), default=0)
-        path = folder / f"flight-{last + 1:04d}"
-        with suppress(FileExistsError):  # taken by another flight that has just begun
-            path.mkdir(mode=0o750)
-            return path
-
-
-def _size(folder: Path) -> int:
-    return sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())

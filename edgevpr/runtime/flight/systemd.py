@@ -5,6 +5,7 @@ The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket th
 
 import os
 import socket
+from contextlib import suppress
 
 from edgevpr.core.text import shown
 
@@ -19,25 +20,19 @@ def is_there() -> bool:
     return "NOTIFY_SOCKET" in os.environ
 
 
-def notify(**assignments: object) -> bool:
-    """Send assignments, such as READY=1, WATCHDOG=1 or STATUS="12 places". Returns True if they were sent.
-
-    Never raises: a flight must not end because nobody listens.
-    """
+def notify(**assignments: object) -> None:
+    """Send assignments, such as READY=1, WATCHDOG=1 or STATUS="12 places". Never raises: a flight must not end because
+    nobody listens."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
-        return False
+        return
     if address[0] == "@":  # a name in the abstract namespace, which begins with a zero byte
         address = "\0" + address[1:]
     # A line break in a value would begin an assignment of its own.
     lines = (f"{key}={shown(' '.join(str(value).splitlines()))}" for key, value in assignments.items())
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-            sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it
-            sender.sendto("\n".join(lines).encode("utf-8"), address)
-    except OSError:
-        return False
-    return True
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+        sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it
+        sender.sendto("\n".join(lines).encode("utf-8"), address)
 
 
 def watchdog_interval_s() -> float | None:

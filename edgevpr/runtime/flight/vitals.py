@@ -28,10 +28,10 @@ class Vitals:
     """Pings the watchdog of systemd, and reports once a second how the flight goes to systemd and to the status file,
     and the state of this computer to the autopilot. It reports once, through the herald, when the camera is lost,
     frozen, damaged or shows nothing, when nothing can be recognised any more, and when each of these is over. `remarks`
-    are functions that return a sentence for the status, or None."""
+    returns sentences for the status; those that are None are left out."""
 
     def __init__(
-        self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Sequence[Callable[[], str | None]]
+        self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Callable[[], Sequence[str | None]]
     ) -> None:
         self._crew, self._tally, self._pace, self._commands, self._remarks = crew, tally, pace, commands, remarks
         self._watchdog_s = systemd.watchdog_interval_s()
@@ -46,15 +46,13 @@ class Vitals:
         self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
 
     def tell(self, event: Recognition) -> None:
-        """Keep an event, if it is a query, as the newest query and, if it was accepted, as the newest match, for the
-        status."""
+        """Keep an event for the status, if it is a query."""
         if event.frame and event.is_query:
             self._newest = {"t_frame_s": event.frame.t_mono_s, **_seen(event)}
             self._match = self._newest if event.accepted else self._match
 
     def beat(self) -> None:
-        """Ping the watchdog and report, if due, and log the answers to fixes that have come. Call it in every pass of
-        the loop."""
+        """Ping the watchdog and report, if due, and log the answers to fixes. Call it in every pass of the loop."""
         now_s = self._crew.clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s:
             systemd.notify(WATCHDOG=1)
@@ -97,13 +95,13 @@ class Vitals:
         )
 
     def _look_at_log(self) -> None:
-        """Report to the ground station if the flight log cannot be written, and when it can again; the journal has the
-        reason."""
+        """Tell the ground station if the flight log cannot be written, and when it can; the journal has the reason."""
         has_log = self._crew.flight_log.is_written
         if has_log != self._has_log:
             self._has_log = has_log
             text = f"flight log {'is written again' if has_log else 'cannot be written'}"
-            self._crew.herald.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
+            if self._crew.link:
+                self._crew.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
     def _health(self) -> Health:
         if self._source_trouble:
@@ -153,15 +151,15 @@ class Vitals:
             "newest": self._newest,
             "match": self._match,
             "link": crew.autopilot.state() if crew.autopilot else None,
-            "remarks": [text for remark in self._remarks if (text := remark())],
+            "remarks": [remark for remark in self._remarks() if remark],
         }
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
 
     def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
-        """Add a measurement, and return (queries per second, cores kept busy) since the oldest one kept; both are None
-        if there is no older one. `elapsed_s` and `cpu_s` are the time and the CPU time since the start."""
+        """Return queries per second and cores kept busy over the last reports (None: this is the first one).
+        `elapsed_s` and `cpu_s` are the time and the CPU time since the start."""
         self._looks.append((elapsed_s, self._tally.queries, cpu_s))
         begin_s, queries, begin_cpu_s = self._looks[0]
         span_s = elapsed_s - begin_s

@@ -97,13 +97,12 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """External parts of a flight: all that it reads from and writes to. A test or a replay replaces them.
+    """External parts of a flight: all that it reads from and writes to. A replay replaces them.
     - `place_map`: path of the map (None: none is configured); `log`: settings of the flight log
-    - `tape`: records all input of the flight, or plays it back (see `Tape`); `clock`: the clocks
+    - `tape`: records all input of the flight, or plays it back (see `Tape`)
     - `open_source`: opens the source of frames, given the seconds between two frames
     - `link`, `ground`: classes of the links to the autopilot and to the ground station
     - `signing`: of their packets; `tap`: is called with each packet sent or received
-    - `stop`: the signal handler that ends the flight
     - `status`: the status file (None: none is written); `recording`: folder of the recording (None: there is none).
     """
 
@@ -124,9 +123,8 @@ class World:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crew:
-    """All opened parts of a flight that work together. None means: `learner`, no places are learnt; `link`, `ground`
-    and `autopilot`, there is no such link; `status`, no status file is written. `fewer_candidates` are the numbers of
-    candidates that the governor may lower to."""
+    """All opened parts of a flight that work together; None: the flight has no such part. `fewer_candidates` are the
+    numbers of candidates that the governor may lower to."""
 
     recogniser: Recogniser
     learner: Learner | None = None
@@ -166,8 +164,6 @@ def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]
         tape.note("flight", header)
         status_path = config.status.file or usual_path()
         status = _or_without(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
-        if config.log.tlog and not config.mavlink.link:
-            _log.warning("there is no link, so there is no tlog either")
         tlog_path = config.log.tlog if config.mavlink.link else None
         tlog = _or_without(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
 

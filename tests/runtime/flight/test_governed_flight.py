@@ -19,8 +19,6 @@ BUSY = LoadReading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40
 class Scripted(FlightMeter):
     """A meter that reads what stands in a script, a reading a turn, and calm after its end."""
 
-    age_s = 1.0
-
     def __init__(self, battery, board, clock, *, readings):
         super().__init__(battery, board, clock)
         self._readings, self._begin_s, self._now = readings, clock.mono_s(), clock.mono_s

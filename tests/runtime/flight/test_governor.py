@@ -2,13 +2,15 @@
 
 import itertools
 import random
+from dataclasses import replace
 
 import pytest
 
-from edgevpr.runtime.flight.governor import Change, Governor, Limits, Setting, lowered, steps
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.flight.governor import Change, Governor, Setting, steps
 from edgevpr.runtime.flight.metering import LoadReading
 
-LIMITS = Limits(cpu_share=0.5, memory_max_mb=512, temperature_c=80)
+BOARD, LIMIT_C = replace(load_board("rpi-4b"), cpu_share=0.5, memory_max_mb=512), 80
 ASKED = Setting(2.0, 40)
 
 
@@ -26,7 +28,7 @@ class Flight:
 
     def __init__(self, reading, settings=None):
         self.settings = settings or steps(ASKED, keeps_rate=False, fewer=(20,))
-        self.governor = Governor(LIMITS, self.settings)
+        self.governor = Governor(BOARD, LIMIT_C, self.settings)
         self.reading, self.now_s = reading, 0.0
         self.changes = []
 
@@ -71,7 +73,7 @@ def test_it_goes_back_in_the_opposite_order():
     assert flight.governor.setting == Setting(0.25, 20)
     flight.fly(600)
     assert [change.after for _, change in flight.changes if change.back] == [*reversed(flight.settings[:-1])]
-    assert flight.governor.setting == flight.governor.asked == ASKED
+    assert flight.governor.setting == ASKED
 
 
 def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidates():
@@ -84,8 +86,10 @@ def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidate
 
 
 def test_what_is_lowered_is_said_in_a_few_words():
-    assert lowered(ASKED, ASKED) == ""
-    assert lowered(Setting(0.5, 20), Setting(2.0, 40)) == "0.5 of 2 Hz, 20 of 40 candidates"
+    flight = Flight(lambda setting, now_s: BUSY)
+    assert flight.governor.held is None
+    flight.fly(60)
+    assert flight.governor.held == "held to 0.25 of 2 Hz, 20 of 40 candidates"
 
 
 def test_a_short_peak_changes_nothing():

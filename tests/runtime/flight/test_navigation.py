@@ -8,9 +8,9 @@ from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.filter import INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch
 from edgevpr.runtime.flight.navigator import Slew
+from edgevpr.runtime.flight.path import INERTIAL, RECKONED
 
 HOME = 47.0, 8.0
 STEP_S = 0.02

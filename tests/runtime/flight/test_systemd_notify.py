@@ -19,7 +19,7 @@ def manager(tmp_path, monkeypatch):
 
 
 def test_all_assignments_arrive_in_one_datagram(manager):
-    assert notify(READY=1, STATUS="240 places of cohog")
+    notify(READY=1, STATUS="240 places of cohog")
     assert manager.recv(4096) == b"READY=1\nSTATUS=240 places of cohog"
 
 
@@ -29,7 +29,7 @@ def test_an_abstract_socket_is_reached(monkeypatch):
         receiver.settimeout(5)
         receiver.bind("\0" + name)
         monkeypatch.setenv("NOTIFY_SOCKET", "@" + name)
-        assert notify(WATCHDOG=1)
+        notify(WATCHDOG=1)
         assert receiver.recv(4096) == b"WATCHDOG=1"
 
 
@@ -45,23 +45,23 @@ def test_neither_a_password_nor_an_escape_gets_into_the_status(manager):
 
 def test_without_systemd_nothing_is_sent(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    assert not notify(READY=1)
+    notify(READY=1)
 
 
 @pytest.mark.parametrize("address", ["/nowhere/notify", "vsock:2:1234", "/" + "x" * 200, "@" + "x" * 200])
 def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
     monkeypatch.setenv("NOTIFY_SOCKET", address)
-    assert not notify(WATCHDOG=1)
+    notify(WATCHDOG=1)
 
 
 @pytest.mark.slow
 def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
-    sent = [notify(WATCHDOG=1)]
-    while sent[-1] and len(sent) < 10_000:
-        sent.append(notify(WATCHDOG=1))
-    assert not sent[-1]
-    manager.recv(4096)
-    assert notify(WATCHDOG=1)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            while True:
+                other.sendto(b"x", manager.getsockname())
+    notify(WATCHDOG=1)
 
 
 def test_the_watchdog_is_fed_twice_in_its_time(monkeypatch):
