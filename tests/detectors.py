@@ -1,4 +1,4 @@
-"""Cards of three object detectors, for tests and benchmarks. Their files are no part of edgevpr: they are looked for in
+"""Cards of two object detectors, for tests and benchmarks. Their files are no part of edgevpr: they are looked for in
 $EDGEVPR_DETECTORS, by default ../shared/models beside the project.
 """
 
@@ -9,7 +9,7 @@ from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.techniques.session import file_sha256
 
 FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
-NAMES = ("fastestdet", "nanodet_m_320", "yolox_nano")
+NAMES = ("fastestdet", "yolox_nano")
 # Of the eighty classes of COCO those that move (thesis 3.2.2), with their numbers.
 _DYNAMIC = {
     "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
@@ -23,14 +23,6 @@ _SAID = {
         "outputs": {"boxes": ["758"]},
         # On views from the air it finds much below that which is not there.
         "detector": {"family": "fastestdet", "min_score": 0.65, "dynamic": _DYNAMIC},
-    },
-    "nanodet_m_320": {
-        "input": {
-            **_INPUT, "height": 320, "width": 320, "scale": 1.0,
-            "mean": [103.53, 116.28, 123.675], "std": [57.375, 57.12, 58.395],
-        },
-        "outputs": {"boxes": [f"{of}_pred_stride_{stride}" for of in ("cls", "dis") for stride in (8, 16, 32)]},
-        "detector": {"family": "nanodet", "min_score": 0.4, "dynamic": _DYNAMIC},
     },
     "yolox_nano": {
         "input": {**_INPUT, "height": 416, "width": 416, "scale": 1.0, "pad": 114},

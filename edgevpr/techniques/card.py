@@ -28,7 +28,7 @@ class InputRule:
     stretched: it keeps its proportions in the upper left corner, and the rest has that level. `layout` is the order of
     the axes of the input and of feature maps."""
 
-    layout: str = key(choices=("NCHW", "NHWC"))
+    layout: str = key(choices=("NCHW",))
     height: int = bounded(8, 4096)
     width: int = bounded(8, 4096)
     colour: str = key(choices=("grey", "bgr", "rgb"))
@@ -57,7 +57,7 @@ class DetectorRule:
     """Decoding of the outputs `boxes` of an object detector, by the decoder of its `family`. `dynamic` are the classes
     of movable things, such as cars, each with its number in the outputs. A box counts from the score `min_score` on."""
 
-    family: str = key(choices=("yolox", "fastestdet", "nanodet"))
+    family: str = key(choices=("yolox", "fastestdet"))
     dynamic: dict[str, int]
     min_score: float = bounded(0.01, 1)
 
@@ -75,7 +75,7 @@ class Card:
     source: str
     input: InputRule
     outputs: Outputs
-    similarity: str = key(choices=("cosine", "l1", "l2"), default="cosine")
+    similarity: str = key(choices=("cosine", "l1"), default="cosine")
     detector: DetectorRule | None = None
 
     @property

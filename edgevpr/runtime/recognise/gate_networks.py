@@ -1,15 +1,11 @@
-"""Networks of the gate, each with a card: one tells how well the parts of a frame can be remembered, the other which of
-its pixels show nothing movable.
+"""Networks of the gate, each with a card: one tells how well the parts of a frame can be remembered (thesis 3.2.1), the
+other, an object detector, which of its pixels show nothing movable (thesis 3.2.2).
 
-Memorability (thesis 3.2.1): the picture is cut into 5x5 crops that do not overlap. For each crop the network gives its
-memorability, 0..1. Between the middles of the crops values are interpolated. `benchmarks/matchability.py` fits a
-network of another meaning: how likely a crop is to be found again in another picture.
+`benchmarks/matchability.py` fits a network of memorability of another meaning: how likely a crop is to be found again
+in another picture.
 
-Staticity, by an object detector (thesis 3.2.2): the section `detector` of its card names the dynamic classes, such as
-cars. Only the pixels that their boxes cover count, so overlapping boxes are kept.
-
-Detectors of one family have outputs of the same form, and each family has a decoder here. A decoder takes the outputs
-in the order of the card and the input's (height, width) in pixels, and returns
+Each family of detectors has a decoder here. It takes the outputs in the order of the card and the input's (height,
+width) in pixels, and returns
 
 * `boxes`, float32 (N, 4): left, top, right, bottom as shares of the input; they may reach beyond it,
 * `scores`, float32 (N, C): the score of each class, 0..1.
@@ -34,7 +30,7 @@ _MOST_TILES = 4  # along each side; each tile is a run of the network
 _OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
 CROPS = 5  # along each side; the thesis's C is 5x5
 _SEED = 7
-_STRIDES_PX = (8, 16, 32)  # of the grids of yolox and nanodet
+_STRIDES_PX = (8, 16, 32)  # of the grids of yolox
 _LARGEST_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
 
 Decoded = tuple[Floats, Floats]
@@ -70,7 +66,7 @@ class Memorability:
 
 def prepared_crops(image: Image, rule: InputRule) -> Singles:
     """Cut uint8 (H, W[, 3]), at least 5 pixels along each side, into crops, row by row, and prepare them for a network:
-    float32 (25, C, height, width), or (25, height, width, C) for an input in the order NHWC."""
+    float32 (25, C, height, width)."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
     return np.concatenate([prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns])
 
@@ -147,10 +143,16 @@ def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode (1, N, 5 + C), the cells of three grids in turn (Ge et al. 2021, arXiv 2107.08430). Each has the offset of
     the centre in cells, the logarithms of the sides in cells, the score of an object, and the scores of the classes."""
     values = outputs[0][0]
-    cells, stride_px = _grids(size_px)
-    centre_px = (values[:, :2] + cells) * stride_px
+    (height, width), cells, strides = size_px, [], []
+    for stride in _STRIDES_PX:
+        grid = np.stack(np.meshgrid(np.arange(-(-width // stride)), np.arange(-(-height // stride))), -1)
+        cells.append(grid.reshape(-1, 2))
+        strides.append(np.full((len(cells[-1]), 1), stride))
+    stride_px = np.concatenate(strides).astype(np.float32)
+    centre_px = (values[:, :2] + np.concatenate(cells).astype(np.float32)) * stride_px
     side_px = np.exp(np.minimum(values[:, 2:4], _LARGEST_LOG)) * stride_px
-    return _boxes(centre_px - side_px / 2, centre_px + side_px / 2, size_px), values[:, 4:5] * values[:, 5:]
+    boxes = np.concatenate([centre_px - side_px / 2, centre_px + side_px / 2], 1) / (width, height, width, height)
+    return boxes.astype(np.float32), values[:, 4:5] * values[:, 5:]
 
 
 def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
@@ -166,39 +168,7 @@ def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     return boxes, np.moveaxis(scores, 0, -1).reshape(-1, len(scores))
 
 
-def nanodet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
-    """Decode scores (1, N, C) for each of the strides 8, 16 and 32, then distances (1, N, 4 x bins) for each (Li et al.
-    2020, arXiv 2006.04388). A distance from the cell's middle to a side is a distribution over whole strides."""
-    levels = len(_STRIDES_PX)
-    scores = np.concatenate([part[0] for part in outputs[:levels]])
-    said = np.concatenate([part[0] for part in outputs[levels:]])
-    cells, stride_px = _grids(size_px)
-    logits = said.reshape(len(said), 4, -1)
-    shares = np.exp(logits - logits.max(-1, keepdims=True))
-    distance_px = (shares @ np.arange(shares.shape[-1])) / shares.sum(-1) * stride_px
-    middle_px = (cells + 0.5) * stride_px
-    return _boxes(middle_px - distance_px[:, :2], middle_px + distance_px[:, 2:], size_px), scores
-
-
 _DECODERS: dict[str, Callable[[Sequence[Floats], tuple[int, int]], Decoded]] = {
     "yolox": yolox,
     "fastestdet": fastestdet,
-    "nanodet": nanodet,
 }
-
-
-def _grids(size_px: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return for all cells of the three grids column and row, float32 (N, 2), and the stride in pixels, (N, 1)."""
-    cells, strides = [], []
-    for stride in _STRIDES_PX:
-        rows, columns = (-(-side // stride) for side in size_px)
-        grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
-        cells.append(grid)
-        strides.append(np.full((len(grid), 1), stride))
-    return np.concatenate(cells).astype(np.float32), np.concatenate(strides).astype(np.float32)
-
-
-def _boxes(least_px: Floats, most_px: Floats, size_px: tuple[int, int]) -> Floats:
-    """Return boxes float32 (N, 4), as shares of the input, of left top and right bottom corners (N, 2) in pixels."""
-    height, width = size_px
-    return (np.concatenate([least_px, most_px], 1) / (width, height, width, height)).astype(np.float32)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.gate_networks import fastestdet, nanodet, yolox
+from edgevpr.runtime.recognise.gate_networks import fastestdet, yolox
 
 RNG = np.random.default_rng(3)
 
@@ -52,24 +52,3 @@ def test_fastestdet_cell_by_cell():
             wanted = [middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1]]
             assert boxes[at] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
             assert scores[at] == pytest.approx([thing**0.6 * each**0.4 for each in named], rel=1e-4)
-
-
-def test_nanodet_cell_by_cell():
-    height, width, classes, bins = 64, 96, 3, 8
-    shapes = [(height // stride, width // stride, stride) for stride in (8, 16, 32)]
-    named = [RNG.random((1, rows * columns, classes)).astype(np.float32) for rows, columns, _ in shapes]
-    sides = [RNG.normal(0, 1, (1, rows * columns, 4 * bins)).astype(np.float32) for rows, columns, _ in shapes]
-    boxes, scores = nanodet([*named, *sides], (height, width))
-    assert np.array_equal(scores, np.concatenate([part[0] for part in named]))
-    at = 0
-    for (rows, columns, stride), part in zip(shapes, sides, strict=True):
-        for cell in range(rows * columns):
-            x, y = (cell % columns + 0.5) * stride, (cell // columns + 0.5) * stride
-            distances = []
-            for side in part[0, cell].reshape(4, bins):
-                shares = [math.exp(value) for value in side]
-                distances.append(sum(k * share for k, share in enumerate(shares)) / sum(shares) * stride)
-            left, up, right, down = distances
-            wanted = [(x - left) / width, (y - up) / height, (x + right) / width, (y + down) / height]
-            assert boxes[at] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
-            at += 1
