@@ -243,12 +243,8 @@ def changed_config(config: Config, path: str | Path) -> Config:
 def with_logs_in(config: Config, folder: str) -> Config:
     """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
     `folder`."""
-
-    def meant_from(path: str | None) -> str | None:
-        return path and os.path.join(folder, path)
-
-    log = config.log
-    log = replace(log, path=meant_from(log.path), tlog=meant_from(log.tlog), record=meant_from(log.record))
+    paths = {name: getattr(config.log, name) for name in ("path", "tlog", "record")}
+    log = replace(config.log, **{name: path and os.path.join(folder, path) for name, path in paths.items()})
     return replace(config, log=log)
 
 

@@ -1,5 +1,4 @@
-"""Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, progress, and figures drawn
-with matplotlib."""
+"""Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, and progress."""
 
 import json
 import logging
@@ -13,11 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from difflib import get_close_matches
 from itertools import zip_longest
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
-
-from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.files import require_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +25,6 @@ _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _COLUMNS, _TERMINAL_COLUMNS = 120, 79
 _SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
-_PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -162,18 +156,6 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")
         stream.flush()
-
-
-def require_picture(path: Path) -> None:
-    """Check, before the work, that a figure can be written to `path`. Raises UsageError for a wrong file name or a
-    missing folder, EdgevprError if matplotlib is missing."""
-    if path.suffix.lower() not in _PICTURE_ENDINGS:
-        raise UsageError(f"{path}: a picture's name ends in {', '.join(_PICTURE_ENDINGS)}: choose one of these.")
-    require_folder(path)
-    try:
-        figure(1.0, 1.0)
-    except ImportError as error:
-        raise EdgevprError(f'{error}: pictures need matplotlib; pip install "edgevpr[plots]".') from error
 
 
 def figure(width_in: float, height_in: float) -> "Figure":
