@@ -28,16 +28,12 @@ def shipped(kind: str) -> Path:
     return in_wheel if in_wheel.is_dir() else package.parent / kind
 
 
-def own_folder() -> Path:
-    """Return the user's own folder, which may not exist: `edgevpr` in XDG_DATA_HOME or ~/.local/share."""
-    # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
-    return Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")) / "edgevpr"
-
-
 def own_models() -> Path:
     """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
-    models in the user's own folder (`edgevpr` in XDG_DATA_HOME or ~/.local/share)."""
-    return Path(os.environ.get("EDGEVPR_MODELS") or own_folder() / "models")
+    edgevpr/models in XDG_DATA_HOME or ~/.local/share."""
+    # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
+    data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
+    return Path(os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models"))
 
 
 def model_folders() -> tuple[Path, ...]:
