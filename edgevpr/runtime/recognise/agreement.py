@@ -1,10 +1,10 @@
 """Verification of the best place by landmarks, which had no part in finding it, and the agreement of two pictures: how
 many of their landmarks coincide after one rotation, one scaling and one shift.
 
-It is for cameras that look straight down only: ahead, near and far landmarks shift by different amounts. The query is
-the picture that is looked for, a place a picture of the map. Points are complex numbers here, x + iy (to the right,
-down), as shares of the longest side from the picture's middle. A *way* to lay the query on the place is two of them: a
-point is multiplied by the first (rotation and scale), then the second (the shift) is added.
+It is for cameras that look straight down only: ahead, near and far landmarks shift by different amounts. Points are
+complex numbers here, x + iy (to the right, down), as shares of the longest side from the picture's middle. A *way* to
+lay the query on the place is two of them: a point is multiplied by the first (rotation and scale), then the second (the
+shift) is added.
 
 Two landmarks match if each is the most similar one of the other picture. Every two of the best matches define one way.
 The way that most of all matches follow is taken. Nothing is random: the same pictures always give the same result.
@@ -13,6 +13,7 @@ The way that most of all matches follow is taken. Nothing is random: the same pi
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -90,13 +91,6 @@ class Agreement:
     is_expected: bool = True
 
     @property
-    def way(self) -> tuple[complex, complex] | None:
-        """The way to lay the query on the place, as two complex numbers (see the module); None without inliers."""
-        if self.shift_share is None or self.rotation_deg is None or self.scale is None:
-            return None
-        return complex(self.scale * np.exp(1j * np.radians(self.rotation_deg))), complex(*self.shift_share)
-
-    @property
     def is_at_rest(self) -> bool:
         """True if the pictures coincide without shift, turn or scaling, as a display drawn over all pictures does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
@@ -112,18 +106,20 @@ def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
     if found.inliers >= CONFIRMED:
         return found
     otherwise = agreement(query, place)
-    way = otherwise.way
-    if way is None or otherwise.inliers < PROVEN or otherwise.is_at_rest or _is_near(*way, expected):
+    if otherwise.inliers < PROVEN or otherwise.is_at_rest or otherwise.shift_share is None:
         return found  # an agreement at rest may come from a display, not from the ground
-    return replace(otherwise, is_expected=False)
+    turn_scale = (otherwise.scale or 1.0) * np.exp(1j * np.radians(otherwise.rotation_deg or 0.0))
+    is_near = _is_near(complex(turn_scale), complex(*otherwise.shift_share), expected)
+    return found if is_near else replace(otherwise, is_expected=False)
 
 
 def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
     """Compare the landmarks of two pictures. Only ways to lay the query on the place that are near to the `expected`
     overlay are tried (None: all ways)."""
     possible = min(len(query), len(place))
+    nothing = Agreement(inliers=0, matched=0, possible=possible)
     if possible < _FEWEST:
-        return Agreement(inliers=0, matched=0, possible=possible)
+        return nothing
     asked, known = _complex(query), _complex(place)
     differing = _differing_bits(query.bits, place.bits)
     if expected is not None:
@@ -134,7 +130,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
     mutual = mutual[np.argsort(least[mutual], kind="stable")]
     asked, known = asked[mutual].astype(complex), known[best[mutual]].astype(complex)
     way = _most_followed(asked, known, expected)
-    nothing = Agreement(inliers=0, matched=len(mutual), possible=possible)
+    nothing = replace(nothing, matched=len(mutual))
     if way is None:
         return nothing
     for _ in range(3):
@@ -148,10 +144,9 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
         return nothing
     turn_scale, shift = way
     variance = _variance(asked[along], known[along], turn_scale, shift)
-    return Agreement(
+    return replace(
+        nothing,
         inliers=inliers,
-        matched=len(mutual),
-        possible=possible,
         shift_share=(float(shift.real), float(shift.imag)),
         rotation_deg=float(np.angle(turn_scale, deg=True)) % 360,
         scale=float(abs(turn_scale)),
@@ -168,9 +163,11 @@ class Verification:
     """Compares the landmarks of one query, which are computed when first needed, with those of places."""
 
     def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
-        self._spec, self.picture = spec, picture
-        self._index, self._map = index, place_map
-        self._query: Landmarks | None = None
+        self._spec, self.picture, self._index, self._map = spec, picture, index, place_map
+
+    @cached_property
+    def _query(self) -> Landmarks:
+        return describe(self.picture.image, self.picture.mask, OF_QUERY)
 
     def proof(self, ranking: Ranking) -> Agreement | None:
         """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that the
@@ -180,7 +177,7 @@ class Verification:
         Raises PlaceError if the landmarks of the place cannot be read; the place is then left out.
         """
         expected, known = self._place(ranking, int(ranking.slots[0]))
-        return held_against(self._of_query(), known, expected) if expected and known is not None else None
+        return held_against(self._query, known, expected) if expected and known is not None else None
 
     def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
@@ -191,7 +188,7 @@ class Verification:
         if not len(away):
             return 0
         expected, known = self._place(ranking, int(away[0]))
-        return OF_PLACE if known is None else agreement(self._of_query(), known, expected).inliers
+        return OF_PLACE if known is None else agreement(self._query, known, expected).inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Of the best few places compared, return the numbers of those that show the same ground as the best one: their
@@ -227,12 +224,6 @@ class Verification:
             return expected, None if blob is None else unpacked(blob)
         return expected, None
 
-    def _of_query(self) -> Landmarks:
-        """Return the landmarks of the query, computed at the first call."""
-        if self._query is None:
-            self._query = describe(self.picture.image, self.picture.mask, OF_QUERY)
-        return self._query
-
 
 def _complex(landmarks: Landmarks) -> Array:
     """Return the points of landmarks as complex64 (K,), x + iy."""
@@ -252,8 +243,7 @@ def _turn_scale(expected: Overlay) -> np.complex64:
 
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
     """Return bool (N, M): True where a landmark of the query can be that landmark of the place, by position, direction
-    and size, if the query lies on the place about as `expected`. `asked` (N,) and `known` (M,) are the points of query
-    and place."""
+    and size, if the query lies on the place about as `expected`. `asked` (N,) and `known` (M,) are their points."""
     factor = _ANY_SCALE if expected.scale is None else _SCALE
     laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
@@ -278,9 +268,8 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 
 def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
-    """Return the way that most matches follow, out of those that two matches define; None if no way is near to the
-    expected overlay. `asked` and `known`, complex (n,), are the points of the matches in query and place, best matches
-    first."""
+    """Return the way that most matches follow, out of those that two matches define; None if none is near to the
+    expected overlay. `asked` and `known`, complex (n,), are the points in query and place, best matches first."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)
     apart = np.abs(asked[other] - asked[one]) > _APART
     one, other = one[apart], other[apart]
@@ -306,8 +295,7 @@ def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
 
 
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers:
-    their points `asked` in the query and `known` in the place, complex (n,) each."""
+    """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
     per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE / 10) ** 2)
     middle = asked.mean()
