@@ -26,9 +26,9 @@ class InputRule:
     number, or one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the
     interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it is not
     stretched: it keeps its proportions in the upper left corner, and the rest has that level. `layout` is the order of
-    the axes of the input and of feature maps."""
+    the axes of the input and of feature maps, NCHW."""
 
-    layout: str = key(choices=("NCHW",))
+    layout: str
     height: int = bounded(8, 4096)
     width: int = bounded(8, 4096)
     colour: str = key(choices=("grey", "bgr", "rgb"))
@@ -154,6 +154,8 @@ def _problems(card: Card, sha256: str) -> Iterator[str]:
     per_channel = f"write one number or {channels}, one a channel"
     if not re.fullmatch(sha256, card.sha256):
         yield f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints."
+    if card.input.layout != "NCHW":
+        yield f"`input.layout` is `{card.input.layout:.20}`: export the network again with the axes in the order NCHW."
     if card.file in ("", ".", "..") or "/" in card.file:
         yield f"`file` is `{card.file}`: write the name of a file that lies beside the card."
     if card.file.lower().endswith((".yaml", ".yml")):

@@ -19,14 +19,16 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image, Ints, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
-from edgevpr.core.errors import UsageError
-from edgevpr.techniques.pooling import regional_vectors, square_regions, unit
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import VectorTechnique
-from edgevpr.techniques.words import bag_of_words, load_words
+from edgevpr.techniques.words import bag_of_words, load_words, unit
 
 _TINY = 1e-12
 Describe = Callable[[Singles], tuple[Singles, Singles]]
+Square = tuple[int, int, int]  # top, left, side, in cells of a feature map
+_RMAC_OVERLAP = 0.4  # wanted, of neighbouring squares (Tolias et al. 2016, section 3.2)
+_RMAC_SCALES = 3
 
 
 class RegionTechnique(VectorTechnique):
@@ -114,6 +116,43 @@ def region_backbone(technique: str, model: str, threads: int, regions: int) -> B
     if not 1 <= regions <= 10_000:
         raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
     return open_backbone(model, "features", threads)
+
+
+def square_regions(height: int, width: int) -> list[Square]:
+    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2), in its cells.
+
+    At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
+    one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
+    Raises ModelError for a feature map less than 2 wide.
+    """
+    short, long = min(height, width), max(height, width)
+    if 2 * short // (_RMAC_SCALES + 1) < 1:
+        raise ModelError(
+            f"A feature map of {height}x{width} is too small for the regions of R-MAC: it must be at least 2 wide."
+        )
+    # A square feature map has one region at the first scale; for others 2 to 7 are tried, as in the authors' code.
+    m = (
+        1
+        if long == short
+        else min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP))
+    )
+    regions = []
+    for scale in range(1, _RMAC_SCALES + 1):
+        side = 2 * short // (scale + 1)
+        down, across = (scale, scale + m - 1) if height <= width else (scale + m - 1, scale)
+        regions += [(top, left, side) for top in _starts(height, side, down) for left in _starts(width, side, across)]
+    return regions
+
+
+def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
+    """Return the largest activation of each channel in each of R squares, of length 1: (C, H, W) to float32 (R, C). The
+    signed square root is taken first, the power normalisation of the thesis (4.2); the paper whitens by PCA."""
+    vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
+    return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
+
+
+def _starts(length: int, side: int, count: int) -> list[int]:
+    return [i * (length - side) // max(count - 1, 1) for i in range(count)]
 
 
 def find_regions(features: Singles, count: int) -> Ints:

@@ -143,8 +143,6 @@ def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
             f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
             "the picture shows nothing at all."
         )
-    if output == "features" and card.input.layout == "NHWC":
-        values = np.ascontiguousarray(values.transpose(2, 0, 1))
     return values
 
 
@@ -178,8 +176,8 @@ def _in_one_line(error: Exception) -> str:
 
 def prepare(image: Array, rule: InputRule) -> Singles:
     """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
-    width), or (1, height, width, C) for the layout NHWC. Histogram equalisation is that of CALC: the histogram of Y of
-    BGR as YUV is equalised before the picture is made grey and smaller."""
+    width). Histogram equalisation is that of CALC: the histogram of Y of BGR as YUV is equalised before the picture is
+    made grey and smaller."""
     if rule.equalise and image.ndim == 2:
         image = cv2.equalizeHist(image)
     elif rule.equalise:
@@ -202,7 +200,7 @@ def prepare(image: Array, rule: InputRule) -> Singles:
     values -= np.array(rule.mean, np.float32)
     if rule.std is not None:
         values /= np.array(rule.std, np.float32)
-    return np.ascontiguousarray(values[None] if rule.layout == "NHWC" else values.transpose(2, 0, 1)[None])
+    return np.ascontiguousarray(values.transpose(2, 0, 1)[None])
 
 
 def shares(image: Array, rule: InputRule) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bytes, Doubles, Image, Ints, Mask, Singles
+from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
@@ -32,9 +32,9 @@ class VectorTechnique:
     """Base class of the techniques that describe a picture by one vector, and compare it with the vectors of all places
     in RAM; a subclass implements `vector`. `form` says how the vectors are kept in RAM, see above.
 
-    `similarity` is "cosine", "l1" or "l2"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
+    `similarity` is "cosine" or "l1"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
     For "cosine", the score in the form `float` is the cosine (0 if negative), and in `8bit` it is (1 + cosine) / 2 of
-    the vectors from which the map's mean is subtracted. For "l1" and "l2" it is 1 / (1 + distance). In `1bit` it is the
+    the vectors from which the map's mean is subtracted. For "l1" it is 1 / (1 + distance). In `1bit` it is the
     share of equal bits. `margins` are the minimum margins of an accepted match in the forms `float`, `8bit` and `1bit`,
     known for the shipped weights. With another `model` no match is accepted until the configuration sets a minimum
     margin.
@@ -116,26 +116,16 @@ class VectorTechnique:
             rows[block, self._length :] = np.stack([step, length], axis=1).astype("<f4").view(np.int8)
         return rows
 
-    def coarse_scores(
-        self,
-        query: Descriptor,
-        rows: Array,
-        mean: Singles | None = None,
-        turned_deg: Doubles | None = None,
-        height_ratio: float | None = None,
-    ) -> tuple[Singles, None]:
+    def coarse_scores(self, query: Descriptor, rows: Array, mean: Singles | None = None) -> tuple[Singles, None]:
         """Compare a query with all places, `rows` (N, *row shape): scores float32 (N,), all 0 for a query of zeros, and
-        None, since there are no hypotheses. `mean` is the map's (D,), which the form `float` does not need.
-        `turned_deg` and `height_ratio` are ignored."""
+        None, since there are no hypotheses. `mean` is the map's (D,), which the form `float` does not need."""
         vector = query.coarse.astype(np.float32)
         if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
         if mean is not None and self.spec.form != "float":
             vector -= mean
         if self.spec.form == "1bit":
-            code = np.zeros(self.spec.row.shape, np.uint8)
-            code[: -(-self._length // 8)] = np.packbits(vector > 0)
-            return (1 - hamming(code, rows) / np.float32(self._length)).astype(np.float32, copy=False), None
+            return self._equal_bits(vector, rows), None
         scores = np.empty(len(rows), np.float32)
         values = np.empty((min(self._at_once, len(rows)), self._length), np.float32)
         for start in range(0, len(rows), self._at_once):
@@ -144,6 +134,19 @@ class VectorTechnique:
             beside = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
             scores[start : start + len(part)] = self._compared(vector, values[: len(part)], beside)
         return scores, None
+
+    def _equal_bits(self, vector: Singles, rows: Bytes) -> Singles:
+        """Return the share of the bits in which n places, uint8 (n, B), are equal to a vector: float32 (n,)."""
+        code = np.zeros(self.spec.row.shape, np.uint8)
+        code[: -(-self._length // 8)] = np.packbits(vector > 0)
+        asked, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
+        different: Ints = np.empty(len(rows), np.uint16 if 8 * len(code) < 1 << 16 else np.uint32)
+        ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
+        at_once = max(1, _CODE_BYTES_AT_ONCE // len(code))
+        for start in range(0, len(rows), at_once):
+            block = slice(start, start + at_once)
+            different[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
+        return np.asarray(1 - different / np.float32(self._length), np.float32)
 
     def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
         """Score n places by their vectors `values`, float32 (n, D), which are overwritten. `beside` (2, n) are the
@@ -159,11 +162,7 @@ class VectorTechnique:
         if len(beside):
             values *= beside[0][:, None]
         values -= vector
-        if self._similarity == "l1":
-            scores = 1 / (1 + np.abs(values, out=values).sum(axis=1))
-        else:
-            scores = 1 / (1 + np.sqrt(np.einsum("nd,nd->n", values, values)))
-        return scores
+        return np.asarray(1 / (1 + np.abs(values, out=values).sum(axis=1)))
 
 
 class Hog(VectorTechnique):
@@ -193,16 +192,3 @@ class Hog(VectorTechnique):
         allowed = mask_square(mask, self._w1)
         cells = oriented_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
         return normalised_blocks(cells).ravel()
-
-
-def hamming(query: Bytes, codes: Bytes) -> Ints:
-    """Count the bits in which `query` uint8 (B,) differs from each of `codes` uint8 (N, B), with B a multiple of 8:
-    uint16 (N,), or uint32 for more than 8191 bytes."""
-    asked, places = query.view(np.uint64), np.ascontiguousarray(codes).view(np.uint64)
-    distances: Ints = np.empty(len(codes), np.uint16 if 8 * codes.shape[1] < 1 << 16 else np.uint32)
-    ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
-    at_once = max(1, _CODE_BYTES_AT_ONCE // codes.shape[1])
-    for start in range(0, len(codes), at_once):
-        block = slice(start, start + at_once)
-        distances[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
-    return distances

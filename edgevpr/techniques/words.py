@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgevpr.core.arrays import Ints, Singles
+from edgevpr.core.arrays import Array, Ints, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import arrays_of, find_model, read_file
 from edgevpr.techniques.card import load_card
-from edgevpr.techniques.pooling import unit
 
 _MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
 _TINY = 1e-12
@@ -52,6 +51,12 @@ def load_words(model: str, kind: str, count: int) -> Words:
         raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     return Words(words, sha256)
+
+
+def unit(vectors: Array) -> Array:
+    """Scale rows (or a single vector) to length 1; a zero vector stays zero."""
+    unit_vectors: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
+    return unit_vectors
 
 
 def local_descriptors(features: Singles) -> Singles:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.errors import ModelError
-from edgevpr.techniques import pooling, regions, words
+from edgevpr.techniques import network, regions, words
 
 
 def feature_map(seed: int, channels: int = 6, height: int = 7, width: int = 9, dead: float = 0.6) -> np.ndarray:
@@ -23,32 +23,32 @@ SIGNED = np.random.default_rng(9).normal(size=(5, 7, 9)).astype(np.float32)
 @pytest.mark.parametrize("levels", [1, 4, 7])
 def test_pyramid(levels):
     expected = literal.pyramid(SIGNED, range(1, levels + 1)).astype(np.float32)
-    np.testing.assert_array_equal(pooling.pyramid(SIGNED, levels), expected)
+    np.testing.assert_array_equal(network.pyramid(SIGNED, levels), expected)
 
 
 def test_what_is_too_small_is_refused():
     with pytest.raises(ModelError, match="8x8"):
-        pooling.pyramid(SIGNED, 8)
+        network.pyramid(SIGNED, 8)
     with pytest.raises(ModelError, match="R-MAC"):
-        pooling.square_regions(1, 30)
+        regions.square_regions(1, 30)
     with pytest.raises(ModelError, match="400"):
-        pooling.gaussian_projection(315, 400, seed=0)
+        network.gaussian_projection(315, 400, seed=0)
 
 
 @pytest.mark.parametrize(("size", "length"), [(60, 20), (61, 61), (2, 1)])
 def test_projection_is_the_product_with_its_matrix(size, length):
     vector = np.random.default_rng(3).normal(size=size).astype(np.float32)
-    row, signs = pooling.gaussian_row(size, seed=5)
-    project = pooling.gaussian_projection(size, length, seed=5)
+    row, signs = network.gaussian_row(size, seed=5)
+    project = network.gaussian_projection(size, length, seed=5)
     expected = literal.projected(vector, row, signs, length)
     np.testing.assert_allclose(project(vector), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_gaussian_row_is_the_same_everywhere_and_for_ever():
-    row, signs = pooling.gaussian_row(5, seed=7)
+    row, signs = network.gaussian_row(5, seed=7)
     np.testing.assert_allclose(row, ROW_OF_SEED_7, rtol=1e-12)
     assert signs.tolist() == SIGNS_OF_SEED_7
-    long, _ = pooling.gaussian_row(20_001, seed=1)
+    long, _ = network.gaussian_row(20_001, seed=1)
     assert abs(long.mean()) < 0.03
     assert abs(long.std() - 1) < 0.03
     assert abs((long**4).mean() - 3) < 0.3  # Gaussian, not uniform (1.8) nor a sign (1)
@@ -57,7 +57,7 @@ def test_the_gaussian_row_is_the_same_everywhere_and_for_ever():
 
 @pytest.mark.parametrize("shape", [(15, 20), (13, 13), (20, 15), (7, 30), (2, 2), (4, 5)])
 def test_rmac_regions(shape):
-    found = pooling.square_regions(*shape)
+    found = regions.square_regions(*shape)
     assert found == literal.rmac_regions(*shape)
     for top, left, side in found:
         assert side >= 1
@@ -66,11 +66,11 @@ def test_rmac_regions(shape):
 
 
 def test_rmac_vectors_and_aggregate():
-    where = pooling.square_regions(7, 9)
-    vectors = pooling.regional_vectors(SIGNED, where)
+    where = regions.square_regions(7, 9)
+    vectors = regions.regional_vectors(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
     expected = literal.rmac_aggregate(literal.rmac_vectors(SIGNED, where))
-    np.testing.assert_allclose(pooling.unit(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(words.unit(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("soft", [None, 3.0, 50.0])
@@ -78,7 +78,7 @@ def test_vlad(soft):
     local = words.local_descriptors(SIGNED)
     np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1, rtol=1e-5)
     np.testing.assert_allclose(local[9 + 2], SIGNED[:, 1, 2] / np.linalg.norm(SIGNED[:, 1, 2]), rtol=1e-5)
-    known = pooling.unit(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
+    known = words.unit(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
     expected = literal.intra_normalised(literal.vlad(local, known, soft))
     np.testing.assert_allclose(words.vlad(local, known, soft), expected, rtol=1e-3, atol=1e-4)
 
@@ -125,7 +125,7 @@ def test_a_dead_feature_map_has_no_regions():
 
 def test_mutual_score():
     rng = np.random.default_rng(8)
-    query, place = pooling.unit(rng.normal(size=(6, 4))), pooling.unit(rng.normal(size=(9, 4)))
+    query, place = words.unit(rng.normal(size=(6, 4))), words.unit(rng.normal(size=(9, 4)))
     assert regions.mutual_score(query, place) == pytest.approx(literal.mutual_score(query, place))
     assert regions.mutual_score(query, query) == pytest.approx(1)
     assert regions.mutual_score(query, np.zeros((9, 4))) == 0
@@ -134,7 +134,7 @@ def test_mutual_score():
 
 
 def test_directions_survive_8_bits():
-    vectors = np.concatenate([pooling.unit(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
+    vectors = np.concatenate([words.unit(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
     back = regions.from_bytes(regions.to_bytes(vectors.astype(np.float32)))
     assert (np.einsum("nd,nd->n", back, vectors)[:20] > 0.9998).all()
     assert not back[20].any()

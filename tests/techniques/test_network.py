@@ -26,7 +26,7 @@ def test_a_card_makes_a_technique_of_its_name(models):
 
 def test_what_changes_the_vector_changes_what_a_map_asks_for(models):
     hashes = set()
-    for changes in ({}, {"similarity": "l2"}, {"input": {**CARD["input"], "equalise": True}}):
+    for changes in ({}, {"similarity": "l1"}, {"input": {**CARD["input"], "equalise": True}}):
         write_network(models, "mine", card=changes)
         hashes.add(techniques.create("mine").spec.model_sha256)
     assert len(hashes) == 3
@@ -46,7 +46,7 @@ def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models)
 
 def test_numbers_beyond_half_precision_are_said_before_take_off(models):
     rule = {**CARD["input"], "scale": 1e6}
-    write_network(models, "mine", card={"input": rule, "similarity": "l2"})
+    write_network(models, "mine", card={"input": rule, "similarity": "l1"})
     with pytest.raises(ModelError, match="half precision"):
         techniques.create("mine")
     write_network(models, "mine", card={"input": rule})

@@ -43,9 +43,6 @@ def test_colours_come_in_the_order_of_the_card():
     image[:] = (10, 20, 30)  # blue, green, red
     assert prepare(image, rule(colour="bgr", scale=1.0))[0, :, 0, 0].tolist() == [10, 20, 30]
     assert prepare(image, rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [30, 20, 10]
-    turned = prepare(image, rule(colour="rgb", scale=1.0, layout="NHWC"))
-    assert turned.shape == (1, 12, 16, 3)
-    assert turned[0, 0, 0].tolist() == [30, 20, 10]
     assert prepare(image[..., 0], rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [10, 10, 10]
 
 
