@@ -14,7 +14,7 @@ import base
 from base import Row
 
 from edgevpr.review.compare import compare
-from edgevpr.review.replay import recorded, replay
+from edgevpr.review.replay import replay
 
 _FLIGHTS = {
     "flight": "{flight}",
@@ -34,15 +34,15 @@ def main() -> None:
 
 
 def _of_flight(log: Path) -> Row:
-    flight, begin_s = recorded(log), time.perf_counter()
-    again = replay(flight, lambda done, total: None)
-    took_s, lines = time.perf_counter() - begin_s, compare(flight.lines, again.lines)
+    begin_s = time.perf_counter()
+    again = replay(log)
+    took_s, lines = time.perf_counter() - begin_s, compare(again.flown, again.lines)
     queries = [line for line in again.lines if line.get("kind") == "query"]
     return {
         "flight": log.parent.name,
         "queries": len(queries),
         "minutes": (queries[-1]["t_mono_s"] - queries[0]["t_mono_s"]) / 60,
-        "recording_mb": sum(each.stat().st_size for each in flight.folder.rglob("*") if each.is_file()) / 1e6,
+        "recording_mb": sum(each.stat().st_size for each in again.folder.rglob("*") if each.is_file()) / 1e6,
         "lines": lines.alike,
         "lines_other": len(lines.others),
         "packets": again.packets.alike,

@@ -4,8 +4,6 @@ flies a recorded flight again on the ground."""
 import logging
 import sys
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.cli.shared import add_json, command, path_of, show, write_out
 from edgevpr.cli.wording import of_replay, of_what_if
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import waiting
 
 if TYPE_CHECKING:
     from edgevpr.review.logged import LoggedFlight
@@ -100,37 +97,16 @@ def run_replay(args: Namespace) -> int:
     """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs from
     the flight, but 0 with --config."""
     from edgevpr.review.compare import beside, compare
-    from edgevpr.review.replay import recorded, replay
+    from edgevpr.review.replay import replay
 
-    flight = recorded(args.log)
-    with _unheard(getattr(args, "debug", False)):
-        again = replay(flight, _say, args.map, path_of(args.config))
-    waiting("")
+    again = replay(args.log, args.map, path_of(args.config))
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
     if args.config:
-        found = beside(flight.lines, again.lines)
+        found = beside(again.flown, again.lines)
         show({**found, **end}, args.json, of_what_if(found, again.why_ended))
         return 0
-    lines, packets = compare(flight.lines, again.lines), again.packets
+    lines, packets = compare(again.flown, again.lines), again.packets
     is_same = not (lines.others or packets.others or packets.renumbered)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
     show(value, args.json, of_replay(again, lines, packets))
     return 0 if is_same else 1
-
-
-def _say(done: int, total: int) -> None:
-    waiting(f"replaying  {done}/{total}")
-
-
-@contextmanager
-def _unheard(debug: bool) -> Iterator[None]:
-    """Context manager: of the log messages of the replayed flight, print errors only, or all with `debug`. The flight
-    itself has printed them once."""
-    log = logging.getLogger("edgevpr")
-    before = log.level
-    if not debug:
-        log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(before)

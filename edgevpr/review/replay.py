@@ -3,8 +3,8 @@ recording in place of the real ones."""
 
 import logging
 import shutil
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, build, changed_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
 from edgevpr.frames.taped import ReplayedSource
 from edgevpr.mavlink.signing import NOT_SIGNING
@@ -23,38 +24,73 @@ from edgevpr.review.tape import Playback, ReplayedSigning, Supposed, TapeEnded, 
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.recording import FRAMES, MAP, TAPE, frame_path, recording_of
+from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, recording_of
 from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.flight.world import Stop, World
-
-Say = Callable[[int, int], None]  # shows progress: takes the number of the frame, and how many there are
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """A recorded flight: the lines of its log, each a dictionary, and the folder of its recording."""
+class Replayed:
+    """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the `folder`
+    of the recording; the comparison of the `packets` of both; `why_ended`, the reason why the replay ended before the
+    flight did (None: it did not); and `guessed`, the number of answers that were not on the tape where they were asked
+    for (see `Playback`)."""
 
+    flown: list[Line]
     lines: list[Line]
     folder: Path
-
-
-@dataclass(frozen=True, slots=True)
-class Replayed:
-    """Result of a replay: the `lines` of its log; the comparison of its `packets` with those of the flight;
-    `why_ended`, the reason why it ended before the flight did (None: it did not); and `guessed`, the number of answers
-    that were not on the tape where they were asked for (see `Playback`)."""
-
-    lines: list[Line]
     packets: Packets
     why_ended: str | None
     guessed: int
 
 
-def recorded(log: str | Path) -> Recorded:
-    """Find the last flight of `log` and its recording, in the folder that the log names or in one of that name beside
-    the log. Raises UsageError if there is no recording, and EdgevprError for a file without a line of a flight."""
+def replay(log: str | Path, place_map: str | None = None, changes: Path | None = None) -> Replayed:
+    """Fly the last flight of `log` again. Its recording is in the folder that the log names, or in one of that name
+    beside the log. `place_map` is the path of its map (None: the path that it had). `changes` is a YAML file (None:
+    none) whose keys override the configuration of the flight; frames and messages stay those of the flight. Raises
+    UsageError if there is no recording, and EdgevprError if it or the map cannot be opened."""
+    flown, folder = _recorded(log)
+    notes = read_tape(folder / TAPE)
+    note = next(notes, None)
+    if not (note and note[0] == "flight" and isinstance(note[1], dict)):
+        raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
+    header = note[1]
+    config = build(Config, header["config"], str(folder))
+    if changes:
+        config = changed_config(config, changes)
+    playback = Supposed(notes) if changes else Playback(notes)
+    why_ended = None
+    with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
+        again_log = f"{temporary}/flight.jsonl" if config.log.path else None
+        world = World(
+            board=build(Board, header["board"], "the board of the flight"),
+            place_map=_map_of(folder, Path(temporary), config, place_map or config.map),
+            log=replace(config.log, path=again_log, max_mb=None),
+            tape=playback,
+            clock=taped(Clock(sleep=playback.sleep), playback),
+            open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
+            link=playback.link,
+            ground=playback.ground,
+            signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
+            tap=untapped,
+            stop=Stop(playback),
+            status=None,
+            recording=header["recording"],
+        )
+        try:
+            with _unheard(), closing(Flight.open(config, world)) as again:
+                again.run()
+        except TapeEnded as end:
+            why_ended = str(end) or "the recording ends there"
+        waiting("")
+        lines = list(read_log(again_log)) if again_log else []
+        return Replayed(flown, lines, folder, playback.packets, why_ended, playback.guessed)
+
+
+def _recorded(log: str | Path) -> tuple[list[Line], Path]:
+    """Return the lines of the last flight of `log`, and the folder of its recording."""
     whole = flight_of(log)
     if whole.missing:
         _log.warning("%s", whole.missing)
@@ -65,53 +101,26 @@ def recorded(log: str | Path) -> Recorded:
     folder = recording_of(where, log)
     if folder is None:
         raise UsageError(f"{log}: its recording is neither at {where} nor beside the log: bring it there.")
-    return Recorded(lines, folder)
+    return lines, folder
 
 
-def replay(flight: Recorded, say: Say, place_map: str | None = None, changes: Path | None = None) -> Replayed:
-    """Fly a recorded flight again. `place_map` is the path of its map (None: the path that it had). `changes` is a YAML
-    file (None: none) whose keys override the configuration of the flight; frames and messages stay those of the flight.
-    Raises EdgevprError if recording or map cannot be opened."""
-    notes = read_tape(flight.folder / TAPE)
-    note = next(notes, None)
-    if not (note and note[0] == "flight" and isinstance(note[1], dict)):
-        raise EdgevprError(
-            f"{flight.folder / TAPE} is no tape of a flight, or was cut in its first line: nothing can be replayed."
-        )
-    header = note[1]
-    config = build(Config, header["config"], str(flight.folder))
-    if changes:
-        config = changed_config(config, changes)
-    playback = Supposed(notes) if changes else Playback(notes)
-    why_ended = None
-    with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
-        log = f"{temporary}/flight.jsonl" if config.log.path else None
-        world = World(
-            board=build(Board, header["board"], "the board of the flight"),
-            place_map=_map_of(flight.folder, Path(temporary), config, place_map or config.map),
-            log=replace(config.log, path=log, max_mb=None),
-            tape=playback,
-            clock=taped(Clock(sleep=playback.sleep), playback),
-            open_source=lambda step_s: ReplayedSource(playback, partial(_picture, flight.folder, say)),
-            link=playback.link,
-            ground=playback.ground,
-            signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
-            tap=untapped,
-            stop=Stop(playback),
-            status=None,
-            recording=header["recording"],
-        )
-        try:
-            with closing(Flight.open(config, world)) as again:
-                again.run()
-        except TapeEnded as end:
-            why_ended = str(end) or "the recording ends there"
-        return Replayed(list(read_log(log)) if log else [], playback.packets, why_ended, playback.guessed)
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Context manager: of the log messages of the replayed flight, which has printed them once, let errors through
+    only; all with --debug."""
+    log = logging.getLogger("edgevpr")
+    before = log.level
+    if not log.isEnabledFor(logging.DEBUG):
+        log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
-def _picture(folder: Path, say: Say, number: int) -> Image:
+def _picture(folder: Path, number: int) -> Image:
     """Read a recorded frame. Raises TapeEnded for one that cannot be read, for instance after a power cut."""
-    say(number, sum(1 for _ in (folder / FRAMES).iterdir()))
+    waiting(f"replaying  {number}")
     try:
         return read_image(frame_path(folder, number))
     except ImageError as error:

@@ -10,10 +10,10 @@ import logging
 from base64 import b64decode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Tape
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
@@ -214,8 +214,8 @@ class Playback(Tape):
         """Return at once: the time comes from the tape."""
 
     def _head(self) -> str:
-        """Return the kind of the next answer on the tape, without taking it. What the links did in the flight before
-        that answer stands on the tape too, and is done first. Raises TapeEnded."""
+        """Perform the turns of links that come next on the tape, and return the kind of the answer after them. Raises
+        TapeEnded."""
         while note := self._next():
             perform = self.links.get(note[0])
             if perform is None:
@@ -231,12 +231,9 @@ class Playback(Tape):
     def _comes(self, kind: str) -> bool:
         """Return True if an answer of `kind`, or the end of the flight, comes before the next frame. For a clock return
         False, since no answers are skipped to read one."""
-        for at in range(self._at, len(self._notes)) if kind not in _CLOCKS else ():
-            if self._notes[at][0] in (kind, "stopped"):
-                return True
-            if self._notes[at][0] == "frame":
-                return False
-        return False
+        until = (kind, "stopped", "frame")
+        first = next((note[0] for note in islice(self._notes, self._at, None) if note[0] in until), None)
+        return first in (kind, "stopped") and kind not in _CLOCKS
 
     def _guess(self, kind: str, look: Callable[[], Any]) -> Any:
         if kind == "frame":
@@ -273,13 +270,12 @@ class Supposed(Playback):
             return self._frame()
         if kind == "ended":
             return self._has_ended
-        if kind in _ALWAYS:
-            return _ALWAYS[kind]
         if kind in _AS_FOUND:
             while kind not in self._known and (note := self._next()):
                 self._step(note)
             return self._known[kind] if kind in self._known else look()
-        return self.t_s + (self._utc_ahead_s if kind == "utc_s" else 0.0)
+        now_s = self.t_s + (self._utc_ahead_s if kind == "utc_s" else 0.0)
+        return _ALWAYS.get(kind, now_s)
 
     def _frame(self) -> dict[str, Any] | None:
         """Return the next frame (None: the tape has no more). If the time is past several frames, return the newest of
@@ -313,17 +309,12 @@ def _is_moment(kind: str) -> bool:
 
 
 def read_tape(path: Path) -> Iterator[Note]:
-    """Yield the notes of a tape file, up to a line that was cut off. Raises EdgevprError if it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            for line in file:
-                try:
-                    note = json.loads(line)
-                except ValueError:
-                    return
-                if note[0] not in _RETIRED:
-                    yield note
-    except OSError as error:
-        raise EdgevprError(
-            f"{path} cannot be read ({error.strerror}): give the log of a flight with `log.record`, and its recording."
-        ) from error
+    """Yield the notes of a tape file, up to a line that was cut off. Raises OSError if it cannot be read."""
+    with open(path, "rb") as file:
+        for line in file:
+            try:
+                note = json.loads(line)
+            except ValueError:
+                return
+            if note[0] not in _RETIRED:
+                yield note
