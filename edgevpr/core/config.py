@@ -243,7 +243,7 @@ def changed_config(config: Config, path: str | Path) -> Config:
 def with_logs_in(config: Config, folder: str) -> Config:
     """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
     `folder`."""
-    paths = {name: getattr(config.log, name) for name in ("path", "tlog", "record")}
+    paths: dict[str, Any] = {name: getattr(config.log, name) for name in ("path", "tlog", "record")}
     log = replace(config.log, **{name: path and os.path.join(folder, path) for name, path in paths.items()})
     return replace(config, log=log)
 

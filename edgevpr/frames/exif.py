@@ -143,8 +143,7 @@ def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tu
     """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
     where roll and pitch are the camera's deviation from straight down. All in degrees."""
     # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
-    # is the camera's viewing direction: roll and pitch are 0 when it looks straight down. Then the gimbal's own roll
-    # only turns the picture: a gimbal may report half a turn in yaw as half a turn in roll.
+    # is the camera's viewing direction. Straight down, the gimbal's own roll only turns the picture.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
     # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, with which atan2 is off by half a turn.
     ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)

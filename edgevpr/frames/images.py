@@ -1,8 +1,6 @@
 """Image files: listing the images of a folder, decoding one, and encoding pictures. An incomplete file is an error,
-never decoded in part.
-
-All modules that read pictures or streams import `cv2` from here. OpenCV's own log messages are turned off, as edgevpr
-reports each fault once, in its own words; to get them back, set OPENCV_LOG_LEVEL before the start.
+never decoded in part. OpenCV's own log messages are turned off, as edgevpr reports each fault once, in its own words;
+to get them back, set OPENCV_LOG_LEVEL before the start.
 """
 
 import contextlib

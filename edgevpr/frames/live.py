@@ -27,7 +27,6 @@ class DeviceCapture:
         self._capture, self._clock = capture, clock
 
     def read(self) -> Shot | None:
-        """Wait for the next picture and return it; None if the camera is lost (OpenCV's `isOpened` does not tell)."""
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
             there, read = self._capture.read()
             if there:
@@ -37,7 +36,6 @@ class DeviceCapture:
         return None
 
     def release(self) -> None:
-        """Close the device."""
         self._capture.release()
 
 
@@ -68,7 +66,6 @@ class LiveSource(Source):
         self._thread.start()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the newest frame not read yet; None if none comes within `timeout_s` seconds, or after `close`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
             newest, self._newest = self._newest, None

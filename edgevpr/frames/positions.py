@@ -66,7 +66,7 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     take-off point, which is that above the ground only if the ground is level. All cells but the name may be empty;
     other columns are ignored. Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
     """
-    return {row["file"]: tag_of(row, where) for where, row in rows_of(csv_path)}
+    return {row["file"]: _tag_of(row, where) for where, row in _rows_of(csv_path)}
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
@@ -85,11 +85,9 @@ def _numbers_of(tag: GeoTag) -> tuple[Any, ...]:
     return *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
-def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the rows of a table with the columns `needed`. Returns for each row
-    * the text "FILE, line N", for error messages, and
-    * its values as text, by column name.
-    If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
+def _rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
+    """Read the rows of a table with the columns `needed`: for each "FILE, line N" and its values as text, by column
+    name. If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
         table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
@@ -117,10 +115,9 @@ def rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> li
     return found
 
 
-def tag_of(row: Mapping[str, str], where: str) -> GeoTag:
-    """Convert a table's row (text by column name; columns as in `read_positions`) to a GeoTag. Raises UsageError, whose
-    message begins with `where`, for a wrong value."""
-    known = {column: number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
+def _tag_of(row: Mapping[str, str], where: str) -> GeoTag:
+    """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
+    known = {column: _number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
     lat_deg, lon_deg = known["lat"], known["lon"]
     if (lat_deg is None) != (lon_deg is None):
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
@@ -140,11 +137,10 @@ def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Pos
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
-def number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError, whose message
-    begins with `where`, for text that is no number within `low`..`high`."""
-    text = row.get(column)
-    if not text:
+def _number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError for text that is
+    no number within `low`..`high`."""
+    if not (text := row.get(column)):
         return None
     try:
         value = float(text)
@@ -231,8 +227,8 @@ def read_track(csv_path: str | Path) -> VideoTrack:
     optionally, those of a positions.csv. Rows without a position are ignored. Raises UsageError for a file that cannot
     be read, a wrong value, and a table without any position."""
     tags: dict[float, GeoTag] = {}
-    for where, row in rows_of(csv_path, _TRACK_COLUMNS):
-        tag = tag_of(row, where)
+    for where, row in _rows_of(csv_path, _TRACK_COLUMNS):
+        tag = _tag_of(row, where)
         if tag.position is None:
             continue
         if tag.t_utc_s is None or (tags and tag.t_utc_s <= next(reversed(tags))):

@@ -1,8 +1,7 @@
 """One picture of a camera or stream (`Shot`), what gives them (`Capture`), and the detection of repeats (`Newness`).
 
-A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But from the
-air no two pictures are exactly equal, because of the camera's noise. Pictures are compared by coarse grey copies, in
-twelve horizontal bands of rows.
+A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But no two new
+pictures are exactly equal, because of the camera's noise. They are compared by coarse grey copies, in bands of rows.
 """
 
 from collections import deque

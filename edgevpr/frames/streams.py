@@ -62,7 +62,6 @@ class StreamCapture:
         self._arrivals = Arrivals(whole.fetch, clock)
 
     def read(self) -> Shot | Refusal | None:
-        """Wait for the next picture and return it, or the reason why it is rejected; None if the stream is lost."""
         while not self._ready:
             arrival = self._arrivals.next()
             if arrival is None:
@@ -80,7 +79,6 @@ class StreamCapture:
         return self._ready.popleft()
 
     def release(self) -> None:
-        """Close the connection."""
         self._arrivals.close()
         self._whole.close()
 

@@ -37,7 +37,6 @@ class RecordedSource(Source):
         return value
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, as `Source.read` does, with the picture decoded from the recorded JPEG."""
         try:
             frame = self._source.read(timeout_s)
         except ImageError as error:
@@ -47,12 +46,10 @@ class RecordedSource(Source):
             self._tape.note("frame", None)
             return None
         jpeg = as_jpeg(frame.image)
-        number = self._keep(jpeg)
-        kept = replace(frame, image=decoded(jpeg))
         known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNPACKED}
         position = frame.position and asdict(frame.position)
-        self._tape.note("frame", known | {"number": number, "position": position})
-        return kept
+        self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position})
+        return replace(frame, image=decoded(jpeg))
 
     def close(self) -> None:
         self._source.close()
@@ -73,8 +70,6 @@ class ReplayedSource(Source):
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame of the tape; None if in the flight no frame came within the time-out. Raises ImageError
-        if the flight's frame could not be used. `timeout_s` is ignored."""
         known: Any = self._tape.read("frame", lambda: None)
         if known is None:
             return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
-from edgevpr.frames.decoding import WholePictures, open_pictures
+from edgevpr.frames.decoding import open_pictures
 from edgevpr.frames.positions import GeoTag, VideoTrack
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource, tagged
@@ -45,9 +45,11 @@ class VideoSource(RecordingSource):
         self._whole, stream = whole, whole.stream
         self._unit_s, self._first_stamp = float(whole.time_base), stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
-        self._promised_s, self._is_stamped = _promised_s(whole), whole.is_stamped
-        frames = stream.frames or self._promised_s / self._frame_s
-        self._promised_s = max(self._promised_s, stream.frames * self._frame_s)  # a cut AVI file has only this right
+        self._is_stamped = whole.is_stamped
+        lasts_s = stream.duration * self._unit_s if stream.duration else (whole.container.duration or 0) / 1e6
+        stated_s = lasts_s if whole.is_stamped else 0.0
+        frames = stream.frames or stated_s / self._frame_s
+        self._promised_s = max(stated_s, stream.frames * self._frame_s)  # a cut AVI file has only this right
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
         if track and self._promised_s:
             track.require_within(path, self._promised_s)
@@ -57,8 +59,6 @@ class VideoSource(RecordingSource):
         self._t_due_s = self._heard_s = 0.0
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame at least `step_s` after the last; None at the end, or if decoding takes longer than
-        `timeout_s`. Raises ImageError for damaged frames; the next call continues after them."""
         deadline_s = self._clock() + timeout_s
         while not self.ended:
             if not self._ready:
@@ -93,8 +93,7 @@ class VideoSource(RecordingSource):
             self._ready.extend(pictures)
 
     def _advance(self, picture: "VideoFrame") -> bool:
-        """Set index and video time to those of `picture`, the next one decoded. Return True if it should be given: at
-        least `step_s` of video time have passed since the picture given last."""
+        """Set index and video time to those of `picture`, the next one decoded; return True if it should be given."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
         # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
@@ -123,11 +122,3 @@ class VideoSource(RecordingSource):
                 "video again.",
                 round((self._promised_s - seen_s) / self._frame_s),
             )
-
-
-def _promised_s(whole: WholePictures) -> float:
-    """Return the duration in seconds that the file's header states; 0 if it states none."""
-    if not whole.is_stamped:
-        return 0.0
-    duration = whole.stream.duration
-    return float(duration * whole.time_base) if duration else (whole.container.duration or 0) / 1e6
