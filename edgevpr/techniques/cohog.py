@@ -3,13 +3,10 @@
 A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
 uses only its *good* blocks, those of high entropy. Each of them finds its most similar block in the place. In the
 thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the
-displacement of the picture, and the score is the share of votes that agree (see `displacement`), times how well the
-structures of query and place agree on it (see `overlay`). With a forward camera the score of the scan counts too; with
-a nadir camera, one that looks straight down, how well the layouts agree on that displacement (see `layout`).
+displacement of the picture. docs/explanation/how-cohog-matches.md follows a query through all that makes the score.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
-places that are compared in full: 144 bytes with a forward camera (see `placecode`), 1120 bytes with a nadir camera (see
-`layout`).
+places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -21,7 +18,7 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask,
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.techniques import layout, overlay, placecode
-from edgevpr.techniques.contrast import Contrast, stretched
+from edgevpr.techniques.contrast import stretched
 from edgevpr.techniques.displacement import aligned, most_similar, share, voted
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
@@ -50,9 +47,10 @@ _ACCEPT = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
-# No place of any set lies below `kept` (aerial_copr has one of 45 levels, nordland_tiny one of 81), so none changed.
-# Chosen on corridor, aerial_caliterra and aerial_garfield28, with aerial_swindale: looking ahead, noise harms more.
-_CONTRAST = {"forward": Contrast(75, 200, 0.4), "nadir": Contrast(40, 40, 0.25)}
+# (kept, wanted, sigma_pixels), see `stretched`. No place of any set lies below `kept` (aerial_copr has one of 45
+# levels, nordland_tiny one of 81), so none changed. Chosen on corridor, aerial_caliterra and aerial_garfield28, with
+# aerial_swindale: looking ahead, noise harms more.
+_CONTRAST = {"forward": (75, 200, 0.4), "nadir": (40, 40, 0.25)}
 _MATCHINGS = ("displacement", "thesis")
 # Places or, looking down, pairs of a place and a rotation.
 _CANDIDATES = {"forward": 42, "nadir": 30}
@@ -152,7 +150,7 @@ class CoHog:
             image, mask = in_square(image, mask)
         grey, allowed = grey_square(image, self.w1), mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
-        grey = stretched(grey, allowed, pixel_px, _CONTRAST[self.camera])
+        grey = stretched(grey, allowed, pixel_px, *_CONTRAST[self.camera])
         blocks, seen, good = self._blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.

@@ -1,16 +1,12 @@
 """Contrast of pictures taken in little light or in fog, for `cohog`.
 
 The entropy of dim ground is that of a blank wall: few grey levels are left. Such a picture is *stretched* to more of
-them, and the more it is stretched, the more it is smoothed before, since the sensor's noise grows with it. A picture
-with contrast enough is not touched, so ordinary maps hold what they always held. A picture with next to none is not
-touched either: stretched noise must not pass for ground.
-
-All is rounded alike on every processor (see `gradients`): means of whole grey levels are exact, and products and sums
-are computed one by one.
+them, and smoothed before, since the sensor's noise grows with it. A picture with contrast enough is not touched, nor
+one with next to none: stretched noise must not pass for ground. All is rounded alike on every processor (see
+`gradients`): means of whole grey levels are exact, and products and sums are computed one by one.
 """
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,19 +23,12 @@ _MOST_SIGMA = 1.4
 _ROUNDS = 4  # of smoothing: fewer cannot reach that much
 
 
-@dataclass(frozen=True, slots=True)
-class Contrast:
-    """The rule by which dim pictures are stretched, in grey levels: those of less contrast than `kept`, at half of it
-    or less to `wanted`, which is at most four times `kept`. `sigma_pixels` is the sigma of the blur for each doubling
-    of the contrast, in pixels of the picture as it came."""
-
-    kept: float
-    wanted: float
-    sigma_pixels: float
-
-
-def stretched(grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], contrast: Contrast) -> Singles:
-    """Return a square picture, stretched if its contrast is below `contrast.kept`.
+def stretched(
+    grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], kept: float, wanted: float, sigma_pixels: float
+) -> Singles:
+    """Return a square picture, stretched if its contrast is below `kept`: at half of it or less to `wanted`, which is
+    at most four times `kept`. For each doubling of the contrast the sigma of the blur is `sigma_pixels`, in pixels of
+    the picture as it came.
 
     Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
     of allowed pixels. `grey` is float32 (side, side), 0 to 255; the same array is returned where its contrast is enough
@@ -49,19 +38,19 @@ def stretched(grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float]
     low, high = _ends(grey, allowed)
     found = high - low
     of_noise = _NOISE * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_ALONG / len(grey)
-    if not max(_LEAST, of_noise) <= found < contrast.kept:
+    if not max(_LEAST, of_noise) <= found < kept:
         return grey
-    lacks = contrast.kept / found
-    gain = min(lacks * lacks * lacks, contrast.wanted / found)  # from 1 on: no jump
+    lacks = kept / found
+    gain = min(lacks * lacks * lacks, wanted / found)  # from 1 on: no jump
     # Nothing of a bright display may bleed into the ground beside it.
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
-    sigma_pixels = min(_MOST_SIGMA, contrast.sigma_pixels * math.log2(gain))
+    sigma = min(_MOST_SIGMA, sigma_pixels * math.log2(gain))
     across, down = (min(max(1, round(each)), len(grey) // 4) for each in pixel_px)
-    _smooth(picture, sigma_pixels, across)
-    _smooth(picture.T, sigma_pixels, down)
+    _smooth(picture, sigma, across)
+    _smooth(picture.T, sigma, down)
     picture -= np.float32(low)
     picture *= np.float32(gain)
-    picture += np.float32(min(low, 255 - contrast.wanted))
+    picture += np.float32(min(low, 255 - wanted))
     clipped: Singles = np.clip(picture, 0, 255, out=picture)
     return clipped
 

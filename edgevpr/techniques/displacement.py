@@ -2,11 +2,8 @@
 
 Every good region of the query finds its most similar region of the place, the *reference*. The shift between the two,
 in cells, is its vote. If the place is the same, the votes pile up on one shift; if it is another place, they scatter.
-The score is the share of the votes at the peak.
-
-A picture of another kind (a screen, a test card) has many regions that resemble the same few regions of the place.
-Their votes can pile up as well. So the different regions of the place that the agreeing votes lead to are counted, as a
-second measure. Regions are numbered row by row.
+The regions of a picture of another kind (a test card) may all resemble the same few of the place, so the different
+regions that the agreeing votes lead to are counted as well. Regions are numbered row by row.
 """
 
 import math

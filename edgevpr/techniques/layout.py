@@ -1,16 +1,12 @@
 """The coarse stage of `cohog` for a camera that looks straight down: a place is the *layout* of its structures.
 
-The patterns of a picture's good regions (see `slow_patterns`) are averaged in the cells of a square grid. What the
-cells around have in common is subtracted: it tells of the light and of the kind of ground, but not of the place. The
-square root of each cell's strength is kept, so that a few strong edges do not decide alone. Such a field of vectors
-changes less over the seasons than single regions do, since a cell holds many of them.
+The patterns of a picture's good regions (see `slow_patterns`) are averaged in the cells of a square grid, less what the
+cells around have in common. A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift
+by whole cells under which enough of the place is covered. The score is the correlation of the two fields where they
+overlap, divided by what two independent fields of that strength would scatter by.
 
-A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift by whole cells under which
-enough of the place is covered. The score is the correlation of the two fields where they overlap, divided by what two
-independent fields of that strength would scatter by, so that small and large overlaps compare.
-
-There are two grids. All places are compared by the coarse one, under every second rotation. Only the pairs of a place
-and a rotation that come out best are compared by the fine one. A place keeps both in RAM, in 4 bits a number.
+All places are compared by a coarse grid, under every second rotation, and only the pairs of a place and a rotation that
+come out best by a fine one. A place keeps both in RAM, in 4 bits a number.
 """
 
 from collections.abc import Callable

@@ -1,10 +1,8 @@
 """Techniques that describe a picture by one vector of a network. Either the network gives the vector by itself, or a
-*head*, such as a pooling, makes it from the feature map.
-
-A card is the YAML file that describes a network. If the network gives a descriptor, the card is a technique by itself,
-under the card's name. The techniques of the thesis take parameters. `model` names the card of the network to use.
-`form` is what a number of the vector takes in RAM: "float", "8bit" or "1bit" (see `vectors`). `threads` is the number
-of threads of the network. A map does not depend on `form` and `threads`.
+*head*, such as a pooling, makes it from the feature map. A card whose network gives a descriptor is a technique by
+itself, under the card's name. The techniques of the thesis take parameters: `model` names the card of the network to
+use, `form` is what a number of the vector takes in RAM (see `vectors`), and `threads` is the number of threads of the
+network. A map does not depend on `form` and `threads`.
 """
 
 from collections.abc import Callable

@@ -1,15 +1,10 @@
 """The last look of `cohog`: the query is laid over a place as its match says.
 
-If the match is right, the structures of both pictures coincide, those of changed ground as well: few single regions are
-still each other's most similar ones, but all of them together agree. The *structure* of a picture is the patterns of
-its regions less what those around have in common (see `layout`). The *agreement* of two structures is their correlation
-over what independent ones would scatter by.
-
-With a camera that looks ahead, the agreement at the shift that was voted for counts (see `displacement`). With a camera
-that looks straight down, the query's picture is first turned, scaled and shifted by the fit of the pairs that agree,
-and described again. There, a wrong match has a road or the edge of a field in common with the place, which agrees
-nearly as well if the query is pushed along it. So it counts how far the agreement stands out: how much larger it is
-where the query should lie than at any shift of some cells.
+If the match is right, the structures of both pictures coincide, those of changed ground as well. The *structure* of a
+picture is the patterns of its regions less what those around have in common. The *agreement* of two structures is their
+correlation over what independent ones would scatter by. With a camera that looks ahead, the agreement at the shift that
+was voted for counts. With one that looks straight down, the query's picture is first turned, scaled and shifted, and it
+counts how far the agreement stands out from that at other shifts: a road agrees nearly as well if pushed along it.
 """
 
 import math

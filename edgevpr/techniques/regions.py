@@ -1,13 +1,11 @@
 """Techniques that match regions of a feature map: `rmac` takes squares, `cross_region_bow` takes active areas.
 
-Both scan the map by one vector per picture, then compare the best places region by region. The score sums the cosines
-of the pairs of regions that are each other's best match.
-
-Cross-Region-BoW (Chen, Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019; see `network`) find
-regions in the same way. In each channel, activations above zero that touch one another, corners included, make a
-region. Its energy is their mean. The regions of the highest energy over all channels are kept. Each is described by the
-sum of all channels' activations in the box around it, as in the public code of Region-VLAD, scaled to length 1. Without
-this scaling, or without the box, both techniques find fewer places on the data sets used for tuning.
+Both scan the map by one vector per picture, then compare the best places region by region. Cross-Region-BoW (Chen,
+Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019; see `network`) find regions in the same way.
+In each channel, activations above zero that touch one another, corners included, make a region. Its energy is their
+mean. The regions of the highest energy over all channels are kept. Each is described by the sum of all channels'
+activations in the box around it, as in the public code of Region-VLAD, scaled to length 1: otherwise both techniques
+find fewer places on the data sets used for tuning.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
 """Base of the techniques that describe a picture by one vector (also those in `network` and `regions`): the three forms
 of a vector in RAM, and the comparison of vectors. `hog` here needs no network.
 
-The map file keeps each vector in half precision. In RAM a vector has one of three *forms*. `float` is half precision
-too. `8bit` and `1bit` are one byte or one bit per number, after the mean of all vectors of the map is subtracted: the
-mean does not help to tell places apart, and takes most of the range of a byte. The file is the same for all forms.
+The map file keeps each vector in half precision, and so does the form `float`. `8bit` and `1bit` are one byte or one
+bit per number, after the mean of all vectors of the map is subtracted: the mean does not help to tell places apart, and
+takes most of the range of a byte.
 """
 
 from typing import Any

@@ -1,12 +1,10 @@
 """Views of a query: its picture as it would look from other heights and under other headings, for `cohog`.
 
-A nadir query (of a camera that looks straight down) is compared with a place under each of several *hypotheses*: a
-height ratio (the camera's height above the ground over that when the place was mapped) and a rotation of the camera
-since then, in steps of 15 degrees. A view undoes both: the picture is scaled until a cell shows as much ground as a
-cell of the place, and turned back.
-
-Few regions agree by chance more easily than many. Factors make the shares of agreeing votes comparable: they follow
-from the shares that foreign pictures reach under each view (measured between the two tuning sets from the air).
+A nadir query (of a camera that looks straight down) is compared with a place under several *hypotheses*: a height ratio
+(the camera's height above the ground over that when the place was mapped) and a rotation of the camera since then, in
+steps of 15 degrees. A view undoes both. Factors make the shares of agreeing votes comparable, since few regions agree
+by chance more easily than many: they follow from foreign pictures under each view, between the tuning sets from the
+air.
 """
 
 from collections.abc import Callable

@@ -57,7 +57,10 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
         ({"outputs": {}}, "`outputs` names none"),
         ({"similarity": "cosin"}, "`similarity` is `cosin`: write cosine or l1"),
         ({"input": {**CARD["input"], "colour": "gray"}}, "`input.colour` is `gray`: write grey, bgr or rgb"),
-        ({"input": {**CARD["input"], "layout": "CHW"}}, "`input.layout` is `CHW`: export the network again with the axes in the order NCHW"),
+        (
+            {"input": {**CARD["input"], "layout": "CHW"}},
+            "`input.layout` is `CHW`: export the network again with the axes in the order NCHW",
+        ),
         ({"input": {**CARD["input"], "resize": "crop"}}, "`input.resize` is `crop`: write area, linear or cubic"),
         ({"input": {**CARD["input"], "mean": [1.0, 2.0]}}, "`input.mean` is .*: write one number or 1"),
         ({"input": {**CARD["input"], "mean": 0.5}}, "`input.mean` must be a list, not 0.5"),

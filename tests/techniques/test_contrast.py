@@ -5,12 +5,12 @@ import pytest
 from pictures import textured
 
 from edgevpr.techniques import create
-from edgevpr.techniques.contrast import Contrast, stretched
+from edgevpr.techniques.contrast import stretched
 from edgevpr.techniques.gradients import grey_square
 
 CAMERAS = ("forward", "nadir")
 WORSE = {"dark": lambda picture: 0.15 * picture, "fog": lambda picture: 0.15 * picture + 170}
-DOUBLED = Contrast(100, 200, 0.3)
+DOUBLED = (100, 200, 0.3)
 PIXEL_PX = (512 / 640, 512 / 480)
 
 
@@ -47,14 +47,14 @@ def test_sensor_noise_does_not_become_ground(camera, size, level):
 
 def test_a_picture_with_contrast_enough_is_not_touched():
     picture = ramp(50, 160)
-    assert stretched(picture, None, PIXEL_PX, DOUBLED) is picture
+    assert stretched(picture, None, PIXEL_PX, *DOUBLED) is picture
 
 
 def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
     inner = slice(8, -8)  # the ends of the range may be cut off
     nearly = ramp(50, 50 + 101)
-    assert abs(stretched(nearly, None, PIXEL_PX, DOUBLED) - nearly)[:, inner].max() < 3
-    ranges = [np.ptp(stretched(ramp(20, 20 + levels), None, PIXEL_PX, DOUBLED)) for levels in (95, 90, 80, 70, 15)]
+    assert abs(stretched(nearly, None, PIXEL_PX, *DOUBLED) - nearly)[:, inner].max() < 3
+    ranges = [np.ptp(stretched(ramp(20, 20 + levels), None, PIXEL_PX, *DOUBLED)) for levels in (95, 90, 80, 70, 15)]
     assert ranges[:4] == sorted(ranges[:4])
     assert ranges[-1] == pytest.approx(200, abs=8), "never to more than what is wanted"
 
@@ -64,10 +64,10 @@ def test_what_is_masked_changes_nothing_of_what_is_not():
     allowed = np.ones((512, 512), bool)
     allowed[200:300, 100:400] = False
     changed = np.where(allowed, dim, np.float32(255))
-    found, other = (stretched(each, allowed, PIXEL_PX, DOUBLED) for each in (dim, changed))
+    found, other = (stretched(each, allowed, PIXEL_PX, *DOUBLED) for each in (dim, changed))
     assert found is not dim
     np.testing.assert_array_equal(found[allowed], other[allowed])
-    assert not np.array_equal(stretched(changed, None, PIXEL_PX, DOUBLED)[allowed], found[allowed])
+    assert not np.array_equal(stretched(changed, None, PIXEL_PX, *DOUBLED)[allowed], found[allowed])
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 4000), (4000, 1), (13, 17)])
@@ -79,4 +79,4 @@ def test_a_picture_of_any_shape_is_stretched_or_left(size):
 
 def test_nothing_allowed_is_nothing_stretched():
     dim = ramp(0, 20)
-    assert stretched(dim, np.zeros((512, 512), bool), PIXEL_PX, DOUBLED) is dim
+    assert stretched(dim, np.zeros((512, 512), bool), PIXEL_PX, *DOUBLED) is dim
