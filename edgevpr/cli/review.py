@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
         ("--map-images", "the pictures that the map was made of"),
     ):
         report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
-    export = command(commands, "export", run_export, "write matches, fixes and places of a flight, for a map viewer")
+    export = command(commands, "export", run_export, "write matches and fixes of a flight, for a map viewer")
     export.add_argument("log", metavar="LOG")
     form = export.add_mutually_exclusive_group(required=True)
     for name in ("geojson", "csv"):
@@ -71,7 +71,7 @@ def run_report(args: Namespace) -> int:
 
 
 def run_export(args: Namespace) -> int:
-    """Run `export`: write the points of a flight (matches, fixes, places) as GeoJSON or CSV."""
+    """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON or CSV."""
     from edgevpr.review.export import WRITERS, features_of
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)

@@ -2,13 +2,12 @@
 
 import csv
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
 from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, text
 
-# A point to export: its `kind` ("match", "fix", "place", "learnt", "autopilot" or "gps"), position and properties.
+# A point to export: its `kind` ("match", "fix", "autopilot" or "gps"), position and properties.
 Feature = dict[str, Any]
 
 _PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others are its properties
@@ -16,14 +15,8 @@ _PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others a
 
 def features_of(flight: LoggedFlight) -> list[Feature]:
     """Return the points of a flight: for every query the accepted match, the fix made from it, and the positions by
-    autopilot and GPS receiver; then the places that were found, each once, and those learnt in flight."""
-    features = [feature for query in flight.queries for feature in _of_query(query)]
-    at_place = {query.place: query for query in flight.queries if query.place_at}
-    times_found = Counter(query.place for query in flight.queries if query.place_at)
-    for place, query in at_place.items():
-        known = {"place": place, "reference_image": query.reference_image, "times_found": times_found[place]}
-        features.append(_feature("place", query.place_at, known))
-    return features + [_feature("learnt", at, {}) for at in flight.learnt]
+    autopilot and GPS receiver."""
+    return [feature for query in flight.queries for feature in _of_query(query)]
 
 
 def _of_query(query: LoggedQuery) -> Iterator[Feature]:
@@ -47,8 +40,8 @@ def _of_query(query: LoggedQuery) -> Iterator[Feature]:
         yield _feature("gps", query.gps_at, named)
 
 
-def _feature(kind: str, at: Point | None, properties: dict[str, Any]) -> Feature:
-    return dict(zip(_PLACED, (kind, *(at or ())), strict=True)) | properties
+def _feature(kind: str, at: Point, properties: dict[str, Any]) -> Feature:
+    return dict(zip(_PLACED, (kind, *at), strict=True)) | properties
 
 
 def write_geojson(features: Sequence[Feature], out: TextIO) -> None:

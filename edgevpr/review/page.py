@@ -164,7 +164,6 @@ def _lanes(flight: LoggedFlight) -> str:
             (outcome.value, colour, [query.t_s for query in queries if query.fix and query.fix.outcome is outcome])
             for outcome, colour in _COLOURS.items()
         ),
-        ("autopilot heard", "autopilot", [query.t_s for query in queries if query.has_link]),
         ("autopilot silent", "refused", [query.t_s for query in queries if is_heard and query.has_link is False]),
     ]
     return lanes([row for row in rows if row[2]], flight.span_s)

@@ -20,7 +20,7 @@ def written(write, features):
 def test_every_form_has_the_same_points(flown):
     features = features_of(read_flight(flown / "flight.jsonl"))
     kinds = Counter(each["kind"] for each in features)
-    assert kinds["match"] == kinds["place"] == 8
+    assert kinds["match"] == 8
     assert kinds["autopilot"] == kinds["gps"] == 10
     assert kinds["fix"] > 0
     collection = json.loads(written(write_geojson, features))

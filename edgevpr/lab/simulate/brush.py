@@ -162,7 +162,9 @@ def parcels(
     todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
     while todo:
         level, piece = todo.pop()
-        if _area_m2(piece) < field_m2 * rng.uniform(0.7, 1.8):
+        x, y = piece.T
+        area_m2 = abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))) / 2
+        if area_m2 < field_m2 * rng.uniform(0.7, 1.8):
             fields.append(piece)
             continue
         side = longest_side(piece)
@@ -182,7 +184,7 @@ def longest_side(polygon: Doubles) -> Doubles:
 
 
 class Bend:
-    """Function object that bends straight lines by about `by_m` metres. Points near each other move alike."""
+    """Bends straight lines by about `by_m` metres. Points near each other move alike."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
@@ -205,14 +207,8 @@ class Bend:
         return bent_m
 
 
-def _area_m2(polygon: Doubles) -> float:
-    x, y = polygon.T
-    return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))) / 2
-
-
 def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Cut a convex polygon along the line that passes `through` a point, at right angles to the vector `across`.
-    Returns its two halves, and the two ends of the cut (2, 2)."""
+    """Cut a convex polygon through a point, at right angles to the vector `across`; return halves and ends (2, 2)."""
     side = (piece - through) @ across
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []

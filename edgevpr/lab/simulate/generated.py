@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image
-from edgevpr.core.geodesy import EARTH_RADIUS_M
+from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.brush import Scene
@@ -46,8 +46,8 @@ def mapping_flight(seed: int) -> GeneratedFlight:
     poses = []
     for leg, north_m in enumerate(_LEGS_NORTH_M):
         eastwards = leg % 2 == 0
-        for east in np.linspace(_LEG_START_M, _LEG_END_M, 14)[:: 1 if eastwards else -1]:
-            off_m, off_deg = rng.normal(0, 0.7, 3), rng.normal(0, 0.8, 3)
+        for east in np.linspace(_LEG_START_M, _LEG_END_M, 14)[:: 1 if eastwards else -1].tolist():
+            off_m, off_deg = rng.normal(0, 0.7, 3).tolist(), rng.normal(0, 0.8, 3).tolist()
             position = {"east_m": east + off_m[0], "north_m": north_m + off_m[1], "height_m": _HEIGHT_M + off_m[2]}
             heading_deg = (90 if eastwards else 270) + off_deg[0]
             poses.append(CameraPose(**position, heading_deg=heading_deg, roll_deg=off_deg[1], pitch_deg=off_deg[2]))
@@ -134,19 +134,14 @@ def fly_and_write(folder: Path, which: str, seed: int) -> str:
 
 def to_position(pose: CameraPose) -> Position:
     """Return the geographic position of a pose in the scene, a plane that touches the globe at ORIGIN."""
-    lat_deg = ORIGIN.lat_deg + np.degrees(pose.north_m / EARTH_RADIUS_M)
-    lon_deg = ORIGIN.lon_deg + np.degrees(pose.east_m / _radius_of_latitude_m())
-    return Position(float(lat_deg), float(lon_deg), _ORIGIN_ALT_M + pose.height_m)
+    lat_deg, lon_deg = moved(ORIGIN.lat_deg, ORIGIN.lon_deg, pose.east_m, pose.north_m)
+    return Position(lat_deg, lon_deg, _ORIGIN_ALT_M + pose.height_m)
 
 
 def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
     """Return east and north, in metres, of a position in the scene: the inverse of `to_position`."""
-    north_m = np.radians(lat_deg - ORIGIN.lat_deg) * EARTH_RADIUS_M
-    return float(np.radians(lon_deg - ORIGIN.lon_deg) * _radius_of_latitude_m()), float(north_m)
-
-
-def _radius_of_latitude_m() -> float:
-    return EARTH_RADIUS_M * float(np.cos(np.radians(ORIGIN.lat_deg)))
+    east_m, north_m = offset_m(ORIGIN.lat_deg, ORIGIN.lon_deg, lat_deg, lon_deg)
+    return float(east_m), float(north_m)
 
 
 def wander(rng: np.random.Generator, count: int) -> Doubles:

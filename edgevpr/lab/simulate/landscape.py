@@ -45,13 +45,9 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     river_m = winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
     road_m = winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
     bend = Bend(rng, width_m, depth_m, by_m=2.5)
-    trees: list[Doubles] = []  # (N, 4): east, north, radius and top in metres
-
     fields, cuts = parcels(rng, width_m, depth_m, field_m2=7500)
-    for field_m in fields:
-        trees.append(paint_field(rng, canvas, bend(field_m, closed=True)))
-    for level, cut_m in cuts:
-        trees.append(_border(rng, canvas, bend(cut_m, closed=False), level))
+    trees = [_field(rng, canvas, bend(field_m, closed=True)) for field_m in fields]
+    trees += [_border(rng, canvas, bend(cut_m, closed=False), level) for level, cut_m in cuts]
     trees.append(_river(rng, canvas, river_m))
     _road(rng, canvas, road_m)
     yards_m = _farms(rng, canvas, road_m, river_m)
@@ -61,8 +57,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
 
 
 def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int) -> Doubles:
-    """Paint the border of two fields: a lane if the `level` of its cut (see `parcels`) is 0 or 1, else a hedge, a wall
-    or a grass strip. Returns its trees, (N, 4) metres: east, north, radius, top."""
+    """Paint the border of two fields, of which great cuts are lanes (see `parcels`); return its trees."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
@@ -88,8 +83,7 @@ def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int
 
 
 def _along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
-    """Place trees about every `step_m` along a line, up to about `spread_m` off it, with radii of about `radius_m`.
-    Returns them, (N, 4) metres: east, north, radius, top."""
+    """Return trees about every `step_m` along a line, about `spread_m` off it, with radii of about `radius_m`."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
@@ -179,8 +173,7 @@ def _mottle(rng: np.random.Generator, canvas: Scene) -> None:
 def _plant(
     rng: np.random.Generator, canvas: Scene, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
 ) -> None:
-    """Paint the trees, (N, 4) metres: east, north, radius, top. Trees near a line (or points) of `keep_off_m` are left
-    out: each entry is its points (N, 2) and the distance to keep from them."""
+    """Paint the trees that keep the distances in metres from the points (N, 2) of `keep_off_m`."""
     for line_m, clear_m in keep_off_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]
@@ -250,9 +243,8 @@ _KINDS: tuple[tuple[float, Callable[[Singles, Singles, Array], Look], tuple[floa
 )
 
 
-def paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
-    """Paint a field of a random kind within its outline (N, 2); return the trees that stand in it, (N, 4) metres: east,
-    north, radius, top."""
+def _field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
+    """Paint a field of a random kind within its outline (N, 2); return its trees."""
     weights = np.array([weight for weight, _, _ in _KINDS])
     _, look, trees_m = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
     side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
@@ -274,8 +266,7 @@ def paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> 
 def _trees(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
-    """Place trees in rows along `turn_rad` over a field, `spacing_m` apart and moved at random by about `scatter_m`,
-    with radii of about `radius_m`. Returns them, (N, 4) metres: east, north, radius, top."""
+    """Return trees in rows along `turn_rad`, `spacing_m` apart, moved at random by about `scatter_m`."""
     along, across = axes_of(turn_rad)
     reach_m = np.arange(-110, 110, spacing_m)
     u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))

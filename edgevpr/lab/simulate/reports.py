@@ -12,7 +12,6 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 Report = Callable[[Firmware], Message | None]
 _UNKNOWN_16 = 65_535
-_G_MG = 1000
 _CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -20,8 +19,7 @@ _CAPABILITIES = (
 )
 
 
-def heartbeat(brain: Firmware) -> Message:
-    """Make the HEARTBEAT of the simulated autopilot."""
+def _heartbeat(brain: Firmware) -> Message:
     armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if brain.is_armed else 0
     return mavlink.MAVLink_heartbeat_message(
         type=brain.vehicle_type,
@@ -36,12 +34,9 @@ def heartbeat(brain: Firmware) -> Message:
 def _position(brain: Firmware) -> Message | None:
     if brain.origin is None:
         return None
-    truth, (lat_deg, lon_deg) = brain.truth, brain.place
-    velocity_m_s = brain.velocity_m_s
-    north_cm_s, east_cm_s, down_cm_s = (
-        max(-32_768, min(32_767, round(100 * each)))
-        for each in (velocity_m_s.imag, velocity_m_s.real, -truth.climb_m_s)
-    )
+    truth, (lat_deg, lon_deg), over_ground_m_s = brain.truth, brain.place, brain.velocity_m_s
+    ned_m_s = over_ground_m_s.imag, over_ground_m_s.real, -truth.climb_m_s
+    north_cm_s, east_cm_s, down_cm_s = (max(-32_768, min(32_767, round(100 * each))) for each in ned_m_s)
     return mavlink.MAVLink_global_position_int_message(
         time_boot_ms=_boot_ms(brain),
         lat=round(lat_deg * 1e7),
@@ -56,17 +51,16 @@ def _position(brain: Firmware) -> Message | None:
 
 
 def _attitude(brain: Firmware) -> Message | None:
-    """Make an ATTITUDE; None if the track does not contain the angles."""
     roll, pitch = math.radians(brain.truth.roll_deg), math.radians(brain.truth.pitch_deg)
-    if math.isnan(roll + pitch):
+    if math.isnan(roll + pitch):  # the track does not say
         return None
     return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, yaw_of(brain.truth), 0, 0, 0)
 
 
 def _second_gps(brain: Firmware) -> Message | None:
-    if not brain.receivers.has_second:
-        return None
-    return mavlink.MAVLink_gps2_raw_message(**_gps(brain.receivers.second, brain), dgps_numch=0, dgps_age=0)
+    second = _gps(brain.receivers.second, brain)
+    has_second = brain.receivers.has_second
+    return mavlink.MAVLink_gps2_raw_message(**second, dgps_numch=0, dgps_age=0) if has_second else None
 
 
 def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
@@ -100,14 +94,8 @@ def _origin(brain: Firmware) -> Message | None:
 
 def _version(brain: Firmware) -> Message:
     is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
-    encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0
-    return mavlink.MAVLink_autopilot_version_message(
-        _CAPABILITIES | encoding, brain.version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, 0
-    )
-
-
-def _ekf_status(brain: Firmware) -> Message:
-    return mavlink.MAVLink_ekf_status_report_message(brain.flags(), 0.05, brain.test_ratio, 0.05, 0.02, 0.0)
+    capabilities = _CAPABILITIES | (mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if is_px4 else 0)
+    return mavlink.MAVLink_autopilot_version_message(capabilities, brain.version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, 0)
 
 
 def _estimator_status(brain: Firmware) -> Message:
@@ -118,7 +106,7 @@ def _estimator_status(brain: Firmware) -> Message:
 
 
 REPORTS: dict[int, Report] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: lambda brain: mavlink.MAVLink_system_time_message(
         round((brain.start_utc_s + brain.now_s) * 1e6), _boot_ms(brain)
     ),
@@ -126,7 +114,11 @@ REPORTS: dict[int, Report] = {
         **_gps(brain.receivers.first, brain)
     ),
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda brain: mavlink.MAVLink_scaled_imu_message(
-        _boot_ms(brain), 0, 0, -_G_MG, *[0] * 6
+        _boot_ms(brain),
+        0,
+        0,
+        -1000,
+        *[0] * 6,  # milli-g: it hangs still
     ),
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _position,
@@ -136,7 +128,9 @@ REPORTS: dict[int, Report] = {
 }
 # Each firmware has its own report of its filter, and does not know the other's.
 FILTER_REPORTS: dict[int, Report] = {
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: lambda brain: mavlink.MAVLink_ekf_status_report_message(
+        brain.flags(), 0.05, brain.test_ratio, 0.05, 0.02, 0.0
+    ),
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
 }
 # Known, but there is no such sensor.
