@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
-from edgevpr.core.contract import Technique, TechniqueSpec
+from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import PlaceError
 from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, packed, unpacked
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, unpacked
 
 # Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
 # expected as their match says, 31 had four inliers, 7 five, 3 six and none more (benchmarks/verification.py). Of
@@ -152,11 +152,6 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
         scale=float(abs(turn_scale)),
         covariance_share2=(variance, 0.0, variance),
     )
-
-
-def landmarks_of(technique: Technique, picture: Levelled) -> bytes | None:
-    """Return the landmarks of a picture as a map stores them; None for a technique that does not look straight down."""
-    return packed(describe(picture.image, picture.mask, OF_PLACE)) if technique.spec.cells else None
 
 
 class Verification:

@@ -80,8 +80,8 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> La
 
 
 def _spread(at_px: Singles, most: int) -> Ints:
-    """Choose at most `most` of the points `at_px` (K, 2), given best first, so that they spread over the picture: the
-    best of every cell of a grid, then the second best, and so on. Returns their indices in this order."""
+    """Return the indices of at most `most` of the points `at_px` (K, 2), given best first, so that they spread over the
+    picture: the best of every cell of a grid, then the second best, and so on."""
     # Keep only the best of the points of one corner.
     _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)

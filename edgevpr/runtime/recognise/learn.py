@@ -80,7 +80,8 @@ class Learner:
         return {"places": self.learnt, "left_out": dict(self.passed_over), "stopped": self.trouble}
 
     def learn(self, event: Recognition) -> Place | None:
-        """Make a place of an event's frame and return it; None if the frame is left out. Never raises MapError."""
+        """Make a place of an event's frame. Return its number, picture, position and quality; None if the frame is left
+        out. Never raises MapError."""
         frame, seen = event.frame, event.descriptor
         if self.trouble is not None or self.is_off or event.failed or frame is None or seen is None:
             return None
@@ -94,16 +95,7 @@ class Learner:
             salience = replace(worth.salience, is_low=worth.reason is not None) if worth else None
             place_id = self._map.add(here, seen, salience, self._recogniser.landmarks(event))
             self.learnt += 1
-            place = Place(
-                place_id=place_id,
-                source_image=here.name,
-                position=here.position,
-                t_utc_s=here.t_utc_s,
-                heading_deg=here.heading_deg,
-                quality=seen.quality,
-                salience=salience,
-                pose=here.pose,
-            )
+            place = Place(place_id=place_id, source_image=here.name, position=here.position, quality=seen.quality)
             self._growing.add(place_id, here.position, seen.coarse, here.heading_deg)
         except _LeftOut as reason:
             self.passed_over[str(reason)] += 1

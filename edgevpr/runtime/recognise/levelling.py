@@ -24,9 +24,8 @@ _log = logging.getLogger(__name__)
 
 
 class Levelling:
-    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` the pictures stay
-    as they are, and only the distance on the ground from the point below the camera to the picture's middle is
-    computed.
+    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they stay as they
+    are, and only the distance on the ground from the point below the camera to the picture's middle is computed.
 
     `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
     (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
@@ -69,18 +68,17 @@ def levelling_of(
     lens is unknown and it is on a gimbal."""
     if technique.spec.parameters.get("camera") != "nadir":
         return None
-    if config.fov_deg is None:
+    lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
+    if lens is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal:
             return None
-    lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
     is_now = config.uri is not None and is_live(config.uri)
     return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now)
 
 
 def seen_as(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled picture, for the hints; unchanged if it is
-    unknown."""
+    """Return the frame with the heading of the top of its levelled picture, for the hints, if that is known."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 

@@ -47,10 +47,9 @@ def open_recogniser(
     """Open the map, make its technique for the board, and load the index.
 
     With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
-    but for what is `known` of recorded ones (see `Told`; nothing of sequences).
-    With `follows`, the queries are those of one flight, in order (see `follow`). `settings` are parameters of the
-    technique. Raises an EdgevprError that names what does not fit together, such as a setting that the map was not
-    built with.
+    but for what is `known` of recorded ones (see `Told`). With `follows`, the queries are those of one flight, in order
+    (see `follow`). `settings` are parameters of the technique. Raises an EdgevprError that names what does not fit
+    together, such as a setting that the map was not built with.
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
@@ -64,20 +63,14 @@ def open_recogniser(
         if narrowed:
             prior = _in_flight(config, technique)
         recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
-        if narrowed:
-            place_map.wait_at_most(_WAIT_S)
         on_error.pop_all()
     return recogniser
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
-    """Open a map for adding places. Returns
-
-    * a recogniser for a flight, as `open_recogniser` does,
-    * the index that takes new places, up to the memory budget.
-
-    If there is no map, an empty one is made for the technique `new_technique` (None: a map must exist).
-    """
+    """Open a map for adding places. Returns a recogniser for a flight, as `open_recogniser` does, and the index that
+    takes new places, up to the memory budget. If there is no map, an empty one is made for the technique
+    `new_technique` (None: a map must exist)."""
     if config.map is None:
         raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
     path = map_path(config.map)
@@ -93,7 +86,6 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
         prior, follows = _in_flight(config, technique), config.match.follow
         recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
-        place_map.wait_at_most(_WAIT_S)
         on_error.pop_all()
     return recogniser, growing
 
@@ -212,8 +204,6 @@ def _recogniser(
     prior: Prior | Told | None,
     follows: bool,
 ) -> Recogniser:
-    """Make the recogniser of an open map for a board. `prior` makes hints that narrow each query (None: none do).
-    `follows`: it follows the aircraft from query to query."""
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
     matcher = Matcher(technique, index, rule, search_of(length))
@@ -225,7 +215,7 @@ def _recogniser(
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=_is_now(config))
     candidates = match.candidates or technique.candidates
     levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
-    return Recogniser(
+    recogniser = Recogniser(
         matcher,
         place_map,
         meter_of(config, board),
@@ -235,6 +225,9 @@ def _recogniser(
         prior=None if matcher.search else prior,
         follower=follower,
     )
+    if isinstance(prior, Prior):  # a flight
+        place_map.wait_at_most(_WAIT_S)
+    return recogniser
 
 
 def _make_map(path: Path, technique: Technique, mask: Mask | None) -> None:
@@ -253,7 +246,6 @@ def _wanted(config: Config) -> dict[str, str]:
 
 
 def _ram(config: Config, board: Board, technique: Technique) -> tuple[int, int]:
-    """Return two sizes in bytes: RAM that an index may take, and RAM that a sequence of queries takes for each
-    place."""
+    """Return the bytes of RAM that an index may take, and that a sequence of queries takes for each place."""
     beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
     return int(budget_mb(config, board) * 1e6), beside_bytes

@@ -20,7 +20,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.agreement import Verification, landmarks_of
+from edgevpr.runtime.recognise.agreement import Verification
 from edgevpr.runtime.recognise.evidence import evidence_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, Told, expected_of, other_heights
@@ -33,6 +33,7 @@ from edgevpr.runtime.recognise.judge import (
     judge,
     says_nothing,
 )
+from edgevpr.runtime.recognise.landmarks import describe, packed
 from edgevpr.runtime.recognise.levelling import Levelling, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -57,8 +58,8 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """Preparation of a frame before it is encoded. `levelling` levels its picture (None: it is used as it is), `mask`
-    excludes parts of it (None: no part), and `gate` rejects frames that are not memorable (None: no frame)."""
+    """Preparation of a frame before it is encoded: `levelling` levels its picture, `mask` excludes parts of it, and
+    `gate` rejects frames that are not memorable (None: neither is done)."""
 
     levelling: Levelling | None = None
     mask: Mask | None = None
@@ -155,15 +156,16 @@ class Recogniser:
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return the landmarks to store for a frame that becomes a place; None if the technique does not look straight
         down."""
-        return landmarks_of(self.technique, event.picture) if event.picture else None
+        picture = event.picture if self.technique.spec.cells else None
+        return packed(describe(picture.image, picture.mask)) if picture else None
 
     def _encode(self, event: Recognition, frame: Frame) -> tuple[Levelled, Descriptor]:
         """Prepare the picture of a frame, judge its worth by the gate, and encode it."""
-        gate = self._preparation.gate
+        preparation = self._preparation
         with self.meter.step("prepare"):
-            event.picture = picture = self._preparation.picture(frame, event.vehicle)
+            event.picture = picture = preparation.picture(frame, event.vehicle)
         with self.meter.step("gate"):
-            event.worth = gate.look(frame.image) if gate else None
+            event.worth = preparation.gate.look(frame.image) if preparation.gate else None
         with self.meter.step("encode"):
             event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
         return picture, descriptor
@@ -232,8 +234,7 @@ class Recogniser:
     ) -> _Judged:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
         flight makes another place more likely, judge that one (`followed`: the flight's result is known already).
-        `looked` compares the landmarks of the query. Returns the verdict, the place judged, and the aircraft's position
-        (None: unknown)."""
+        Returns the verdict, the place judged, and the aircraft's position (None: unknown)."""
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)

@@ -21,44 +21,29 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 class Recognition:
     """Result of one frame, which the recogniser fills in on the way. A field is None if its step was not reached.
 
-    * `frame`, and `vehicle`, the autopilot's report when the frame was taken (None: no report)
-    * `picture`: the picture that was encoded, and how it lies on the ground; `descriptor`: the encoded picture
-    * `worth`: the judgement of the salience gate (None: no gate)
-    * `hints`, which narrowed the search; `ranking`, the places found; `best`, the first of them
-    * `proof`: the agreement of the landmarks (None: not compared)
-    * `evidence` of the match (see `evidence`), and `confidence`, the probability by that evidence that the match is
-      right (None: the technique is judged by limits); `followed`: the result with the flight so far
-    * `accepted`: is `best` taken for the place? `reason`: why or why not, in a few words
-    * `says_nothing`: the picture shows too little to be recognised; a search was only made to continue a sequence
-    * `failed`: the frame, a place or the technique was unusable; `map_lost`: the whole map cannot be read
-    * `left_out`: unreadable places that are left out since the last event: number, and what is wrong
-    * `located`: the position of the aircraft; `accuracy_m`: the 1-sigma to send with it. Both are set only if the match
-      is accepted and the place has a position
-    * `steps`: the time that each step took; `cost`: time, memory and battery charge of the whole query
-    * `fix`: what became of the position; `last_fix`: what became of the one sent before. The channel to the autopilot
-      sets both (None: nothing was sent)
+    The channel to the autopilot sets `fix` and `last_fix`: what became of the position, and of the one sent before.
     """
 
     frame: Frame | None
-    vehicle: Vehicle | None = None
-    picture: Levelled | None = None
-    worth: Worth | None = None
+    vehicle: Vehicle | None = None  # the autopilot's report when the frame was taken
+    picture: Levelled | None = None  # that was encoded, and how it lies on the ground
+    worth: Worth | None = None  # judgement of the salience gate
     descriptor: Descriptor | None = None
-    hints: Hints | None = None
+    hints: Hints | None = None  # that narrowed the search
     ranking: Ranking | None = None
-    best: Candidate | None = None
-    proof: Agreement | None = None
+    best: Candidate | None = None  # the first of the ranking
+    proof: Agreement | None = None  # of the landmarks
     evidence: Mapping[str, float] | None = None
-    confidence: float | None = None
-    followed: Followed | None = None
-    accepted: bool = False
-    reason: str = ""
-    says_nothing: bool = False
-    failed: bool = False
-    map_lost: bool = False
-    left_out: tuple[tuple[int, str], ...] = ()
-    located: Located | None = None
-    accuracy_m: float | None = None
+    confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
+    followed: Followed | None = None  # the result together with the flight so far
+    accepted: bool = False  # `best` is taken for the place
+    reason: str = ""  # why or why not, in a few words
+    says_nothing: bool = False  # too little to be recognised; a search was only made to continue a sequence
+    failed: bool = False  # the frame, a place or the technique was unusable
+    map_lost: bool = False  # the whole map cannot be read
+    left_out: tuple[tuple[int, str], ...] = ()  # places unreadable since the last event: number, and what is wrong
+    located: Located | None = None  # position of the aircraft, only if the match is accepted and the place has one
+    accuracy_m: float | None = None  # the 1-sigma to send with it
     steps: Steps = field(default_factory=Steps)
     cost: QueryCost = field(default_factory=QueryCost)
     fix: FixReport | None = None

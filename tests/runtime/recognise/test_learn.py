@@ -218,5 +218,5 @@ def test_what_is_learnt_of_a_levelled_picture_lies_where_its_middle_is(tmp_path)
     bench = Bench(tmp_path / "m.gpkg")
     place = bench.see(view=View(up_deg=0.0, footprint_m=100.0, aside=(0.0, -0.3)))
     assert place.position.lat_deg == pytest.approx(50 + 30 * METRE_DEG, abs=1e-7), "the aircraft is south of it"
-    assert (place.heading_deg, place.pose.up_deg, place.pose.footprint_m) == (0.0, 0.0, 100.0)
-    assert [stored.heading_deg for stored in bench.map.places()] == [0.0]
+    (stored,) = bench.map.places()
+    assert (stored.heading_deg, stored.pose.up_deg, stored.pose.footprint_m) == (0.0, 0.0, 100.0)
