@@ -243,9 +243,9 @@ def changed_config(config: Config, path: str | Path) -> Config:
 def with_logs_in(config: Config, folder: str) -> Config:
     """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
     `folder`."""
-    paths: dict[str, Any] = {name: getattr(config.log, name) for name in ("path", "tlog", "record")}
-    log = replace(config.log, **{name: path and os.path.join(folder, path) for name, path in paths.items()})
-    return replace(config, log=log)
+    given = ((name, getattr(config.log, name)) for name in ("path", "tlog", "record"))
+    paths: dict[str, Any] = {name: path and os.path.join(folder, path) for name, path in given}
+    return replace(config, log=replace(config.log, **paths))
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:

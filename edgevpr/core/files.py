@@ -3,18 +3,14 @@ that are complete or not there at all."""
 
 import errno
 import hashlib
-import io
 import os
 import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+from typing import BinaryIO, TypeVar
 
 from edgevpr.core.errors import UsageError
-
-if TYPE_CHECKING:
-    import numpy as np
 
 T = TypeVar("T")
 _KERNEL_FILE_BYTES = 1_000_000  # read at most of a file of /proc or /sys, which report a size of 0
@@ -79,23 +75,6 @@ def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
         while block := handle.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def arrays_of(content: bytes, most_bytes: int) -> "dict[str, np.ndarray[Any, Any]]":
-    """Unpack the `content` of an .npz file of any origin to its arrays by name. Raises ValueError for one that is
-    damaged, holds Python objects, or takes more than `most_bytes` unpacked."""
-    import zipfile  # not at the top: only networks and data sets are in archives
-
-    import numpy as np
-
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(part.file_size for part in archive.infolist()) > most_bytes:
-                raise ValueError(f"it takes more than {most_bytes / 1e6:.0f} MB unpacked")
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (OSError, EOFError, KeyError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise ValueError(str(error)) from error
 
 
 def require_folder(path: Path) -> None:

@@ -3,13 +3,15 @@ picture's local descriptors and their words (Jégou et al., CVPR 2010), and the 
 models/recipes/ writes the file of the words; the techniques in `network` and `regions` load it."""
 
 import hashlib
+import io
+import zipfile
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.core.arrays import Array, Ints, Singles
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import arrays_of, find_model, read_file
+from edgevpr.core.files import find_model, read_file
 from edgevpr.techniques.card import load_card
 
 _MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
@@ -37,9 +39,10 @@ def load_words(model: str, kind: str, count: int) -> Words:
         raise ModelError(f"There are no words {name} in the folders of models: {command}.")
     try:
         content = read_file(path, _MAX_FILE_BYTES)
-        arrays = arrays_of(content, _MAX_FILE_BYTES)
+        with np.lib.npyio.NpzFile(io.BytesIO(content)) as file:
+            arrays = dict(file)
         words = arrays["words"].astype(np.float32)
-    except (OSError, ValueError, KeyError, MemoryError) as error:
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
     learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != wanted:
