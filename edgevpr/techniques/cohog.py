@@ -210,14 +210,10 @@ class CoHog:
             middle, seen = (placecode.middle(each, views.seen) for each in (views.blocks(1.0, 0)[0], views.seen))
             asked = placecode.hypotheses(*placecode.grid(middle, seen), mean_grid)
             return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
-        expected = None
-        if turned_deg is not None:
-            steps = np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS
-            expected = np.nan_to_num(steps, nan=-1).astype(np.intp)
         ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
         self._views_of(query).keep(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, expected, in_reach)
+        of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, turned_deg, in_reach)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         scores[:, first : first + ROTATIONS] = of_ratio
         return np.clip(of_ratio.max(axis=1), 0, 1), scores

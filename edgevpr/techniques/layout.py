@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from edgevpr.core.arrays import Array, Bools, Bytes, Ints, Singles
+from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Ints, Singles
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,19 +92,21 @@ def of_place(patterns: Array, good: Bools, side: int) -> Bytes:
     return packed
 
 
-def scan(fields: Fields, rows: Bytes, expected: Ints | None = None, likely: Bools | None = None) -> Singles:
+def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
     """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
 
-    `expected` int (N,) is the rotation, in steps, under which each place is expected if headings are known. Then only
-    this rotation and the two beside it are scored, and the others are -inf. Below 0, or if `expected` is None, all are.
-    `likely` bool (N,) tells which places may be compared by the fine grid (None: all). A pair that is compared by the
-    fine grid has a score of 0 to 1; any other has its score by the coarse grid, less 1.
+    `turned_deg` (N,) is the rotation under which each place is expected. Then only the nearest rotation and the two
+    beside it are scored, and the others are -inf. If it is NaN, or None, all are scored. `likely` bool (N,) tells which
+    places may be compared by the fine grid (None: all). A pair that is compared by the fine grid has a score of 0 to 1;
+    any other has its score by the coarse grid, less 1.
     """
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
-    turns = np.full(len(rows), -1) if expected is None else expected
+    turns = np.full(len(rows), -1)
+    if turned_deg is not None:
+        turns = np.nan_to_num(np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS, nan=-1).astype(np.intp)
     of_coarse = rows[:, : COARSE.numbers // 2]
     for turn in np.unique(turns):
-        group = slice(None) if expected is None else np.flatnonzero(turns == turn)
+        group = slice(None) if turned_deg is None else np.flatnonzero(turns == turn)
         tried = np.arange(0, ROTATIONS, 2) if turn < 0 else np.arange(turn - 1, turn + 2) % ROTATIONS
         found = _compared(COARSE, [fields(int(each), COARSE) for each in tried], of_coarse[group])
         if turn < 0:
@@ -136,7 +138,11 @@ def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     if not inside:
         return 0.0
     laid = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
-    return float(np.clip(_scored(laid, _strength(query), place).max(), 0, 1))
+    of_place = (place**2).sum(axis=0)
+    scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
+    scatter = np.maximum(scatter, _LEAST_SCATTER**2 * _strength(query) * of_place.sum())
+    found = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * n)
+    return float(np.clip(found.max(), 0, 1))
 
 
 def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
@@ -160,16 +166,6 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
         strength = np.einsum("nd,nd->n", places, places)
         best[start : start + len(part)] = (found / np.sqrt(strength + _TINY)).T
     return best
-
-
-def _scored(laid: Singles, strength: float, place: Singles) -> Singles:
-    """Return the score of each of S shifted fields of a query, `laid` (S, C, n, n), on a place (C, n, n): (S,).
-    `strength` is that of the field before it was shifted."""
-    of_place = (place**2).sum(axis=0)
-    scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
-    scatter = np.maximum(scatter, _LEAST_SCATTER**2 * strength * of_place.sum())
-    found: Singles = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * len(of_place))
-    return found
 
 
 def _strength(field: Array) -> float:

@@ -14,7 +14,7 @@ from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.card import Card, digest_of
 from edgevpr.techniques.regions import describe, find_regions, region_backbone
-from edgevpr.techniques.session import Backbone, backbone_of, open_backbone
+from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import NEVER, VectorTechnique
 from edgevpr.techniques.words import load_words, local_descriptors, sharpness_of, vlad
 
@@ -146,7 +146,7 @@ def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of its network. A map records no parameters of it, since the hash of the
     network in the map covers them. The margins of its wrong matches are unknown: no match is accepted until the
     configuration sets a minimum margin."""
-    backbone = backbone_of(card, "descriptor", threads)
+    backbone = Backbone(card, "descriptor", threads)
     sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)

@@ -52,21 +52,19 @@ class SeqSlam:
         quality is the share of patches that vary."""
         size = (self._width, self._height)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32))
-        allowed = np.ones_like(pixels)
-        if mask is not None:
-            small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            allowed = self._patches(small.astype(np.float32))
+        seen = np.ones(image.shape[:2], np.uint8) if mask is None else mask.astype(np.uint8)
+        pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+        allowed = self._patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
         z, spread = normalised(pixels, allowed)
         levels = np.clip(np.rint(_STEPS * z) + _GREYEST, 0, 255).astype(np.uint8)
         rows, columns = self._height // self._patch, self._width // self._patch
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
 
-    def _patches(self, picture: Singles) -> Singles:
-        """Cut a picture into patches: (height, width) to (patches, patch * patch)."""
+    def _patches(self, picture: Array) -> Singles:
+        """Cut a picture into patches: (height, width) to float32 (patches, patch * patch)."""
         rows, columns = self._height // self._patch, self._width // self._patch
-        blocks = picture.reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
+        blocks = picture.astype(np.float32).reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
     def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:

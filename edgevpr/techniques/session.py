@@ -3,7 +3,6 @@ only module that uses onnxruntime in flight, and imports it only with the first 
 is run once before it may fly, and every result is checked."""
 
 import os
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,63 +15,64 @@ from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.files import read_file, sha256_of
 from edgevpr.techniques.card import Card, InputRule, load_card
 
-_RANKS = {"descriptor": 2, "features": 4}
-_FORMS = {"descriptor": "(1, D)", "features": "(1, C, H, W)"}
+_FORMS = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
 _SEED = 7
 MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
 _MOST_THREADS = 256
 _LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
 _RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
-_NOTHING_ALLOWED = 128
 
 
-@dataclass(frozen=True, slots=True)
 class Backbone:
-    """One `output`, "features" or "descriptor", of a network that has run successfully. `shape` is (C, H, W) for
-    features, (D,) for a descriptor. `session` is that of onnxruntime."""
+    """One `output`, "features" or "descriptor", of the network of a `card`, which is run once on trial. `shape` is (C,
+    H, W) for features, (D,) for a descriptor. `sha256` is the card's fingerprint: weights, preparation and outputs.
 
-    card: Card
-    output: str
-    shape: tuple[int, ...]
-    session: Any
+    Raises ModelError, one sentence, if onnxruntime or the card's file is missing, if the file is not that of the card
+    or no ONNX, if inputs or outputs have another form or axes without a size, or if the result of the trial is not
+    finite or all zeros. Raises UsageError for a number of threads outside 1 to 256.
+    """
 
-    @property
-    def sha256(self) -> str:
-        """The card's fingerprint: weights, preparation and outputs (`card.sha256` is that of the file alone)."""
-        return self.card.fingerprint
+    def __init__(self, card: Card, output: str, threads: int = 1) -> None:
+        if getattr(card.outputs, output) is None:
+            raise ModelError(
+                f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
+                f"`outputs: {{{output}: ...}}`."
+            )
+        self.card, self.output, self.sha256 = card, output, card.fingerprint
+        self.session = open_session(card, threads)
+        # Noise, not a uniform picture: many a correct network gives only zeros for that.
+        noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
+        self.shape = self.run(noise).shape
 
     def run(self, image: Image, mask: Mask | None = None) -> Singles:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
         get the mean of the others. Raises ModelError for results with NaN, numbers beyond 1e12, or zeros only."""
-        return _run(self.card, self.output, self.session, without_masked(image, mask))
+        card, name = self.card, getattr(self.card.outputs, self.output)
+        prepared = prepare(without_masked(image, mask), card.input)
+        (result,) = run_outputs(card, self.session, [name], prepared)
+        rank, form = _FORMS[self.output]
+        if result.ndim != rank or len(result) != 1 or not result.size:
+            raise ModelError(
+                f"{card.file_path}: its output `{name}` is {result.shape} and `{self.output}` must be {form}: correct "
+                "`outputs` of the card."
+            )
+        values: Singles = result[0].astype(np.float32, copy=False)
+        if not values.any():
+            raise ModelError(
+                f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, "
+                "or the picture shows nothing at all."
+            )
+        return values
 
 
 def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
-    """Open the network of the card `model`, for its output "features" or "descriptor".
-
-    Raises ModelError, one sentence, if onnxruntime, the card or its file is missing, if the file is not that of the
-    card or no ONNX, if inputs or outputs have another form or axes without a size, or if the result of a trial is not
-    finite or all zeros. Raises UsageError for a number of threads outside 1 to 256.
-    """
-    return backbone_of(load_card(model), output, threads)
-
-
-def backbone_of(card: Card, output: str, threads: int = 1) -> Backbone:
-    """Open the network of a card that is already loaded, as `open_backbone` does."""
-    if getattr(card.outputs, output) is None:
-        raise ModelError(
-            f"{card.path} names no output for `{output}`: use another model, or name its ONNX output in "
-            f"`outputs: {{{output}: ...}}`."
-        )
-    session = open_session(card, threads)
-    # Noise, not a uniform picture: many a correct network gives only zeros for that.
-    noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-    return Backbone(card, output, _run(card, output, session, noise).shape, session)
+    """Open the network of the card called `model`; raises as `Backbone` and `load_card` do."""
+    return Backbone(load_card(model), output, threads)
 
 
 def open_session(card: Card, threads: int = 1) -> Any:
-    """Open the onnxruntime session of a card's file; raises as `open_backbone` does. The network is not run, so its
-    inputs and outputs are not yet compared with the card."""
+    """Open the onnxruntime session of a card's file; raises as `Backbone` does. The network is not run, so its inputs
+    and outputs are not yet compared with the card."""
     if not 1 <= threads <= _MOST_THREADS:
         raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
     return _session(card.file_path, card.sha256, threads)
@@ -127,23 +127,6 @@ def import_onnxruntime() -> Any:
             "the techniques with networks; hog, cohog and seqslam fly without it."
         ) from error
     return onnxruntime
-
-
-def _run(card: Card, output: str, session: Any, image: Image) -> Singles:
-    name = getattr(card.outputs, output)
-    (result,) = run_outputs(card, session, [name], prepare(image, card.input))
-    if result.ndim != _RANKS[output] or len(result) != 1 or not result.size:
-        raise ModelError(
-            f"{card.file_path}: its output `{name}` is {result.shape} and `{output}` must be {_FORMS[output]}: "
-            "correct `outputs` of the card."
-        )
-    values: Singles = result[0].astype(np.float32, copy=False)
-    if not values.any():
-        raise ModelError(
-            f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, or "
-            "the picture shows nothing at all."
-        )
-    return values
 
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
@@ -219,5 +202,5 @@ def without_masked(image: Image, mask: Mask | None) -> Array:
     if mask is None or mask.all():
         return image
     filled = image.copy()
-    filled[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else _NOTHING_ALLOWED
+    filled[~mask] = np.rint(image[mask].mean(axis=0)) if mask.any() else 128
     return filled

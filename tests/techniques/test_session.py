@@ -10,7 +10,6 @@ from pictures import textured
 from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques import session
 from edgevpr.techniques.session import open_backbone
 
 
@@ -91,12 +90,10 @@ def test_a_card_that_does_not_fit_its_file_is_one_sentence(models, card, output,
 def test_a_picture_of_which_nothing_is_made_is_refused_in_flight_too(models):
     write_network(models)
     backbone = open_backbone("tiny", "features")
-    with pytest.raises(ModelError, match="not finite"):
-        session._run(backbone.card, "features", FakeSession(np.full((1, *FEATURES), np.inf, np.float32)), textured(1))
-    with pytest.raises(ModelError, match="beyond 1e\\+12"):  # its length is infinite in float32: all would become zero
-        session._run(backbone.card, "features", FakeSession(np.full((1, *FEATURES), 1e30, np.float32)), textured(1))
-    with pytest.raises(ModelError, match="zeros"):
-        session._run(backbone.card, "features", FakeSession(np.zeros((1, *FEATURES), np.float32)), textured(1))
+    for value, says in ((np.inf, "not finite"), (1e30, r"beyond 1e\+12"), (0, "zeros")):  # 1e30: of infinite length
+        backbone.session = FakeSession(np.full((1, *FEATURES), value, np.float32))
+        with pytest.raises(ModelError, match=says):
+            backbone.run(textured(1))
 
 
 class FakeSession:

@@ -23,7 +23,7 @@ from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
 from edgevpr.runtime.recognise.gate_networks import CROPS, Detector, Memorability
 from edgevpr.techniques.card import Card, card_names, load_card, read_card
-from edgevpr.techniques.session import backbone_of, file_sha256, import_onnxruntime
+from edgevpr.techniques.session import Backbone, file_sha256, import_onnxruntime
 
 _ROUNDS = 10
 _FRAME = (480, 640)
@@ -92,7 +92,7 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
     import_onnxruntime()
     imported_mb = rss_mb()
     outputs = [output for output in ("descriptor", "features") if getattr(card.outputs, output)]
-    backbones = {output: backbone_of(card, output, threads) for output in outputs}
+    backbones = {output: Backbone(card, output, threads) for output in outputs}
     shapes = {output: backbone.shape for output, backbone in backbones.items()}
     runs: dict[str, Callable[[Image], object]] = {output: backbone.run for output, backbone in backbones.items()}
     if card.outputs.boxes:
