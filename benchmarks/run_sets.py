@@ -26,10 +26,9 @@ from edgevpr.core.text import progress
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
-from edgevpr.lab.evaluate.asking import MatchOptions
+from edgevpr.lab.evaluate.asking import MatchOptions, known_of
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate
-from edgevpr.lab.evaluate.knowing import lacking
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import file_sha256
@@ -195,8 +194,14 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
 
 def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
     """Return True if a set says what a variant is told of each query."""
-    known, sequence = variant.options.known, variant.options.sequence
-    return not (known and lacking(known, dataset, create(variant.technique, settings(variant, folder)).spec, sequence))
+    if not variant.options.known:
+        return True
+    spec = create(variant.technique, settings(variant, folder)).spec
+    try:
+        known_of(variant.options.known, dataset, spec, variant.options.sequence)
+    except UsageError:
+        return False
+    return True
 
 
 def thinned(curve: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -1,18 +1,21 @@
 """The page that sums up the result files of the image sets, `sets.md`, and its precision-recall curves."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import base
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import figure, markdown
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json
-from edgevpr.lab.evaluate.tables import plot
+from edgevpr.lab.evaluate.metrics import Quality
 
 CURVES = "curves.png"
+_PANELS_A_ROW = 3
+# More than ten colours cannot be told apart: after ten curves the line style changes.
+_LINES = ("-", "--", ":", "-.")
 # What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
 _NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame", " candidates")
 
@@ -61,6 +64,31 @@ def write(folder: Path, left_out: dict[str, str]) -> None:
     plot(drawn, folder / CURVES)
     base.shrink(folder / CURVES)
     (folder / "sets.md").write_text(_page(contents, results, left_out))
+
+
+def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
+    """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
+    A curve of one point, where all scores are the same, is drawn as a mark."""
+    columns = min(len(results), _PANELS_A_ROW)
+    rows = -(-len(results) // columns)
+    drawn = figure(5.2 * columns, 4.6 * rows)
+    # A technique looks the same in every panel, whatever is beside it and whatever the order of the legend.
+    names = list(dict.fromkeys(result.technique for compared in results.values() for result in compared))
+    for at, (title, compared) in enumerate(results.items(), start=1):
+        axes = drawn.add_subplot(rows, columns, at)
+        for result in sorted(compared, key=lambda result: -result.auc):
+            number = names.index(result.technique)
+            precision, recall = zip(*result.precision_recall, strict=True)
+            label, mark = f"{result.technique} {result.auc:.2f}", "o" if len(recall) == 1 else None
+            line, colour = _LINES[number // 10 % len(_LINES)], f"C{number % 10}"
+            axes.plot(recall, precision, line, color=colour, marker=mark, label=label)
+        axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
+        axes.grid(alpha=0.3)
+        # Below the panel, where it hides no curve.
+        axes.legend(
+            title="AUC (2.3)", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13)
+        )
+    drawn.savefig(path, dpi=100)
 
 
 def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict[str, str]) -> str:

@@ -26,9 +26,12 @@ from edgevpr.cli.shared import (
 )
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.core.text import progress, require_picture, shown
+from edgevpr.core.text import progress, shown
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from edgevpr.lab.evaluate.metrics import Quality
     from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 
 
@@ -46,17 +49,15 @@ def add(commands: Any) -> None:
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV (default: right is what is near, by the positions)")
     parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
     parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
-    parser.add_argument("--overlap", type=positive, metavar="SHARE", help="and with so much common ground (--fov-deg)")
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="measure stored similarities (.npy)")
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
     add_known(parser)
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
-    add_keys(parser, "source.camera", "source.fov_deg", "match.candidates", "match.sequence", "salience.use")
+    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
-    parser.add_argument("--plot", metavar="FILE", help="draw the precision-recall curves (.png, .pdf, .svg)")
     add_json(parser)
 
 
@@ -71,36 +72,31 @@ def _measure_many(args: Namespace) -> int:
     """Measure many rows on many sets, and write the results to --out. Rows that an earlier run measured are reused."""
     from edgevpr.lab.evaluate.many import measure
     from edgevpr.lab.evaluate.page import as_json, write_results
-    from edgevpr.lab.evaluate.tables import quality_text
+    from edgevpr.lab.evaluate.tables import results_text
 
-    if args.plot or value_of(args, "salience.use"):
-        raise UsageError("--plot and --salience go without --out: its page has curves, and --salience takes one set.")
+    if value_of(args, "salience.use"):
+        raise UsageError("--salience goes without --out: it takes one set.")
     plan = _plan(args)
     _say_cameras(plan)
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     outcome = measure(plan, out, args.workers or len(os.sched_getaffinity(0)), progress)
     write_results(out, outcome)
-    for dataset in outcome.sets.values():
-        report(*dataset.notes)
-    measured = [(name, [row.result for row in outcome.rows_of(name)]) for name in outcome.sets]
-    tables = [f"{shown(name)}\n\n{quality_text(results)}\n" for name, results in measured if results]
+    measured = [(name, [row.result for row in rows]) for name, rows in outcome.found.items()]
+    tables = [f"{shown(name)}\n\n{results_text(results)}\n" for name, results in measured if results]
     show(as_json(outcome), args.json, "\n".join([*tables, f"{out / 'index.html'}: look at it."]))
     report(*(f"{name}, {row} was not measured: {why}" for (name, row), why in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
 def _measure_techniques(args: Namespace) -> int:
-    """Measure techniques on one set, and print the results. Files are written only for --plot."""
-    from edgevpr.lab.evaluate import evaluate as evaluation
-    from edgevpr.lab.evaluate.tables import plot, results_text
+    """Measure techniques on one set, and print the results."""
+    from edgevpr.lab.evaluate.evaluate import compare, evaluate
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.techniques import create
 
     if args.sets or args.workers or len(args.data or ()) > 1:
         raise UsageError("--sets, --workers and several sets need a folder for the results: name it with --out.")
-    if args.plot:
-        require_picture(Path(args.plot))
     plan = _plan(args)
     errors: dict[str, ModelError] = {}  # by technique, whatever the form
     for row in plan.rows.values():
@@ -113,18 +109,12 @@ def _measure_techniques(args: Namespace) -> int:
     if not rows:
         raise next(iter(errors.values()))
     gate = gate_of(config_of(args, args.config).salience)
-    ((name, chosen),) = plan.sets.items()
+    (chosen,) = plan.sets.values()
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as videos:
         dataset = chosen.open(Path(videos), progress)
-        report(*dataset.notes)
         _say_cameras(plan)
-        measured = [
-            evaluation.evaluate(row.technique, dataset, row.settings(None), row, progress, gate) for row in rows
-        ]
-    results = evaluation.compare(measured)
-    if args.plot:
-        plot({name: results}, Path(args.plot))
-    show(evaluation.as_json(results), args.json, results_text(results))
+        measured = [evaluate(row.technique, dataset, row.settings(None), row, progress, gate) for row in rows]
+    _show("techniques", compare(measured), args.json)
     report(*(f"{technique} was not measured: {error}" for technique, error in errors.items()))
     return 1 if errors else 0
 
@@ -132,22 +122,20 @@ def _measure_techniques(args: Namespace) -> int:
 def _measure_similarities(args: Namespace) -> int:
     from edgevpr.lab.evaluate.dataset import names_in
     from edgevpr.lab.evaluate.similarity import measure, read_similarities, truth_of
-    from edgevpr.lab.evaluate.tables import plot, quality_text
 
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
-    if args.plot:
-        require_picture(Path(args.plot))
     queries, references = (names_in(folder) if folder else None for folder in (args.query, args.ref))
-    results = []
-    for file in args.similarity:
-        scores = read_similarities(file)
-        results.append(measure(Path(file).stem, scores, *truth_of(args.ground_truth, scores, queries, references)))
-    if args.plot:
-        plot({Path(args.ground_truth).resolve().parent.name: results}, Path(args.plot))
-    found = {"similarities": {result.technique: asdict(result) for result in results}}
-    show(found, args.json, quality_text(results))
+    truth = truth_of(args.ground_truth, queries)
+    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
+    _show("similarities", results, args.json)
     return 0
+
+
+def _show(what: str, results: "Sequence[Quality]", as_json: bool) -> None:
+    from edgevpr.lab.evaluate.tables import results_text
+
+    show({what: {result.technique: asdict(result) for result in results}}, as_json, results_text(results))
 
 
 def _plan(args: Namespace) -> "EvaluationPlan":
@@ -171,8 +159,6 @@ def _plan(args: Namespace) -> "EvaluationPlan":
         ground_truth=args.ground_truth,
         within_m=args.within_m,
         within_deg=args.within_deg,
-        overlap=args.overlap,
-        fov_deg=value_of(args, "source.fov_deg"),
         rate_hz=args.rate_hz,
     )
     return of_flags(args.data or (), _rows(args), common)

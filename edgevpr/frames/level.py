@@ -7,7 +7,7 @@ shows. Recognition and mapping level their pictures by `runtime.recognise.levell
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
@@ -220,15 +220,13 @@ def _body_from_lens(up_deg: float) -> Doubles:
 
 
 def _quadrangle(corners: Doubles, side: int) -> Mask:
-    """Return a mask, bool (side, side), True inside a quadrangle. `corners`, float (3, 4), are its corners in
-    homogeneous pixels, one per column."""
+    """Return a mask, bool (side, side), True inside the quadrangle of `corners`, homogeneous pixels (3, 4)."""
     points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
     return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS).view(np.bool_)
 
 
 def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
-    """Warp an image to (side, side) pixels by the homography `out_from_pixel` (3, 3). `shrink`: number of input pixels
-    along a side that become one output pixel."""
+    """Warp an image to (side, side) pixels by a homography (3, 3); `shrink` input pixels along a side become one."""
     if shrink > 2:  # averaged first, since a warp alone would ignore most pixels
         height, width = image.shape[:2]
         small = max(1, round(width / shrink)), max(1, round(height / shrink))
@@ -236,32 +234,6 @@ def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink:
         image = resized(image, small)
         out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
     # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
-    warped = cv2.warpPerspective(
+    return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
         image, out_from_pixel, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return warped  # type: ignore[return-value]  # of the same dtype
-
-
-# A rectangle of flat ground: its middle (metres east and south of a common origin), its width and height in metres, and
-# the compass direction of its top in degrees. So OpenCV writes rotated rectangles.
-Footprint: TypeAlias = tuple[tuple[float, float], tuple[float, float], float]
-
-
-def footprint(
-    middle_m: tuple[float, float], height_m: float, fov_deg: float, size_px: tuple[int, int], up_deg: float
-) -> Footprint:
-    """Return the ground shown by a picture of `size_px` (width, height) taken straight down from `height_m` above flat
-    ground, with a field of view of `fov_deg` across its longest side. `middle_m`: point (east, north) in its middle.
-    `up_deg`: compass direction of its top."""
-    longest_m = 2 * height_m * math.tan(math.radians(fov_deg) / 2)
-    width_m, depth_m = (longest_m * each / max(size_px) for each in size_px)
-    return (middle_m[0], -middle_m[1]), (width_m, depth_m), up_deg
-
-
-def shared(one: Footprint, other: Footprint) -> float:
-    """Return the area that two footprints share, as a share of the area of the smaller one, 0..1."""
-    kind, corners = cv2.rotatedRectangleIntersection(one, other)
-    if kind == cv2.INTERSECT_NONE:
-        return 0.0
-    area_m2 = cv2.contourArea(cv2.convexHull(np.asarray(corners, np.float32)))
-    return min(1.0, float(area_m2) / min(math.prod(one[1]), math.prod(other[1])))

@@ -21,7 +21,6 @@ UNKNOWN = "–"
 
 _WIDE, _HIGH = 1000.0, 100.0
 _LAST = 0.97  # share of an axis: a text centred on a point further right would leave the page
-_TAG_WIDE, _TAG_HIGH = 0.035, 0.14  # of a chart: room for the number of a point
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
 
@@ -134,23 +133,6 @@ def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: floa
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
     drawing = _svg(f"{title}, {unit}", _HIGH, axis.grid(_HIGH) + paths)
     return _framed(title, f"{unit} {legend}", highest, axis, drawing)
-
-
-def scatter(title: str, unit: str, points: Sequence[tuple[float, float, str, str]], axis: Axis, top: float) -> str:
-    """Return a chart of `points` as HTML, "" without points. Each point is (x, value, short text, colour), with values
-    from 0 to `top`. Texts that would lie over each other are moved to the right."""
-    taken: list[tuple[float, float]] = []
-    marks = tags = ""
-    for x, value, text, colour in points:
-        left, above = axis.across(x), 1 - min(max(value / top, 0.0), 1.0)
-        marks += f'<path class="dots {colour}" d="{dots([(_WIDE * left, _HIGH * above)])}"/>'
-        tag = left
-        while any(abs(tag - other) < _TAG_WIDE and abs(above - at) < _TAG_HIGH for other, at in taken):
-            tag += _TAG_WIDE
-        taken.append((tag, above))
-        tags += f'<span class="tag {colour}" style="left:{100 * tag:.1f}%;top:{100 * above:.1f}%">{escape(text)}</span>'
-    drawing = _svg(f"{title}, {unit}", _HIGH, axis.grid(_HIGH) + marks)
-    return _framed(title, f"{unit} ", top, axis, f'<div class="tagged">{drawing}{tags}</div>') if points else ""
 
 
 def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:

@@ -14,7 +14,6 @@ from edgevpr.review.html import (
     lanes,
     nice,
     page,
-    scatter,
     section,
     table,
     times,
@@ -53,11 +52,6 @@ def test_times_and_figures_are_short():
 SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.5, "half"), (1.0, "1")])
 
 
-def tags(drawn):
-    found = re.findall(r'<span class="tag \w+" style="left:([\d.]+)%;top:([\d.]+)%">(\w+)<', drawn)
-    return {name: (float(left), float(top)) for left, top, name in found}
-
-
 def test_points_of_a_curve_lie_where_the_axis_says():
     drawn = chart("Precision", "", [Series("", "row0", [(0.0, 1.0), (0.5, 0.5), (1.0, 0.0)])], SHARES, top=1.0)
     assert 'class="line row0" d="M0.0 0.0L500.0 50.0L1000.0 100.0"' in drawn
@@ -76,20 +70,7 @@ def test_an_axis_may_begin_anywhere():
     assert Axis(2.0, 2.0, []).across(2.0) == 0.0
 
 
-def test_numbers_that_would_lie_over_each_other_stand_beside_each_other():
-    drawn = scatter(
-        "Recall", "mAh", [(0.2, 0.5, "1", "row0"), (0.2, 0.5, "2", "row1"), (0.8, 0.5, "3", "row2")], SHARES, 1
-    )
-    found = tags(drawn)
-    assert found["1"] == (20.0, 50.0)
-    assert found["2"][0] > 23
-    assert found["2"][1] == 50.0
-    assert found["3"] == (80.0, 50.0)
-    assert drawn.count("M200.0 50.0h0") == 2, "the points themselves stay"
-
-
 def test_nothing_to_draw_is_nothing():
-    assert scatter("Recall", "mAh", [], SHARES, 1.0) == ""
     assert section("title", "") == ""
 
 

@@ -1,6 +1,7 @@
-"""Asks the queries of a data set one by one, with the recogniser of a flight, and judges each by ground truth."""
+"""Asks the queries of a data set one by one, with the recogniser of a flight, told what is known of them beside their
+pictures, and judges each by ground truth."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -8,14 +9,14 @@ from typing import TypeVar
 import numpy as np
 
 from edgevpr.core.config import bounded, load_config
-from edgevpr.core.contract import Technique
-from edgevpr.core.errors import ModelError
+from edgevpr.core.contract import Technique, TechniqueSpec
+from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.types import Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.source import tags_of
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.lab.evaluate.knowing import NO_TAG, Known
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
@@ -23,12 +24,14 @@ from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.hints import Told, lacking, told_parts
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 
 T = TypeVar("T")
+NO_TAG = GeoTag()
 Progress = Callable[[Iterable[T], int, str], Iterable[T]]  # yields the items, of that number, and shows it with a label
 # Of a discarded query, for example.
 _NOTHING_FOUND = Ranking(slots=np.empty(0, np.intp), scores=np.empty(0, np.float32), compared={})
@@ -47,6 +50,25 @@ class MatchOptions:
     exact: bool = False
     follow: bool = False
     known: str | None = None
+
+
+def known_of(
+    text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
+) -> tuple[Told | None, dict[Path, GeoTag]]:
+    """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),
+    and the tags of the queries by path. The height of the map is the median of those of its pictures. `sequence` is
+    that of `MatchOptions`. Raises UsageError if no query has what is asked for, and for a text that cannot be read."""
+    if not (parts := told_parts(text)):
+        return None, {}
+    queries, places = tags_of(dataset.queries[0].path.parent), tags_of(dataset.ref_dir)
+    if why := lacking(parts, queries.values(), places.values(), length_of(spec, sequence)):
+        raise UsageError(why)
+    of_queries, of_places = (
+        [tag.height_m for tag in side.values() if tag.height_m is not None and tag.height_m > 0]
+        for side in (queries, places)
+    )
+    map_height_m = float(np.median(of_places)) if of_queries and of_places else None
+    return Told(parts, spec.heading_within_deg, map_height_m), queries
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,9 +99,8 @@ class QueryAnswer:
 
 
 class Walk:
-    """A recogniser that is open on a map and set up by `options`, for asking one query after another. `length` is the
-    number of queries that are matched together. `is_in_order` is True if an answer depends on the queries before it.
-    `known` is what `options.known` says of each query."""
+    """A recogniser that is open on a map and set up by `options`, for asking one query after another. `is_in_order` is
+    True if an answer depends on the queries before it. `prior` narrows each query (None: nothing is known of it)."""
 
     def __init__(
         self,
@@ -90,13 +111,12 @@ class Walk:
         *,
         options: MatchOptions,
         gate: Gate | None = None,
-        known: Known = Known(),  # noqa: B008  it is frozen
+        prior: Told | None = None,
     ) -> None:
-        self.known = known
-        self.length = length_of(technique.spec, options.sequence)
-        rule = accept_rule(technique, load_config(None).match, self.length, calibration_of(place_map))
-        follows = options.follow and self.length == 1 and rule.sure is not None
-        self.is_in_order = self.length > 1 or follows
+        together = length_of(technique.spec, options.sequence)
+        rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
+        follows = options.follow and together == 1 and rule.sure is not None
+        self.is_in_order = together > 1 or follows
 
         def recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
@@ -105,12 +125,12 @@ class Walk:
                 meter,
                 WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
                 preparation=Preparation(gate=gate),
-                prior=known.prior(technique.spec),
+                prior=prior,
                 follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
             )
 
         self._once, self._gate = recogniser(1, False), gate
-        self.recogniser = recogniser(self.length, follows)
+        self.recogniser = recogniser(together, follows)
 
     def warm_up(self, path: Path) -> None:
         """Recognise the image `path` without counting it: the first query pays for lazy imports and a cold disk."""
@@ -143,15 +163,18 @@ def answer_of(event: Recognition, query: ScoredQuery, references: Sequence[str],
     )
 
 
-def answers(walk: Walk, dataset: Dataset, progress: Progress[Path]) -> Iterator[QueryAnswer]:
-    """Ask all queries of `dataset`, and yield one judged answer for each that is scored."""
+def answers(
+    walk: Walk, dataset: Dataset, progress: Progress[Path], tags: Mapping[Path, GeoTag] | None = None
+) -> Iterator[QueryAnswer]:
+    """Ask all queries of `dataset`, of which `tags` are known (None: none), and yield one judged answer for each that
+    is scored."""
     recogniser = walk.recogniser
     scored = {query.path.name: query for query in dataset.queries}
     paths = [query.path for query in dataset.queries]
     if walk.is_in_order:  # those that are not scored are part of a sequence as well
         paths = list_images(paths[0].parent)
     for path in progress(paths, len(paths), f"{recogniser.technique.spec.name}: queries"):
-        event = asked(recogniser, path, walk.known.tags.get(path, NO_TAG))
+        event = asked(recogniser, path, (tags or {}).get(path, NO_TAG))
         if query := scored.get(path.name):
             yield answer_of(event, query, dataset.references, recogniser.index)
 

@@ -3,7 +3,7 @@ right references of each query. `evaluate` measures techniques on it; `layouts` 
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,12 +41,11 @@ class ScoredQuery:
 @dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set: its scored `queries`, and the folder `ref_dir` of its references. `references` are the file names of
-    all images there, in the order of mapping. `notes` are sentences on what is left out."""
+    all images there, in the order of mapping."""
 
     queries: tuple[ScoredQuery, ...]
     ref_dir: Path
     references: tuple[str, ...]
-    notes: tuple[str, ...] = ()
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
@@ -57,9 +56,7 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
     return joined(query_dir, ref_dir, read_truth(ground_truth), ground_truth)
 
 
-def joined(
-    query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path, notes: Iterable[str] = ()
-) -> Dataset:
+def joined(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path) -> Dataset:
     """Make a data set of two folders of images and the ground truth that was read from `origin`. Raises UsageError for
     a name that is not in its folder, and where no query is scored."""
     paths = {decoded_name(path.name): path for path in list_images(query_dir)}
@@ -70,10 +67,10 @@ def joined(
             raise UsageError(f"{origin}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
         if judged.right and (unknown := sorted((judged.right | judged.ignored) - known)):
             raise UsageError(f"{origin}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
-    queries = (ScoredQuery(paths[name], each.right, each.ignored) for name, each in truth.items() if each.right)
-    if not (scored := tuple(queries)):
+    queries = tuple(ScoredQuery(paths[name], each.right, each.ignored) for name, each in truth.items() if each.right)
+    if not queries:
         raise UsageError(f"{origin} scores no query: it needs a row with ref_files (and status `ok`).")
-    return Dataset(scored, Path(ref_dir), references, tuple(notes))
+    return Dataset(queries, Path(ref_dir), references)
 
 
 def names_in(folder: str | Path) -> tuple[str, ...]:

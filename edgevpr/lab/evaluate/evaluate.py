@@ -7,7 +7,7 @@ parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Pl
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +16,18 @@ import numpy as np
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
-from edgevpr.core.types import NO_COST, Frame, StageCost
+from edgevpr.core.types import NO_COST, Frame
 from edgevpr.frames.source import Source, open_source
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers
+from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers, known_of
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.evaluate.knowing import known_of
-from edgevpr.lab.evaluate.metrics import Quality, figures
 from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import length_of
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, rail_ah, stage_energy_j
+from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.hints import told_parts
 from edgevpr.runtime.recognise.opening import meter_of
@@ -39,17 +37,16 @@ from edgevpr.techniques.card import weights_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TechniqueResult(Quality):
+class TechniqueResult(metrics.Quality):
     """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
 
     `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of `QueryAnswer`;
     a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all references,
     `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1 (5.1).
     `descriptor_bytes` is the RAM of a place, `fine_bytes` the size of its fine part on disk. Charges are for all
-    queries, in Ah: `ah_total` (5.7) from the battery pack, `ah_total_cpu_rail` from the thesis's rail of 2.5 V;
-    `ah_assumes` names board, pack and efficiency. `sequence`: how many queries were matched together. `known`: that of
-    `MatchOptions`. `weights`: origin of the network's weights (None: no network). `pcu` and `t_encode_max_s`: filled in
-    by `compare`, since they depend on all techniques compared.
+    queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how many
+    queries were matched together. `known`: that of `MatchOptions`. `weights`: origin of the network's weights (None: no
+    network). `pcu`: filled in by `compare`, since it depends on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
@@ -64,14 +61,12 @@ class TechniqueResult(Quality):
     u_encode: float
     u_match: float
     ah_total: float
-    ah_total_cpu_rail: float
     ah_assumes: str
     sequence: int = 1
     known: str | None = None
     discarded: int = 0
     weights: str | None = None
     pcu: float | None = None
-    t_encode_max_s: float | None = None
 
 
 def quietly(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
@@ -94,8 +89,7 @@ def evaluate(
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
     technique = create(technique_name, parameters)
-    found = answered(technique, dataset, options, progress, gate)
-    return summary(technique, len(dataset.references), found, options)
+    return summary(technique, len(dataset.references), answered(technique, dataset, options, progress, gate), options)
 
 
 def answered(
@@ -107,13 +101,13 @@ def answered(
 ) -> list[QueryAnswer]:
     """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers. Raises
     UsageError where no query has what `options.known` asks for."""
-    known = known_of(options.known, dataset, technique.spec, options.sequence)
+    prior, tags = known_of(options.known, dataset, technique.spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), own_meter()
     frames = progress(all_frames(source), source.total, f"{technique.spec.name}: references")
     with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
-        walk = Walk(technique, place_map, index, meter, options=options, gate=gate, known=known)
+        walk = Walk(technique, place_map, index, meter, options=options, gate=gate, prior=prior)
         walk.warm_up(dataset.queries[0].path)
-        return list(answers(walk, dataset, progress))
+        return list(answers(walk, dataset, progress, tags))
 
 
 def own_meter() -> QueryMeter:
@@ -125,14 +119,13 @@ def own_meter() -> QueryMeter:
 def mapped(
     frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Context manager: make a temporary map as `make_map` does. Gives two parts:
-    the map, open to read;
-    an index with all its places."""
+    """Context manager: make a temporary map as `make_map` does; gives the map, open to read, and an index with all its
+    places."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
         make_map(path, frames, technique, images, meter)
-        with opened(path, technique) as (place_map, index):
-            yield place_map, index
+        with opened(path, technique) as both:
+            yield both
 
 
 def make_map(
@@ -152,9 +145,7 @@ def make_map(
 
 @contextmanager
 def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Context manager: open the map file `path`. Gives two parts:
-    the map, open to read;
-    an index with all its places."""
+    """Context manager: open the map file `path` to read; gives the map, and an index with all its places."""
     with PlaceMap.open(path) as place_map:
         yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
@@ -162,36 +153,22 @@ def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIn
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
     """Return the results with the PCU (see `metrics.pcu`) filled in. It depends on the slowest encoder among them."""
     results = list(results)
-    slowest_s = max(result.t_encode_s for result in results)
+    slowest_s = max((result.t_encode_s for result in results), default=0.0)
     return [
-        replace(
-            result,
-            pcu=metrics.pcu(result.precision_at_100_recall, result.t_encode_s, slowest_s),
-            t_encode_max_s=slowest_s,
-        )
-        for result in results
+        replace(each, pcu=metrics.pcu(each.precision_at_100_recall, each.t_encode_s, slowest_s)) for each in results
     ]
-
-
-def as_json(results: Iterable[TechniqueResult]) -> dict[str, Any]:
-    """Return {"techniques": {name: every field of its result}}, for `json.dump`."""
-    return {"techniques": {result.technique: asdict(result) for result in results}}
 
 
 def from_json(row: dict[str, Any]) -> TechniqueResult:
     """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
-    known = {each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row}
-    for name, value in known.items():
-        if name.endswith("_interval") and value:
-            known[name] = tuple(value)
-    return TechniqueResult(**{**known, "precision_recall": tuple(map(tuple, known["precision_recall"]))})
+    return TechniqueResult(**{each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row})
 
 
 def all_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a folder. Raises ImageError for the first that cannot be used: figures without some images
-    would mislead."""
+    """Yield all frames of a folder or video. Raises ImageError for the first that cannot be used: figures without some
+    images would mislead."""
     while not source.ended:
-        if frame := source.read(timeout_s=0):
+        if frame := source.read(timeout_s=1.0):
             yield frame
 
 
@@ -208,7 +185,8 @@ def summary(
     ranks = np.array([answer.first_right for answer in answers])
     config = load_config(None)
     board, pack, efficiency = load_board("this"), parse_pack(config.battery.pack), config.battery.regulator_efficiency
-    encoding, matching = _total(answer.encoding for answer in answers), _total(answer.matching for answer in answers)
+    encoding = sum((answer.encoding for answer in answers), start=NO_COST)
+    matching = sum((answer.matching for answer in answers), start=NO_COST)
     t_encode_s, t_match_s = encoding.wall_s / queries, matching.wall_s / queries
     u_encode, u_match = encoding.utilisation(board.cores), matching.utilisation(board.cores)
     query_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
@@ -220,7 +198,7 @@ def summary(
         parameters=technique.spec.parameters,
         queries=queries,
         references=references,
-        **figures(scores, ranks),
+        **metrics.figures(scores, ranks),
         accepted=sum(answer.accepted for answer in answers),
         accepted_wrong=sum(answer.accepted_wrong for answer in answers),
         accepted_elsewhere=sum(answer.accepted_elsewhere for answer in answers),
@@ -233,7 +211,6 @@ def summary(
         u_encode=u_encode,
         u_match=u_match,
         ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
-        ah_total_cpu_rail=queries_ah(queries, rail_ah(query_j)),
         sequence=length_of(technique.spec, options.sequence),
         known=options.known and ",".join(told_parts(options.known)),
         ah_assumes=(
@@ -241,7 +218,3 @@ def summary(
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
         ),
     )
-
-
-def _total(costs: Iterable[StageCost]) -> StageCost:
-    return sum(costs, start=NO_COST)

@@ -1,13 +1,9 @@
 """Reads data sets in the layouts in which they are published. A layout is recognised by its files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own.
-* query/, ref/ and ground_truth_new.npy: VPR-Bench (Zaffar et al., IJCV 2021), read by `numbered`.
-* two folders of images and GT.npz: VPR_Tutorial (Schubert et al., 2023), read by `numbered`. The first folder by name
-  holds the references.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
   GSV-Cities and others in that form). References near the query are right (`Nearness`).
-* query/ and ref/ with positions (positions.csv or EXIF): references near the query are right. Either side may be a
-  video with positions beside it, query.mp4 with query.csv.
+* query/ and ref/ with positions (positions.csv or EXIF): references near the query are right.
 """
 
 from collections.abc import Callable
@@ -22,62 +18,46 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Position
-from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.level import Footprint, footprint, shared
+from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import tags_of
-from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, load_dataset, names_in
-from edgevpr.lab.evaluate.numbered import read_numbered
-from edgevpr.lab.evaluate.videos import side_of, without_position
+from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, load_dataset
 
 Tags = dict[Path, GeoTag]  # of the pictures of a folder
-_FORMS = "query/, ref/ and ground_truth.csv; ground_truth_new.npy; GT.npz; database/ and queries/; or positions"
+_FORMS = "query/, ref/ and ground_truth.csv; database/ and queries/; or query/ and ref/ with positions.csv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nearness:
-    """Rule by which a reference is right for a query: it was taken within `within_m` metres of it. Two more conditions
-    apply if they are not None: the headings differ by at most `within_deg` degrees; the two pictures have at least the
-    share `overlap` (0..1) of the smaller one's ground in common. For `overlap`, `fov_deg` is the camera's field of view
-    along the longest side, and each picture needs its height above the ground."""
+    """Rule by which a reference is right for a query: it was taken within `within_m` metres of it, and the headings
+    differ by at most `within_deg` degrees (None: whatever the headings)."""
 
     within_m: float = bounded(0.01, 1_000_000, default=25.0)
     within_deg: float | None = bounded(0.1, 180, default=None)
-    overlap: float | None = bounded(0.001, 1, default=None)
-    fov_deg: float | None = bounded(5, 150, default=None)
 
 
-def open_folder(folder: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path) -> Dataset:
-    """Read the data set in `folder`, in any layout above. `pictures` returns the folder of pictures of a side (query or
-    ref), given the path of a folder or a video (default: the path itself, for sets without videos). Raises UsageError
-    for an unknown layout or parts that do not fit together, and SourceError for a folder without images."""
+def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
+    """Read the data set in `folder`, in any layout above. Raises UsageError for an unknown layout or parts that do not
+    fit together, and SourceError for a folder without images."""
     folder = Path(folder)
-    if not folder.is_dir():
-        raise UsageError(f"{folder}: there is no such folder: give one of a data set ({_FORMS}).")
     query, ref = folder / "query", folder / "ref"
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
-    if (numbers := folder / "ground_truth_new.npy").is_file():
-        return _of_numbers(query, ref, numbers)
-    if (matrices := folder / "GT.npz").is_file():
-        inner = sorted(path for path in folder.iterdir() if path.is_dir())
-        if len(inner) != 2:
-            raise UsageError(f"{folder} needs two folders beside GT.npz, that of the map first by name.")
-        return _of_numbers(inner[1], inner[0], matrices)
     for outer in (folder, folder / "test", folder / "images" / "test"):
         if (outer / "database").is_dir() and (outer / "queries").is_dir():
             return _of_utm(outer / "queries", outer / "database", rule)
-    query_side, ref_side = side_of(folder, "query"), side_of(folder, "ref")
-    if query_side and ref_side:
-        return of_positions(query_side, ref_side, rule, pictures)
-    raise UsageError(f"{folder} is no data set that is known: it needs {_FORMS}.")
+    if query.is_dir() and ref.is_dir():
+        return of_positions(query, ref, rule)
+    raise UsageError(f"{folder} is no folder of a data set that is known: it needs {_FORMS}.")
 
 
 def of_positions(
     query: str | Path, ref: str | Path, rule: Nearness, pictures: Callable[[Path], Path] = Path
 ) -> Dataset:
-    """Make a data set of two folders of images, or videos, with positions. `pictures` is that of `open_folder`. Raises
-    UsageError where there are no positions, and what `pictures` raises."""
+    """Make a data set of two folders of images, or videos, with positions; pictures without one are left out.
+    `pictures` returns the folder of pictures of a side (query or ref), given the path of a folder or a video (default:
+    the path itself, for sets without videos). Raises UsageError where there are no positions, and what `pictures`
+    raises."""
     # One side after the other: an error in the first shows before the video of the second is decoded.
     query_dir = pictures(Path(query))
     queries = _tagged(query_dir)
@@ -89,16 +69,7 @@ def of_positions(
         )
     origin = next(tag.position for tag in references.values() if tag.position)
     truth = _near(queries, _offsets_m(queries, origin), references, _offsets_m(references, origin), rule)
-    notes = []
-    for given, folder in ((query, query_dir), (ref, ref_dir)):
-        without, count = without_position(folder) if Path(given) != folder else (0, 0)
-        if without:
-            notes.append(f"{given}: {without} of {count} frames have no position, and are left out")
-    return joined(query_dir, ref_dir, truth, query_dir, notes)
-
-
-def _of_numbers(query_dir: Path, ref_dir: Path, path: Path) -> Dataset:
-    return joined(query_dir, ref_dir, read_numbered(path, names_in(query_dir), names_in(ref_dir)), path)
+    return joined(query_dir, ref_dir, truth, query_dir)
 
 
 def _of_utm(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
@@ -133,17 +104,11 @@ def _near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Double
     """Return the ground truth: for each query with a right reference by `rule`, the names of its right references. The
     other queries are left out. `query_m` and `reference_m`, (N, 2), are metres east and north of a common origin.
     Raises UsageError if no query has a right reference."""
-    prints = []
-    if rule.overlap is not None:
-        prints = [_print(*each, rule) for each in zip(references.items(), reference_m.tolist(), strict=True)]
     truth = {}
-    for (path, tag), at_m in zip(queries.items(), query_m.tolist(), strict=True):
+    for (path, tag), at_m in zip(queries.items(), query_m, strict=True):
         near = np.hypot(*(reference_m - at_m).T) <= rule.within_m
         if rule.within_deg is not None:
             near &= [_apart_deg(tag, other) <= rule.within_deg for other in references.values()]
-        if rule.overlap is not None and near.any():
-            own = _print((path, tag), at_m, rule)
-            near &= [bool(ok) and shared(own, other) >= rule.overlap for ok, other in zip(near, prints, strict=True)]
         if near.any():
             names = (decoded_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
             truth[decoded_name(path.name)] = Judged(frozenset(names))
@@ -156,14 +121,3 @@ def _apart_deg(one: GeoTag, other: GeoTag) -> float:
     if one.heading_deg is None or other.heading_deg is None:
         raise UsageError("--within-deg needs the heading of every picture (yaw_deg in positions.csv): leave it out.")
     return abs((one.heading_deg - other.heading_deg + 180) % 360 - 180)
-
-
-def _print(picture: tuple[Path, GeoTag], at_m: tuple[float, float], rule: Nearness) -> Footprint:
-    path, tag = picture
-    if rule.fov_deg is None or tag.height_m is None or tag.heading_deg is None:
-        raise UsageError(
-            f"{path}: --overlap needs --fov-deg, and height_m and yaw_deg of every picture in positions.csv: leave it "
-            "out."
-        )
-    height_px, width_px = read_image(path).shape[:2]
-    return footprint((at_m[0], at_m[1]), tag.height_m, rule.fov_deg, (width_px, height_px), tag.heading_deg)

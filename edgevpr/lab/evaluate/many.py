@@ -27,7 +27,6 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.asking import Progress, QueryAnswer
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, answered, compare, from_json, summary
-from edgevpr.lab.evaluate.knowing import lacking
 from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 from edgevpr.lab.evaluate.provenance import key_of, machine, stamp, today, versions
 from edgevpr.techniques import create
@@ -51,23 +50,16 @@ class RowOnSet:
     dataset: Dataset
     path: Path
 
-    @property
-    def name(self) -> tuple[str, str]:
-        """The names of the set and of the row."""
-        return self.set_name, self.label
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class MeasuredRow:
     """The result of the row `label` on a set, and the answers to all scored queries. `made` tells its origin: the date
-    (UTC), the machine, the versions, and the number of workers that ran at once. `was_kept`: an earlier run made it."""
+    (UTC), the machine, the versions, and the number of workers that ran at once."""
 
-    set_name: str
     label: str
     result: TechniqueResult
     answers: tuple[QueryAnswer, ...]
     made: dict[str, Any]
-    was_kept: bool
 
     @property
     def recalls(self) -> list[float]:
@@ -76,19 +68,20 @@ class MeasuredRow:
         return [metrics.recall_at(k, ranks) for k in range(1, min(CURVE_TO, self.result.references) + 1)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Measurements:
-    """Outcome of a run: its plan, the sets by name, the rows on sets that were measured (`found`), and why others
+    """Outcome of a run: its plan, the sets by name, the rows that were measured on each set (`found`), and why others
     `failed`."""
 
     plan: EvaluationPlan
     sets: dict[str, Dataset]
-    found: tuple[MeasuredRow, ...]
+    found: dict[str, list[MeasuredRow]]
     failed: Failures
 
-    def rows_of(self, set_name: str) -> list[MeasuredRow]:
-        """Return the rows that were measured on a set."""
-        return [row for row in self.found if row.set_name == set_name]
+    @property
+    def rows(self) -> list[MeasuredRow]:
+        """The rows that were measured, of all sets."""
+        return [row for rows in self.found.values() for row in rows]
 
 
 def measure(plan: EvaluationPlan, folder: Path, workers: int, progress: Progress[Any]) -> Measurements:
@@ -98,42 +91,34 @@ def measure(plan: EvaluationPlan, folder: Path, workers: int, progress: Progress
     sets = {name: each.open(folder / "videos", progress) for name, each in plan.sets.items()}
     failed: Failures = {}
     rows = list(_rows_on_sets(plan, sets, folder / "measured", failed))
-    before = {row.name for row in rows if row.path.exists()}
-    if left := [row for row in rows if row.name not in before]:
+    if left := [row for row in rows if not row.path.exists()]:
         (folder / "measured").mkdir(parents=True, exist_ok=True)
         with _pool(min(workers, len(left))) as pool:
             jobs = {pool.submit(_measured, row, workers): row for row in left}
             for job in progress(as_completed(jobs), len(jobs), "rows"):
                 if why := job.result():
-                    failed[jobs[job].name] = why
-    found = [_kept(row, row.name in before) for row in rows if row.name not in failed]
-    wanted = [(name, label) for name in plan.sets for label in plan.rows]
-    return Measurements(
-        plan=plan,
-        sets=sets,
-        found=tuple(compared for name in plan.sets for compared in _compared(found, name)),
-        failed={name: failed[name] for name in wanted if name in failed},
-    )
+                    failed[jobs[job].set_name, jobs[job].label] = why
+    found = {
+        name: _kept([row for row in rows if row.set_name == name and (name, row.label) not in failed]) for name in sets
+    }
+    return Measurements(plan, sets, found, failed)
 
 
 def _rows_on_sets(plan: EvaluationPlan, sets: dict[str, Dataset], folder: Path, failed: Failures) -> Iterator[RowOnSet]:
-    """Yield the rows on every set that can be measured; write to `failed` why others cannot. The name of a result's
-    file is the key of all that decides it: code, technique, settings, pictures and ground truth."""
+    """Yield the rows on every set; write to `failed` those whose network cannot be used. The name of a result's file is
+    the key of all that decides it: code, technique, settings, pictures and ground truth."""
     code = [stamp(path) for path in sorted(Path(edgevpr.__file__).parent.rglob("*.py"))]
     for name, dataset in sets.items():
         truth = [(query.path.name, sorted(query.right), sorted(query.ignored)) for query in dataset.queries]
         query_dir = dataset.queries[0].path.parent
-        places, asked = filter(None, map(find_positions, (dataset.ref_dir, query_dir))), list_images(query_dir)
-        pictures = [stamp(path) for path in (*places, *list_images(dataset.ref_dir), *asked)]
+        tables = filter(None, map(find_positions, (dataset.ref_dir, query_dir)))
+        pictures = [stamp(path) for path in (*tables, *list_images(dataset.ref_dir), *list_images(query_dir))]
         for label, row in plan.rows.items():
             settings = row.settings(plan.sets[name].camera)
             try:
                 spec = create(row.technique, settings).spec
-                why = lacking(row.known, dataset, spec, row.sequence)
-            except ModelError as error:  # a network that cannot be used stops no other row
-                why = str(error)
-            if why:
-                failed[name, label] = why
+            except ModelError as error:  # it stops no other row
+                failed[name, label] = str(error)
                 continue
             who = [spec.name, spec.parameters, spec.form, spec.model_sha256]
             key = key_of(code, versions(), pictures, truth, who, asdict(row))
@@ -186,25 +171,17 @@ def _measured(row: RowOnSet, workers: int) -> str | None:
     return None
 
 
-def _kept(row: RowOnSet, was_kept: bool) -> MeasuredRow:
-    """Read the result of a row on a set from its file; `was_kept` tells whether an earlier run made it."""
-    content = json.loads(row.path.read_text("utf-8"))
-    return MeasuredRow(
-        set_name=row.set_name,
-        label=row.label,
-        result=replace(from_json(content["result"]), technique=row.label),
-        answers=tuple(_answer(each) for each in content["answers"]),
-        made=content["made"],
-        was_kept=was_kept,
-    )
+def _kept(rows: Sequence[RowOnSet]) -> list[MeasuredRow]:
+    """Read the results of all rows on one set from their files. Their PCU depends on the slowest encoder there."""
+    contents = [json.loads(row.path.read_text("utf-8")) for row in rows]
+    results = [
+        replace(from_json(each["result"]), technique=row.label) for row, each in zip(rows, contents, strict=True)
+    ]
+    return [
+        MeasuredRow(result.technique, result, tuple(map(_answer, each["answers"])), each["made"])
+        for result, each in zip(compare(results), contents, strict=True)
+    ]
 
 
 def _answer(content: dict[str, Any]) -> QueryAnswer:
     return QueryAnswer(**{**content, **{stage: StageCost(**content[stage]) for stage in ("encoding", "matching")}})
-
-
-def _compared(found: Sequence[MeasuredRow], name: str) -> Iterator[MeasuredRow]:
-    """Yield the rows on the set `name` with the PCU (see `metrics.pcu`), which depends on the slowest encoder there."""
-    rows = [row for row in found if row.set_name == name]
-    for row, result in zip(rows, compare(row.result for row in rows) if rows else (), strict=True):
-        yield replace(row, result=result)

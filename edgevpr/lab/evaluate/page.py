@@ -1,15 +1,14 @@
 """Writes the results of `many` as files: results.json for programs, and index.html for people, a page of tables,
-curves, costs and examples of matches. Functions that return a str return HTML."""
+curves and examples of matches. Functions that return a str return HTML."""
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.errors import ImageError
 from edgevpr.core.files import write_whole
 from edgevpr.frames.images import counting_order, read_image, small_jpeg
 from edgevpr.lab.evaluate import tables
@@ -28,7 +27,6 @@ from edgevpr.review.html import (
     notes,
     page,
     picture,
-    scatter,
     section,
     table,
 )
@@ -51,24 +49,15 @@ def write_results(folder: Path, outcome: Measurements) -> None:
 
 def as_json(outcome: Measurements) -> dict[str, Any]:
     """Return all results, with date, machine and versions, for `json.dumps`."""
-    sizes = {
-        name: {"queries": len(each.queries), "references": len(each.references)} for name, each in outcome.sets.items()
-    }
     return {
         "date": today(),
         "machine": machine(),
         "versions": versions(),
-        "seeds": {"intervals": SEED, "resamples": RESAMPLES},
-        "sets": {name: {**asdict(outcome.plan.sets[name]), **size} for name, size in sizes.items()},
+        "sets": {name: asdict(each) for name, each in outcome.plan.sets.items()},
         "results": [
-            {
-                "set": row.set_name,
-                "row": row.label,
-                **asdict(row.result),
-                "recall_at_k": row.recalls,
-                "made": {**row.made, "was_kept": row.was_kept},
-            }
-            for row in outcome.found
+            {"set": name, "row": row.label, **asdict(row.result), "recall_at_k": row.recalls, "made": row.made}
+            for name, rows in outcome.found.items()
+            for row in rows
         ],
         "failed": [{"set": of, "row": row, "why": why} for (of, row), why in outcome.failed.items()],
     }
@@ -76,11 +65,11 @@ def as_json(outcome: Measurements) -> dict[str, Any]:
 
 def page_of(outcome: Measurements) -> str:
     """Return the whole page. Its style and pictures are inside: it loads no other file."""
-    labels = list(dict.fromkeys(row.label for row in outcome.found))
+    labels = list(dict.fromkeys(row.label for row in outcome.rows))
     known = [f"sets: {len(outcome.sets)}", f"rows: {len(labels)}", f"written on {today()}"]
     body = [
         heading("Evaluation", [*known, f"edgevpr {versions()['edgevpr']}"]),
-        notes(_notes(outcome)),
+        notes(f"{label} was not measured on {of}: {why}" for (of, label), why in outcome.failed.items()),
         section("All sets", _over_sets(outcome, labels)),
         *(_of_set(name, outcome, labels) for name in outcome.sets),
         section("How it was measured", _how(outcome)),
@@ -88,28 +77,16 @@ def page_of(outcome: Measurements) -> str:
     return page("Evaluation", Path(__file__).with_name("page.css"), body)
 
 
-def _notes(outcome: Measurements) -> Iterator[str]:
-    for (of, label), why in outcome.failed.items():
-        yield f"{label} was not measured on {of}: {why}"
-    if kept := sum(row.was_kept for row in outcome.found):
-        yield (
-            f"{kept} of {len(outcome.found)} results were measured earlier: their times are of that day and that "
-            "machine, which are named below."
-        )
-    if not all(row.result.recall_at_1_interval for row in outcome.found):
-        yield "SciPy is not installed: there are no intervals."
-
-
 def _over_sets(outcome: Measurements, labels: Sequence[str]) -> str:
     """Return a table of recall@1 of every row on every set; "" if there is one set, whose own table has it."""
     if len(outcome.sets) < 2:
         return ""
-    found = {(row.label, row.set_name): row.result.recall_at_1 for row in outcome.found}
+    found = [{row.label: row.result.recall_at_1 for row in rows} for rows in outcome.found.values()]
     rows = []
     for number, label in enumerate(labels, start=1):
-        shares = [found.get((label, name)) for name in outcome.sets]
+        shares = [of_set.get(label) for of_set in found]
         known = [share for share in shares if share is not None]
-        mean = sum(known) / len(known) if len(known) == len(shares) else None
+        mean = sum(known) / len(shares) if len(known) == len(shares) else None
         rows.append([_name(label, number), *map(tables.share_text, shares), f"<b>{tables.share_text(mean)}</b>"])
     names = map(foreign, outcome.sets)
     return "<p>Recall@1 on every set, and the mean of the sets.</p>" + table(["row", *names, "mean"], rows, str)
@@ -117,12 +94,12 @@ def _over_sets(outcome: Measurements, labels: Sequence[str]) -> str:
 
 def _of_set(name: str, outcome: Measurements, labels: Sequence[str]) -> str:
     dataset, camera = outcome.sets[name], outcome.plan.sets[name].camera
-    rows = [(labels.index(row.label) + 1, row) for row in outcome.rows_of(name)]
+    rows = [(labels.index(row.label) + 1, row) for row in outcome.found[name]]
     scored = f"{len(dataset.queries)} queries scored against {len(dataset.references)} references"
     scored += f", camera {camera}" if camera else ""
     if not rows:
-        return section(foreign(name), f"<p>No row was measured on it: {scored}.</p>")
-    most = max(_FEWEST_OF_A_ROW, min(_MOST_OF_A_ROW, _MOST_MATCHES // len(outcome.found)))
+        return ""  # the notes say why
+    most = max(_FEWEST_OF_A_ROW, min(_MOST_OF_A_ROW, _MOST_MATCHES // len(outcome.rows)))
     reached = [[_name(row.label, number), *tables.quality(row.result)] for number, row in rows]
     paid = [[_name(row.label, number), *tables.costs(row.result), row.made["date"]] for number, row in rows]
     matches = "".join(_matches(dataset, row, number, most) for number, row in rows)
@@ -148,25 +125,6 @@ def _charts(rows: Sequence[Numbered]) -> Iterator[str]:
     at_k = [Series("", _look(number), list(enumerate(row.recalls, start=1))) for number, row in rows]
     axis = Axis(1, most, [(k, str(k)) for k in (1, 5, 10, 15, 20, CURVE_TO) if k <= most])
     yield chart("Recall@K", f"over K, to {most}", at_k, axis, top=1.0)
-    yield _against(
-        "Recall@1 over charge", "mAh a query", rows, lambda row: 1000 * row.result.ah_total / row.result.queries
-    )
-    yield _against("Recall@1 over memory", "bytes of RAM a place", rows, lambda row: row.result.descriptor_bytes)
-
-
-def _against(title: str, unit: str, rows: Sequence[Numbered], cost: Callable[[MeasuredRow], float]) -> str:
-    """Draw recall@1 over `cost` on a logarithmic axis. Rows with a cost of 0 are left out."""
-    points = sorted(
-        (math.log10(cost(row)), row.result.recall_at_1, str(number), _look(number))
-        for number, row in rows
-        if cost(row) > 0
-    )
-    if not points:
-        return ""
-    low = math.floor(points[0][0])
-    high = max(math.ceil(points[-1][0]), low + 1)
-    ticks = [(float(power), f"{10.0**power:g}") for power in range(low, high + 1)]
-    return scatter(title, unit, points, Axis(low, high, ticks), 1.0)
 
 
 def _matches(dataset: Dataset, row: MeasuredRow, number: int, most: int) -> str:
@@ -199,18 +157,15 @@ def _match(dataset: Dataset, answer: QueryAnswer) -> str:
 def _picture(what: str, path: Path | str | None, more: str = "") -> str:
     if not isinstance(path, Path):
         return f"<figure><figcaption>{what}: none</figcaption></figure>"
-    try:
-        return picture(path.name, f"{what}: {path.name}{more}", small_jpeg(read_image(path), _PICTURE_PX))
-    except ImageError:  # deleted since the measurement
-        return f"<figure><figcaption>{what}: {foreign(path.name)} (gone)</figcaption></figure>"
+    return picture(path.name, f"{what}: {path.name}{more}", small_jpeg(read_image(path), _PICTURE_PX))
 
 
 def _how(outcome: Measurements) -> str:
-    results = [row.result for row in outcome.found]
+    results = [row.result for row in outcome.rows]
     made = (
-        f"{'Earlier, ' if row.was_kept else ''}{row.made['date']}, {row.made['machine']['cpu']}, "
-        f"{row.made['workers']} of {row.made['machine']['cores']} cores, edgevpr {row.made['versions']['edgevpr']}."
-        for row in outcome.found
+        f"{row.made['date']}, {row.made['machine']['cpu']}, {row.made['workers']} of {row.made['machine']['cores']} "
+        f"cores, edgevpr {row.made['versions']['edgevpr']}."
+        for row in outcome.rows
     )
     sentences = [
         *made,

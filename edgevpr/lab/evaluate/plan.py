@@ -3,20 +3,19 @@ the sections `sets` and `rows` of a YAML file, or made from flags of `edgevpr ev
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import bounded, build
+from edgevpr.core.config import bounded, build, key
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.lab.evaluate.asking import MatchOptions, Progress
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
-from edgevpr.lab.evaluate.videos import VideoPictures
+from edgevpr.lab.evaluate.videos import pictures_of
 from edgevpr.runtime.preflight.pick import camera_setting
-
-CAMERAS = ("nadir", "forward")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,17 +29,17 @@ class SetPlan(Nearness):
     query: str | None = None
     ref: str | None = None
     ground_truth: str | None = None
-    camera: str | None = None
+    camera: str | None = key(choices=("nadir", "forward"), default=None)
     rate_hz: float | None = bounded(0.001, 1000, default=None)
 
     def open(self, videos: Path, progress: Progress[Any]) -> Dataset:
         """Read the data set; pictures of a video are kept in the folder `videos`. Raises UsageError and SourceError as
-        `open_folder` does, and EdgevprError as `VideoPictures` does."""
-        pictures = VideoPictures(videos, self.rate_hz, progress)
+        `open_folder` does, and EdgevprError as `pictures_of` does."""
         if self.folder:
-            return open_folder(self.folder, self, pictures)
+            return open_folder(self.folder, self)
         if self.ground_truth:
             return load_dataset(self.query or "", self.ref or "", self.ground_truth)
+        pictures = partial(pictures_of, kept=videos, rate_hz=self.rate_hz, progress=progress)
         return of_positions(self.query or "", self.ref or "", self, pictures)
 
 
@@ -75,22 +74,19 @@ def read_plan(path: str | Path) -> EvaluationPlan:
     content, where, base = read_yaml(path), str(path), Path(path).parent
     sections = {"sets": content.pop("sets", None), "rows": content.pop("rows", None)}
     if content:
-        key = str(next(iter(content)))[:80]
-        raise ConfigError(f"{where}: unknown section `{key}` ({meant(key, sections, 'known: sets, rows')}).")
+        unknown = str(next(iter(content)))[:80]
+        raise ConfigError(f"{where}: unknown section `{unknown}` ({meant(unknown, sections, 'known: sets, rows')}).")
     for name, section in sections.items():
         if not isinstance(section, dict) or not section or not all(isinstance(each, dict) for each in section.values()):
             raise ConfigError(f"{where}: `{name}` needs at least one name, and below each name its keys, indented.")
-        if odd := [key for key in section if not isinstance(key, str)]:
-            raise ConfigError(f"{where}: `{name}` has the name {odd[0]!r}: write it in quotes.")
-    sets = {name: build(SetPlan, each, where, f"sets.{name}.") for name, each in sections["sets"].items()}
-    rows = {name: build(RowPlan, each, where, f"rows.{name}.") for name, each in sections["rows"].items()}
+    sets = {str(name): build(SetPlan, each, where, f"sets.{name}.") for name, each in sections["sets"].items()}
+    rows = {str(name): build(RowPlan, each, where, f"rows.{name}.") for name, each in sections["rows"].items()}
     for name, each in sets.items():
-        if bool(each.folder) == bool(each.query and each.ref) or (each.folder and (each.query or each.ref)):
-            raise ConfigError(f"{where}: the set `{name}` needs either `folder`, or `query` and `ref`: name them.")
-        if each.folder and each.ground_truth:
-            raise ConfigError(f"{where}: `sets.{name}.ground_truth` goes with `query` and `ref`: a folder has its own.")
-        if each.camera not in (None, *CAMERAS):
-            raise ConfigError(f"{where}: `sets.{name}.camera` is `{each.camera}`: write {' or '.join(CAMERAS)}.")
+        if bool(each.folder) == any((each.query, each.ref, each.ground_truth)) or bool(each.query) != bool(each.ref):
+            raise ConfigError(
+                f"{where}: the set `{name}` needs either `folder`, which has its own ground truth, or `query` and "
+                "`ref`, beside which `ground_truth` may stand."
+            )
         folder, query, ref, truth = (
             given and str(base / given) for given in (each.folder, each.query, each.ref, each.ground_truth)
         )

