@@ -103,7 +103,7 @@ class ArduPilot(Firmware):
         if self._source == _EXTERNAL:
             return self.external.measured(self.origin, self.now_s)
         primary = self.receivers.primary
-        return primary.last if self._source == _GPS and primary.fix_type >= FIX_3D else None
+        return primary if self._source == _GPS and primary.fix_type >= FIX_3D else None
 
     def _wait_for_aiding(self, measured: PositionMeasurement | None) -> None:
         if measured is None:

@@ -1,13 +1,11 @@
 """The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
 
-import json
 import socket
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -93,11 +91,10 @@ def run_demo(folder: str | Path) -> str:
     ):
         for _ in progress(write_flight(folder / name, scene, flight), len(flight.poses), label):
             pass
-    heard = _flown(folder)
+    _fly(folder)
     answers = read_answers(log_path, folder / "flight-1", folder / "flight-2")
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, answers)
     return f"""{summary_of(answers)}
-flight controller {heard["fixes_accepted"]} position fixes accepted, {heard["fixes_denied"]} denied
 picture           {picture_path}
 page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
@@ -119,8 +116,8 @@ position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(e
 largest {max(errors_m):.1f} m (of the accepted; places are 21 m apart)"""
 
 
-def _flown(folder: Path) -> dict[str, Any]:
-    """Map the first flight of a demonstration and fly the second one; return the report of the flight controller."""
+def _fly(folder: Path) -> None:
+    """Map the first flight of a demonstration and fly the second one."""
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
     map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -129,27 +126,20 @@ def _flown(folder: Path) -> dict[str, Any]:
     build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
     fly = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
     # The flight controller is started first: it listens long before the map is built.
-    command = _command("simulate", "autopilot", "--link", f"udpin:{address}", "--json")
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as autopilot:
+    command = _command("simulate", "autopilot", "--link", f"udpin:{address}")
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as autopilot:
         try:
             for step in (build, ("run", "--map", map_path, "--source", second, *_CAMERA, *fly)):
                 done = subprocess.run(_command(*step), stdout=subprocess.DEVNULL)
-                _require_success(done.args, done.returncode)
+                if done.returncode:
+                    said = f"`{' '.join(done.args[2:])}` ended with exit code {done.returncode}"
+                    raise EdgevprError(f"{said}: see what it said above.")
         finally:
             autopilot.terminate()
-        said, _ = autopilot.communicate()
-    _require_success(command, autopilot.returncode)
-    heard: dict[str, Any] = json.loads(said)
-    return heard
 
 
 def _command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "edgevpr", *map(str, arguments)]
-
-
-def _require_success(command: list[str], code: int) -> None:
-    if code:
-        raise EdgevprError(f"`{' '.join(command[2:])}` ended with exit code {code}: see what it said above.")
 
 
 def read_answers(log_path: Path, mapped: Path, flown: Path) -> list[JudgedAnswer]:

@@ -45,7 +45,7 @@ class Px4(Firmware):
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         first = self.receivers.first
         uses_gps = first.fix_type >= FIX_3D and int(self.parameters["EKF2_GPS_CTRL"]) & 1
-        measured, before = first.last if uses_gps else None, self._used
+        measured, before = first if uses_gps else None, self._used
         self._used = measured
         if measured is not None and measured != before:
             self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from edgevpr.lab.simulate.firmware import Firmware
 from edgevpr.lab.simulate.motion import TrueState
-from edgevpr.lab.simulate.sensors import FIX_3D, NO_FIX, Gps
+from edgevpr.lab.simulate.sensors import FIX_3D, NO_FIX, NOTHING, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 Report = Callable[[Firmware], Message | None]
@@ -63,15 +63,14 @@ def _second_gps(brain: Firmware) -> Message | None:
     return mavlink.MAVLink_gps2_raw_message(**second, dgps_numch=0, dgps_age=0) if has_second else None
 
 
-def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
-    last = gps.last
-    if last is None or not brain.motion.is_known:  # a second GPS that is silent
+def _gps(last: PositionMeasurement, brain: Firmware) -> dict[str, int]:
+    if last is NOTHING or not brain.motion.is_known:  # a second GPS that is silent
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
         return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
     east_m_s, north_m_s = last.velocity_m_s.real, last.velocity_m_s.imag
     return {
         "time_usec": round(last.t_s * 1e6),
-        "fix_type": gps.fix_type,
+        "fix_type": last.fix_type,
         "lat": round(last.lat_deg * 1e7),
         "lon": round(last.lon_deg * 1e7),
         "alt": round(last.alt_m * 1e3),
@@ -79,7 +78,7 @@ def _gps(gps: Gps, brain: Firmware) -> dict[str, int]:
         "epv": 200,
         "vel": min(_UNKNOWN_16 - 1, round(abs(last.velocity_m_s) * 100)),
         "cog": round(math.degrees(math.atan2(east_m_s, north_m_s)) % 360 * 100) % 36_000,
-        "satellites_visible": 10 if gps.fix_type >= FIX_3D else 3,
+        "satellites_visible": 10 if last.fix_type >= FIX_3D else 3,
         "h_acc": round(last.sd_m * 1e3),
         "v_acc": round(last.sd_m * 1e3),
     }

@@ -24,33 +24,34 @@ Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea l
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionMeasurement:
     """A measured position: degrees, altitude above sea level, the standard deviation of one axis, the time `t_s` of the
-    measurement, and the velocity (east + 1j * north)."""
+    measurement, the velocity (east + 1j * north), and the kind of fix (GPS_FIX_TYPE)."""
 
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
-    sd_m: float
-    t_s: float
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    alt_m: float = 0.0
+    sd_m: float = 0.0
+    t_s: float = 0.0
     velocity_m_s: complex = 0j
-
-
-@dataclass(slots=True)
-class Gps:
-    """A GPS receiver as the autopilot sees it: its `last` report, None if there is none that is recent."""
-
     fix_type: int = NO_FIX
-    last: PositionMeasurement | None = None
+
+
+NOTHING = PositionMeasurement()  # of a receiver that is silent
 
 
 class Receivers:
-    """The two GPS receivers. The first measures the true position plus the glitch that the parameters set, while
-    enabled; the second is fed by GPS_INPUT. `primary` is the one in use; the other takes over with a better fix."""
+    """The last reports of two GPS receivers. The first measures the true position plus the glitch that the parameters
+    set, while enabled; the second is fed by GPS_INPUT. `primary` is the one in use; the other takes over with a better
+    fix."""
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
-        self.first, self.second = Gps(), Gps()
-        self.primary = self.first
+        self.first = self.second = NOTHING
+        self._uses_second = False
         self._parameters = parameters
         self._due_s = 0.0
+
+    @property
+    def primary(self) -> PositionMeasurement:
+        return self.second if self._uses_second else self.first
 
     @property
     def has_second(self) -> bool:
@@ -68,28 +69,27 @@ class Receivers:
                 sd_m=_SIMULATED_SD_M,
                 t_s=now_s,
                 velocity_m_s=truth.velocity_m_s,
+                fix_type=_BEST_FIX,
             )
-            if self._parameters["SIM_GPS1_ENABLE"]:
-                self.first.fix_type, self.first.last = _BEST_FIX, seen
-            else:  # reports continue, without a fix
-                self.first.fix_type, self.first.last = NO_FIX, replace(self.first.last or seen, t_s=now_s)
-        if self.second.last and now_s - self.second.last.t_s > _TIMEOUT_S:
-            self.second.fix_type, self.second.last = NO_FIX, None
-        other = self.second if self.primary is self.first else self.first
-        if max(other.fix_type, FIX_3D - 1) > self.primary.fix_type:
-            self.primary = other
+            if not self._parameters["SIM_GPS1_ENABLE"]:  # reports continue, without a fix
+                seen = replace(seen if self.first is NOTHING else self.first, t_s=now_s, fix_type=NO_FIX)
+            self.first = seen
+        if now_s - self.second.t_s > _TIMEOUT_S:
+            self.second = NOTHING
+        other = self.first if self._uses_second else self.second
+        self._uses_second ^= max(other.fix_type, FIX_3D - 1) > self.primary.fix_type
 
     def hear(self, message: Message, now_s: float) -> None:
         """Process a GPS_INPUT, if it is for the second receiver."""
         if self.has_second and message.gps_id == 1:
-            self.second.fix_type = message.fix_type
-            self.second.last = PositionMeasurement(
+            self.second = PositionMeasurement(
                 lat_deg=message.lat / 1e7,
                 lon_deg=message.lon / 1e7,
                 alt_m=message.alt,
                 sd_m=message.horiz_accuracy,
                 t_s=now_s,
                 velocity_m_s=complex(message.ve, message.vn),
+                fix_type=message.fix_type,
             )
 
 
