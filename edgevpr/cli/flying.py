@@ -63,7 +63,6 @@ def add(commands: Any) -> None:
     services = group(commands, "service", "print the systemd unit for a board, or install it all")
     unit = command(services, "print", service_print, "print the unit")
     unit.add_argument("--board", default="this", metavar="NAME", help="that it is for (default: this)")
-    unit.add_argument("--config", metavar="FILE", help="the configuration that it flies with")
     install = command(services, "install", service_install, "install user, folders, program, unit and udev rules")
     install.add_argument("--config", metavar="FILE", help="to become /etc/edgevpr/config.yaml")
     uninstall = command(services, "uninstall", service_uninstall, "leaves maps, logs and configuration")
@@ -167,9 +166,9 @@ def run_check(args: Namespace) -> int:
 def service_print(args: Namespace) -> int:
     """Run `service print`: print the systemd unit for a board."""
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.service.unit import render_unit
+    from edgevpr.runtime.service.install import render_unit
 
-    print(render_unit(load_board(args.board), args.config), end="")
+    print(render_unit(load_board(args.board)), end="")
     return 0
 
 
@@ -205,7 +204,9 @@ def run_doctor(args: Namespace) -> int:
     if config.mavlink.link is None:
         raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
-    diagnosis = doctor(config, address, waiting)
-    known = {"link": str(address), "ok": diagnosis.is_fine, **asdict(diagnosis)}
-    show(known, args.json, "\n".join(map(shown, lines(diagnosis.findings))))
-    return 0 if diagnosis.is_fine else 1
+    findings, reading = doctor(config, address, waiting)
+    is_fine = all(finding.ok for finding in findings)
+    found = [asdict(finding) for finding in findings]
+    known = {"link": str(address), "ok": is_fine, "findings": found, "reading": reading and asdict(reading)}
+    show(known, args.json, lines(findings))
+    return 0 if is_fine else 1

@@ -25,9 +25,8 @@ from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.service.board import log_findings
 from edgevpr.runtime.service.doctor import silence
-from edgevpr.runtime.service.finding import Finding, fine, looked_at, wrong
+from edgevpr.runtime.service.finding import Finding, fine, log_findings, looked_at, wrong
 
 _FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
@@ -36,8 +35,7 @@ _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
 def check(
     config_path: str | Path, *, offline: bool = False, say: Callable[[str], None] = lambda text: None
 ) -> list[Finding]:
-    """Check everything that a flight needs, and return a finding for each part. An error that the user can correct
-    becomes a finding and is never raised.
+    """Check everything that a flight needs, and return a finding for each part.
 
     The check waits for a frame of the source and a heartbeat of the autopilot, unless `offline`: then it is enough that
     source and link can be opened. `say` is called with a short text while the check waits, and with "" after it.
@@ -50,11 +48,8 @@ def check(
         fine("configuration", str(config_path)),
         looked_at("board", lambda: _board(config)),
         looked_at("battery", lambda: _battery(config)),
+        looked_at("map", lambda: _map(config)),
     ]
-    if all(finding.ok for finding in findings):
-        findings.append(looked_at("map", lambda: _map(config)))
-    else:
-        findings.append(wrong("map", "Not looked at: correct the board or the battery first."))
     say("waiting for the source of frames")
     findings.append(looked_at("source", lambda: _source(config, offline)))
     say("waiting for the flight controller")
@@ -149,5 +144,5 @@ def _link(config: Config, offline: bool) -> str:
 
 def _heartbeat(inquiry: Inquiry, address: LinkAddress) -> str:
     if inquiry.heartbeat() is None:
-        raise LinkError(silence(address, inquiry.bad_bytes, inquiry.others, inquiry.signing.refused).message)
+        raise LinkError(silence(address, inquiry.reader.bad_bytes, inquiry.others, inquiry.signing.refused).message)
     return f"autopilot heard: system {inquiry.system_id}"

@@ -1,18 +1,16 @@
 """`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr. It only reads, never writes."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.core.config import Config
-from edgevpr.core.errors import LinkAddressError, LinkError
+from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import AutopilotReading, Inquiry, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.service.board import board_findings
-from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, judged, wrong
+from edgevpr.runtime.service.finding import Finding, FlightIntent, board_findings, fine, judged, wrong
 from edgevpr.runtime.service.rules import RULES
 
 _SLOW_S = 0.25  # for a round trip: fixes would come as late
@@ -27,54 +25,37 @@ _WHERE_SILENT = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """Result of `doctor`: all `findings`, and what was read from the autopilot (None: nothing could be read)."""
+def doctor(
+    config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")
+) -> tuple[list[Finding], AutopilotReading | None]:
+    """Check the autopilot at the other end of the link `address`, and this machine (its files below `root`). Return the
+    findings, and what was read from the autopilot (None: nothing could be read).
 
-    findings: list[Finding]
-    reading: AutopilotReading | None
-
-    @property
-    def is_fine(self) -> bool:
-        return all(finding.ok for finding in self.findings)
-
-
-def doctor(config: Config, address: LinkAddress, say: Callable[[str], None], root: Path = Path("/")) -> Diagnosis:
-    """Check the autopilot at the other end of the link `address`, and this machine (its files below `root`).
-
-    `say` is called with a short text while answers are awaited, and with "" after that. Raises LinkAddressError for an
-    address that is wrong, and ConfigError for a board that is unknown or a signing key that cannot be used.
+    `say` is called with a short text while answers are awaited, and with "" after that. Raises ConfigError for a
+    board that is unknown or a signing key that cannot be used.
     """
     settings = config.mavlink
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     about_board = list(board_findings(config, address, root))
+    intent = FlightIntent(settings.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
     say(f"asking the autopilot at {address}")
     reading = None
     try:
         with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
             reading = read_autopilot(asking, {name: rules.parameters for name, rules in RULES.items()})
             if reading:
-                about_autopilot = list(autopilot_findings(reading, address, intent_of(config)))
+                about_autopilot = list(autopilot_findings(reading, address, intent))
             else:
-                about_autopilot = [silence(address, asking.bad_bytes, asking.others, asking.signing.refused)]
-    except LinkAddressError:
-        raise
+                about_autopilot = [silence(address, asking.reader.bad_bytes, asking.others, asking.signing.refused)]
     except LinkError as error:
         reading, about_autopilot = None, [wrong("link", str(error))]
     say("")
-    return Diagnosis(about_autopilot + about_board, reading)
-
-
-def intent_of(config: Config) -> FlightIntent:
-    """Return what a flight with this configuration intends, as far as the checks of the autopilot depend on it. Raises
-    ConfigError if the board is unknown."""
-    return FlightIntent(config.mavlink.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
+    return about_autopilot + about_board, reading
 
 
 def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Mapping[str, int]) -> Finding:
-    """Return the finding that explains why no heartbeat was received, from what else has arrived: `bad_bytes` is the
-    number of bytes that are no MAVLink, `others` are the system ids of other autopilots, and `refused` has the number
-    of messages that the check of signatures refused, by reason."""
+    """Return the finding that explains why no heartbeat was received, from what else has arrived: bytes that are no
+    MAVLink, system ids of other autopilots, and numbers of messages with refused signatures, by reason."""
     if refused:
         why = max(refused, key=lambda reason: refused[reason])
         return wrong("link", f"{address}: messages arrive, and are refused ({why}): {MEANING[why]}.")

@@ -1,8 +1,9 @@
-"""`edgevpr service install` and `uninstall`: make user, folders, program, configuration, unit and udev rules of the
-service, and remove them again. Maps, flight logs and the configuration stay."""
+"""`edgevpr service`: prints the unit of the service; makes its user, folders, program, configuration, unit and udev
+rules, and removes them again. Maps, flight logs and the configuration stay."""
 
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable
@@ -13,16 +14,18 @@ from edgevpr import __version__
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import shipped, write_whole
-from edgevpr.power.boards import load_board
+from edgevpr.core.text import printable
+from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.service import program
 from edgevpr.runtime.service.program import AGAIN, NAME, VENV, command, is_told
-from edgevpr.runtime.service.unit import HIDDEN_FROM_THE_SERVICE, render_unit
 
 _CONFIG = "etc/edgevpr/config.yaml"
 _UNIT, _RULES = "etc/systemd/system/edgevpr.service", "etc/udev/rules.d/99-edgevpr.rules"
 _MAPS, _LOGS = "var/lib/edgevpr", "var/log/edgevpr"
 _GROUPS = "dialout,video"  # of serial ports and cameras
 _BOOTED = "run/systemd/system"  # sd_booted(3)
+# The unit's ProtectHome and PrivateTmp show the service empty folders instead of these.
+_HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 
 Step = tuple[str, Callable[[], object]]  # what it brings about, in words, and what to call; it may be repeated
 
@@ -34,6 +37,18 @@ _FIRST_CONFIG = """\
 # mavlink: {link: "serial:/dev/edgevpr-fc:921600"}
 log: {path: /var/log/edgevpr/flight.jsonl}
 """
+
+
+def render_unit(board: Board) -> str:
+    """Return the text of deploy/edgevpr.service with the limits of a board."""
+    changed = {
+        "# Board: ": printable(board.name),
+        "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
+        "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
+    }
+    keys = re.compile(f"(?m)^({'|'.join(changed)}).*$")
+    text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
+    return keys.sub(lambda line: line[1] + changed[line[1]], text)
 
 
 def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
@@ -74,16 +89,12 @@ def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/"))
     """Stop the service and remove what `install` has made, except maps, flight logs, the configuration and the user."""
     if not dry_run:
         _require_root(root)
-    is_booted = (root / _BOOTED).is_dir()
-    stop = ("systemctl", "disable", *(("--now",) if is_booted else ()), NAME)
-    reloads: tuple[Step, ...] = (
-        ("systemd has read that the unit is gone", lambda: _reload_units(root)),
-        ("udev has read that its rules are gone", _reload_rules),
-    )
+    stop = ("systemctl", "disable", "--now", NAME)
     steps: tuple[Step, ...] = (
         ("service stopped and not started any more", lambda: command(*stop) if (root / _UNIT).exists() else None),
         *((f"no /{name}", partial((root / name).unlink, missing_ok=True)) for name in (_UNIT, _RULES)),
-        *(reloads if is_booted else ()),
+        ("systemd has read that the unit is gone", lambda: _reload_units(root)),
+        ("udev has read that its rules are gone", _reload_rules),
         # Last, since this may be the very program that runs.
         (f"no /{VENV}", lambda: program.remove_program(root / VENV)),
     )
@@ -111,7 +122,7 @@ def _walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> N
 
 def _require_right_to_change(root: Path) -> None:
     _require_root(root)
-    for folder in HIDDEN_FROM_THE_SERVICE if root == Path("/") else ():
+    for folder in _HIDDEN_FROM_THE_SERVICE if root == Path("/") else ():
         if Path(sys.base_prefix).resolve().is_relative_to(folder):
             raise EdgevprError(
                 f"This Python lies in {sys.base_prefix}, out of sight of the service: install edgevpr with the "

@@ -33,7 +33,6 @@ _USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # values of GPS_AUTO_SWITCH that use the
 _FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # values of EK3_SRCn_...
 _SWITCH = f"GPS_AUTO_SWITCH={_USE_BEST}"
 _SOURCE_SETS = (1, 2, 3)
-_SHORT_BAUDS = {111_100: 111}  # SERIALn_BAUD is in thousands, rounded down; above 2000 it is the rate itself
 _VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
 _MOST_DELAY_MS = 50  # edgevpr sends its position for the moment of sending
 SILENT_S = 5.0  # aux_global_position.cpp: after so long without message 296, PX4 no longer uses its positions
@@ -71,10 +70,6 @@ def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iter
             needs = f"The first flight with fixes on needs {' and '.join(channel.changes)}: {channel.message}"
             channel = fine("channel", f"A dry run (`send_fixes: false`) needs no change. {needs}")
         yield channel
-        if reading.asked.kind is Kind.PLANE:
-            is_known = parameters.get("ARSPD_TYPE", 0) and parameters.get("ARSPD_USE") == 1
-            drifts = "no sensor is in use (ARSPD_TYPE, ARSPD_USE=1), so it drifts faster between two fixes"
-            yield fine("airspeed", "a sensor is in use, so the wind is known" if is_known else drifts)
     yield _port(reading, "SERIALn_PROTOCOL=2")
 
 
@@ -210,12 +205,11 @@ RULES = {
         name="ArduPilot",
         knows_fixes=(4, 5),  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
         parameters=(
-            *ARDUPILOT_PARAMETERS, "GPS_AUTO_SWITCH", "FLOW_TYPE", "ARSPD_TYPE", "ARSPD_USE", "Q_ENABLE",
-            "AHRS_EKF_TYPE", "EK3_ENABLE",
+            *ARDUPILOT_PARAMETERS, "GPS_AUTO_SWITCH", "FLOW_TYPE", "Q_ENABLE", "AHRS_EKF_TYPE", "EK3_ENABLE",
             *(f"EK3_SRC{n}_{what}" for n in _SOURCE_SETS for what in ("POSXY", "VELXY")),
         ),
         findings=_ardupilot_findings,
-        port_changes=lambda baud: ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={_SHORT_BAUDS.get(baud, baud // 1000)}"),
+        port_changes=lambda baud: ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={baud // 1000}"),
     ),
     "px4": FirmwareRules(
         name="PX4",

@@ -9,7 +9,7 @@ import pytest
 
 from edgevpr.core.config import Config, load_config
 from edgevpr.mavlink.address import parse_link
-from edgevpr.runtime.service.board import board_findings, device
+from edgevpr.runtime.service.finding import board_findings, device
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def found(configuration: Config, root: Path, link: str = "udpin:127.0.0.1:14550"
 
 def test_a_board_that_is_fine(root, tmp_path):
     findings = found(config(tmp_path), root)
-    assert list(findings) == ["memory", "cores", "log"]
+    assert list(findings) == ["memory", "log"]
     assert all(each.ok for each in findings.values())
     assert findings["memory"].message.startswith("512 of 512 MB")
     assert list(tmp_path.iterdir()) == [root]

@@ -92,9 +92,6 @@ FUSED = with_parameters(VISUAL, EK3_SRC2_POSXY=6, EK3_SRC2_VELXY=6)
         (with_parameters(VISUAL, EK3_SRC1_POSXY=6), "channel", "ODOMETRY, as its VISO_TYPE is 1."),
         (replace(VISUAL, vehicle="plane"), "channel", "ODOMETRY, as its VISO_TYPE is 1, but no "),
         (FUSED, "channel", "trust it more than its gyros"),
-        (replace(BARE, vehicle="plane"), "airspeed", "drifts faster"),
-        (with_parameters(replace(BARE, vehicle="plane"), ARSPD_TYPE=1, ARSPD_USE=0), "airspeed", "drifts faster"),
-        (with_parameters(replace(BARE, vehicle="plane"), ARSPD_TYPE=1, ARSPD_USE=1), "airspeed", "the wind is known"),
         (replace(COPTER, is_armed=True), "link", ", armed; an answer takes 20 ms"),
         (MUTE, "link", "is heard, but answers nothing: the wire |, or a signing key"),
         (replace(MUTE, signs=True), "link", "it may want signed requests"),
@@ -108,7 +105,6 @@ def test_what_is_said(reading, what, message):
 
 def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
     assert wrong(COPTER) == wrong(PX4) == {}
-    assert "airspeed" not in {each.what for each in autopilot_findings(COPTER, UDP, FIXES)}
 
 
 # The channel of an ArduPilot.
@@ -418,12 +414,16 @@ def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, 
     assert "channel" not in found
 
 
+def test_a_host_that_is_not_there_is_a_finding(capsys):
+    assert main(["doctor", "--link", "udpout:no-such-host.invalid:14550"]) == 1
+    assert not findings_of(capsys.readouterr().out)["link"][0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["--link", "udp:127.0.0.1"], "udp:127.0.0.1"),
         (["--link", "serial:/dev/null:fast"], "baud"),
-        (["--link", "udpout:no-such-host.invalid:14550"], "no-such-host"),
         ([], "--link"),
         (["--config", "/absent.yaml"], "/absent.yaml"),
     ],

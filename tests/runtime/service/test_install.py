@@ -16,8 +16,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import program
-from edgevpr.runtime.service.install import install, uninstall
-from edgevpr.runtime.service.unit import render_unit
+from edgevpr.runtime.service.install import install, render_unit, uninstall
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
 
