@@ -107,9 +107,8 @@ def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Parrot and Pix4D from the first 300 KB of a file. Never raises: a value that is absent,
     damaged or impossible is None.
 
-    The heading is the compass direction of the top of the picture, or if that is unknown, of the aircraft's nose. Roll
-    and pitch are the deviation of the camera from straight down. The height is over the take-off point, which is the
-    height above the ground only where the ground is level. Position and time are None.
+    The heading is that of the top of the picture, or if that is unknown, of the aircraft's nose. Roll and pitch are the
+    deviation of the camera from straight down. The height is over the take-off point. Position and time are None.
     """
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:

@@ -26,7 +26,6 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-_FOLDERS_NAMED = 3  # subfolders suggested in an error message
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
 _SMALL_PX, _SMALL_QUALITY, _TAPE_QUALITY = 640, 80, 95
 
@@ -49,7 +48,7 @@ def list_images(folder: str | Path) -> list[Path]:
     if images := [folder / name for name in names if is_image(name)]:
         return images
     inner = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
-    advice = " or ".join(inner[:_FOLDERS_NAMED]) or "the one that does"
+    advice = " or ".join(inner[:3]) or "the one that does"
     raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give {advice}.")
 
 

@@ -69,11 +69,9 @@ class Capture(Protocol):
 
     def read(self) -> Shot | Refusal | None:
         """Wait for the next picture and return it, or the reason why it is rejected; None if the source is lost."""
-        ...
 
     def release(self) -> None:
         """Close the camera or the connection."""
-        ...
 
 
 def coarse(plane: Image) -> Image:

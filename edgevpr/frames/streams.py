@@ -1,9 +1,6 @@
-"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken.
-
-A thread receives packets from the network as they come (`Arrivals`), the thread of `frames.live` decodes them
-(`StreamCapture`). The time at which each picture was taken is estimated on this machine's clock, with the time stamps
-of the stream (`StampedTime`) or without (`UnstampedTime`).
-"""
+"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken, estimated by the time
+stamps of the stream (`StampedTime`) or without (`UnstampedTime`). A thread receives packets as they come (`Arrivals`),
+the thread of `frames.live` decodes them (`StreamCapture`)."""
 
 import math
 import threading
