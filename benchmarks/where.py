@@ -98,7 +98,7 @@ def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Sol
     step_sd, turn_sd = (np.full(len(rows), each) for each in _PAIR_SD)
     query, place = (np.array([number[row[key]] for row in rows]) for key in ("file_a", "file_b"))
     ties = Ties(query=query, place=place, step=np.array(step), turn=np.array(turn), step_sd=step_sd, turn_sd=turn_sd)
-    return solve(np.array([tags[name] for name in names]), np.full(len(names), np.nan), ties)
+    return solve(np.array([tags[name] for name in names]), ties)
 
 
 def picture(folder: Path, name: str) -> np.ndarray:

@@ -3,9 +3,7 @@ salience`: print how memorable, static and full of information a picture is."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +30,7 @@ from edgevpr.core.text import progress
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import Cuttings, FlownPictures
 
-_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "margin_m")
+_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area")
 _OF_A_RECORDING = ("positions", "rate_hz")
 
 
@@ -62,12 +60,9 @@ def add(commands: Any) -> None:
     merge.add_argument("maps", metavar="MAP", nargs="+")
     smaller = of_map("shrink", map_shrink, "keep only the best places, spread over the map")
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
-    size = smaller.add_mutually_exclusive_group(required=True)
-    size.add_argument("--places", type=count, metavar="N", help="as many places")
-    size.add_argument("--mb", type=positive, metavar="MB", help="as many as such a file holds, MB of 10^6 bytes")
+    smaller.add_argument("--places", type=count, metavar="N", required=True, help="as many places")
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
-    worth.add_argument("--out", metavar="PNG", help="draw the picture with its three maps")
     worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
     add_json(worth)
 
@@ -93,8 +88,9 @@ def _add_pictures(parser: ArgumentParser) -> None:
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
     flags.add_argument("--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture")
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
-    flags.add_argument("--area", metavar="FILE", help="only over this: a mission or GeoJSON (default: all)")
-    flags.add_argument("--margin-m", type=float, metavar="M", help="so far beside the path of --area (a footprint)")
+    flags.add_argument(
+        "--area", metavar="FILE", help="only over this: a mission or GeoJSON (a path: a footprint on either side)"
+    )
 
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
@@ -112,8 +108,6 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
-    if args.margin_m is not None and not (args.area and 0 <= args.margin_m < float("inf")):
-        raise UsageError(f"--margin-m {args.margin_m:g}: give 0 or more, with --area.")
     return Cuttings(orthophoto=args.orthophoto, **{name: getattr(args, name) for name in _OF_AN_ORTHOPHOTO})
 
 
@@ -191,7 +185,7 @@ def map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check
 
-    found = check(args.map, partial(progress, label="checking"))
+    found = check(args.map)
     show({**asdict(found), "is_whole": found.is_whole}, args.json, of_check(found))
     return 0 if found.is_whole else 1
 
@@ -200,79 +194,49 @@ def map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check, repair
 
-    found = check(args.map, partial(progress, label="checking"))
+    found = check(args.map)
     show(found, False, of_check(found))
     if found.is_whole:
         print("nothing is damaged: the map is as it was")
         return 0
-    original = repair(args.map, partial(progress, label="copying"))
+    original = repair(args.map)
     print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
     return 0
 
 
 def map_merge(args: Namespace) -> int:
-    """Run `map merge`: make one map of several. If that fails, no map is written."""
-    from edgevpr.places.examine import absorb
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.mapfiles import map_path, whole_or_none
-    from edgevpr.runtime.recognise.opening import technique_of
+    """Run `map merge`: make one map of several."""
+    from edgevpr.places.examine import merge
+    from edgevpr.places.mapfiles import map_path
 
-    out = map_path(args.out)
-    with ExitStack() as stack:
-        unfinished = stack.enter_context(whole_or_none(out))
-        inputs = [stack.enter_context(PlaceMap.open(path)) for path in args.maps]
-        technique_of(inputs[0])
-        for other in inputs[1:]:
-            other.require(inputs[0].spec)
-        masks = {each.mask_sha256 for each in inputs}
-        with PlaceMap.create(unfinished, inputs[0].spec) as merged:
-            if len(masks) == 1:
-                merged.record_mask(*masks)
-            for path, place_map in zip(args.maps, inputs, strict=True):
-                copied, already_here = absorb(merged, place_map)
-                print(f"{path}: {copied} places copied, {already_here} there already")
-            places = len(merged)
-            were_calibrated = any(each.calibration is not None for each in inputs)
-    print(f"{out}: {places} places")
+    counts, were_calibrated = merge(args.maps, map_path(args.out))
+    for path, (copied, already_here) in zip(args.maps, counts, strict=True):
+        print(f"{path}: {copied} places copied, {already_here} there already")
+    print(f"{args.out}: {sum(copied for copied, _ in counts)} places")
     if were_calibrated:
-        print(f"  not calibrated: how sure the maps were does not hold for it; run `edgevpr map calibrate {out}`")
+        print(f"  not calibrated: how sure the maps were does not hold for it; run `edgevpr map calibrate {args.out}`")
     return 0
 
 
 def map_shrink(args: Namespace) -> int:
     """Run `map shrink`: make a smaller map of the most useful places of a map."""
-    from edgevpr.places.examine import places_in, shrink
-    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.examine import shrink
     from edgevpr.places.mapfiles import map_path
 
-    wanted = args.places
-    if wanted is None:
-        with PlaceMap.open(args.map) as place_map:
-            wanted = places_in(int(args.mb * 1e6), place_map)
-        if wanted < 1:
-            raise UsageError(f"--mb {args.mb:g}: not one place of {args.map} fits: give more.")
-    kept, places = shrink(args.map, map_path(args.out), wanted)
+    kept, places = shrink(args.map, map_path(args.out), args.places)
     print(f"{args.out}: {kept} of {places} places")
     return 0
 
 
 def run_salience(args: Namespace) -> int:
-    """Run `salience`: print the salience scores of a picture (see the glossary); with --out, also draw the picture with
-    a map of each score over its parts."""
-    from edgevpr.core.files import require_folder, write_whole
+    """Run `salience`: print the salience scores of a picture (see the glossary)."""
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import gate_of
-    from edgevpr.runtime.recognise.salience_gate import drawn_as_png, scores_of, worth_of
+    from edgevpr.runtime.recognise.salience_gate import worth_of
 
     gate = gate_of(config_of(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    if args.out:
-        require_folder(Path(args.out))
-    image = read_image(Path(args.image))
-    maps = gate.maps(image)
-    worth = worth_of(scores_of(maps), gate.thresholds)
-    if args.out:
-        write_whole(Path(args.out), lambda path: path.write_bytes(drawn_as_png(image, maps, worth.salience)))
+    worth = worth_of(gate.scores(read_image(Path(args.image))), gate.thresholds)
     known = {"kept": worth.reason is None, "reason": worth.reason}
     show({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

@@ -79,8 +79,6 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
         yield f"  extent      {south:.6f}..{north:.6f} north, {west:.6f}..{east:.6f} east"
     if info.first_time:
         yield f"  time        {info.first_time} to {info.last_time}"
-    if info.mean_quality is not None:
-        yield f"  quality     {info.mean_quality:.2f} on average (share of the image that says anything)"
     if info.with_pose:
         seen = f"a picture shows {info.footprint_m:.0f} m of ground along its longest side"
         yield f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; {seen}"
@@ -88,7 +86,7 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
     if confidence:
         yield f"  confidence  {confidence}"
-    yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM ({info.made_by})"
+    yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM"
 
 
 def of_check(found: "MapCheck") -> Iterator[str]:

@@ -1,19 +1,42 @@
-"""An orthophoto as a source of frames, from which a map can be made: for each place of a grid it gives the picture that
-a camera looking straight down would take there, with north at the top."""
+"""An orthophoto as a source of frames, from which a map can be made: for each place of a regular grid it gives the
+picture that a camera looking straight down would take there, with north at the top."""
 
-from collections.abc import Callable, Collection
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 
-from edgevpr.core.errors import ImageError
+import numpy as np
+
+from edgevpr.core.arrays import Bools, Doubles, Ints
+from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
-from edgevpr.mapmaking.lattice import Lattice
-from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.missions import Area
+from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, local_crs
+from edgevpr.mapmaking.rasters import CRS, geometry_mask, rasterio, transform
 
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
+_MOST_PLACES = 1_000_000
+_MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lattice:
+    """N places of a grid, in arrays (N,): `rows`, int, counted from the north, and `columns`, from the west; `lat_deg`
+    and `lon_deg` in degrees of WGS-84. `shape` is the number of (rows, columns) of the whole grid."""
+
+    rows: Ints
+    columns: Ints
+    lat_deg: Doubles
+    lon_deg: Doubles
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
 
 class OrthophotoSource(RecordingSource):
@@ -71,3 +94,105 @@ class OrthophotoSource(RecordingSource):
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
+
+
+def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
+    """Make a grid of places `spacing_m` apart over the orthophoto. A square with sides of `footprint_m` around each
+    place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
+    its polygons or within `footprint_m` of its paths.
+
+    Raises UsageError if footprint or spacing do not fit the orthophoto, the area is outside of it, or there are no
+    places or more than a million.
+    """
+    plane = local_crs(orthophoto.middle)
+    outline_m = np.array(orthophoto.outline(plane))
+    low, high = outline_m.min(axis=1), outline_m.max(axis=1)
+    size_m = high - low
+    for flag, given_m, most_m in (
+        ("--footprint-m", footprint_m, size_m.min()),
+        ("--spacing-m", spacing_m, size_m.max()),
+    ):
+        if not 0 < given_m <= most_m:  # false for NaN
+            raise UsageError(
+                f"{flag} is {given_m:g}, and {orthophoto.path} is {size_m[0]:.0f} m by {size_m[1]:.0f} m: give more "
+                "than 0 and no more than that."
+            )
+    low, high = low + footprint_m / 2, high - footprint_m / 2
+    count = ((high - low) / spacing_m).astype(int) + 1
+    first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
+    begin, end = np.zeros(2, int), count
+    if area:
+        polygons_m = [[_metres(ring, plane) for ring in rings] for rings in area.polygons]
+        paths_m = [_metres([(way.lat_deg, way.lon_deg) for way in path], plane) for path in area.paths]
+        corners = [ring for rings in polygons_m for ring in rings]
+        corners += [path + off_m for path in paths_m for off_m in (-footprint_m, footprint_m)]
+        area_low, area_high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+        if not ((area_low <= high) & (area_high >= low)).all():  # false for what cannot be projected, too
+            raise UsageError(
+                f"The area does not touch {orthophoto.path}: it is at {extent_words(area.extent_deg)}, the orthophoto "
+                f"at {extent_words(orthophoto.extent_deg)}."
+            )
+        begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
+        end = np.clip(np.floor((area_high - first) / spacing_m) + 1, begin, count).astype(int)
+    _require_bounded((end - begin).prod(), _MOST_POINTS if area else _MOST_PLACES, spacing_m)
+    x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
+    y_m = y_m[::-1]
+    wanted = np.ones((len(y_m), len(x_m)), bool)
+    if area and wanted.size:
+        wanted = _inside(polygons_m, x_m, y_m, spacing_m)
+        for path in paths_m:
+            for start, stop in zip(path, path[1:] if len(path) > 1 else path, strict=False):
+                _add_near(wanted, x_m, y_m, start, stop, footprint_m)
+    rows, columns = np.nonzero(wanted)
+    _require_bounded(len(rows), _MOST_PLACES, spacing_m)
+    if not len(rows):
+        raise UsageError(
+            f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.path}: give a smaller spacing."
+        )
+    lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
+    shape = (int(count[1]), int(count[0]))
+    rows, columns = rows + count[1] - end[1], columns + begin[0]
+    return Lattice(rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
+
+
+def _require_bounded(count: int, most: int, spacing_m: float) -> None:
+    if count > most:
+        needed_m = math.ceil(spacing_m * math.sqrt(count / _MOST_PLACES))
+        raise UsageError(
+            f"A grid of {spacing_m:g} m has {count:,} points here, and a map {_MOST_PLACES:,} places at most: give "
+            f"--spacing-m {needed_m}, or an --area."
+        )
+
+
+def extent_words(extent_deg: tuple[float, float, float, float]) -> str:
+    """Format a bounding box (south, west, north, east) for messages."""
+    south, west, north, east = extent_deg
+    return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"
+
+
+def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> Doubles:
+    lat_deg, lon_deg = zip(*points, strict=True)
+    return np.column_stack(transform(WGS84, plane, lon_deg, lat_deg))
+
+
+def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m: float) -> Bools:
+    """Return bool (rows, columns), True for the points of a grid, of ascending `x_m` and descending `y_m`, that are
+    inside the polygons, each of which is a list of rings (n, 2): its outline, then its holes."""
+    shape = len(y_m), len(x_m)
+    if not polygons_m:
+        return np.zeros(shape, bool)
+    grid = rasterio.Affine(step_m, 0, x_m[0] - step_m / 2, 0, -step_m, y_m[0] + step_m / 2)
+    shapes = [{"type": "Polygon", "coordinates": [ring.tolist() for ring in rings]} for rings in polygons_m]
+    inside: Bools = geometry_mask(shapes, shape, grid, invert=True)
+    return inside
+
+
+def _add_near(inside: Bools, x_m: Doubles, y_m: Doubles, begin: Doubles, end: Doubles, away_m: float) -> None:
+    """Set `inside` to True for the points of its grid within `away_m` of the line `begin` to `end`, (x, y) each."""
+    low, high = np.minimum(begin, end) - away_m, np.maximum(begin, end) + away_m
+    columns = slice(*np.searchsorted(x_m, (low[0], high[0])))
+    rows = slice(*np.searchsorted(-y_m, (-high[1], -low[1])))
+    east_m, north_m = x_m[columns][None] - begin[0], y_m[rows][:, None] - begin[1]
+    way = end - begin
+    share = np.clip((east_m * way[0] + north_m * way[1]) / max(way @ way, 1e-9), 0, 1)
+    inside[rows, columns] |= np.hypot(east_m - share * way[0], north_m - share * way[1]) <= away_m

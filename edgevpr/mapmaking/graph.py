@@ -30,7 +30,6 @@ _MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that 
 _LONGEST_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
 _FIRST = 3.0  # first estimate of `Solved.times`
 _LEAST = 0.5  # least value of `Solved.times`: ties that agree well by chance must not make the others look wrong
-_SURE = 0.005  # standard deviation of a known log
 _LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions: the least, and the first estimate
 _GONE = 0.1  # a tie or position with a smaller weight counts as contradicting the others
 _MEDIAN_OF_FOUR = 1.832  # median length of a vector of four standard normal numbers
@@ -77,29 +76,25 @@ class Solved:
     ties_count: np.ndarray
 
 
-def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.ndarray | None = None) -> Solved:
+def solve(recorded: np.ndarray, ties: Ties) -> Solved:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
-    north in metres. `recorded_sd_m`, float (N,): standard deviation of each (NaN: not known in advance; one value is
-    then estimated for all of these). `log`, complex (N,): for places whose footprint and direction are known in
-    advance, their log as in the module's docstring (NaN: unknown; None: unknown for all places)."""
-    count, own = len(recorded), np.isnan(recorded_sd_m)
+    north in metres. One standard deviation is estimated for all of them."""
+    count = len(recorded)
     _, component = connected_components(_matrix(ties, count), directed=False)
-    graph = _Graph(recorded, np.full(count, np.nan + 0j) if log is None else log, ties, component)
+    graph = _Graph(recorded, ties, component)
     times, scatter_m = _FIRST, _FIRST_M
     for _ in range(_ROUNDS):
-        sd_m = np.where(own, scatter_m, recorded_sd_m)
+        before, sd_m = times, scatter_m
         normal, agree = graph.settle(sd_m, times)
         variance = 2 * _inverse_diagonal(normal)  # the weights are of one axis, the variance of both
-        before = times, scatter_m
         if len(ties):
             # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
             spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
             times = max(_LEAST, float(np.median(graph.off_ties())) / _MEDIAN_OF_FOUR / np.sqrt(spare))
         off_m = abs(graph.position - recorded)
-        if own.any():
-            # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
-            scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off_m[own]) ** 2 + np.median(variance[:count][own]) / 2)))
-        if abs(np.log(before[0] / times)) < _SETTLED and abs(np.log(before[1] / scatter_m)) < _SETTLED:
+        # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
+        scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off_m) ** 2 + np.median(variance[:count]) / 2)))
+        if abs(np.log(before / times)) < _SETTLED and abs(np.log(sd_m / scatter_m)) < _SETTLED:
             break
     return Solved(
         position=graph.position,
@@ -115,13 +110,13 @@ def solve(recorded: np.ndarray, recorded_sd_m: np.ndarray, ties: Ties, log: np.n
 
 
 class _Graph:
-    """The least-squares problem that `solve` solves: N places with T ties, their recorded positions and known logs, and
-    the solution found so far, `position` and `log`, complex (N,) each."""
+    """The least-squares problem that `solve` solves: N places with T ties, their recorded positions, and the solution
+    found so far, `position` and `log`, complex (N,) each."""
 
-    def __init__(self, recorded: np.ndarray, known: np.ndarray, ties: Ties, component: np.ndarray) -> None:
+    def __init__(self, recorded: np.ndarray, ties: Ties, component: np.ndarray) -> None:
         """Make the first solution: place the pictures of each component one after the other along its most exact ties,
-        then fit the component as a whole to its recorded positions and known logs. `known`: complex (N,), or NaN."""
-        self._recorded, self._known, self._ties = recorded, known, ties
+        then fit the component as a whole to its recorded positions."""
+        self._recorded, self._ties = recorded, ties
         count = len(recorded)
         position, log = np.zeros(count, complex), np.zeros(count, complex)
         tree = minimum_spanning_tree(_matrix(ties, count))
@@ -137,18 +132,14 @@ class _Graph:
                 step, turn = tie_of[at, base]
                 position[at], log[at] = position[base] + np.exp(log[base]) * step, log[base] + turn
             scale, offset = _laid_over(position[members], recorded[members])
-            at_known = members[~np.isnan(known[members])]
-            if len(at_known):
-                scale = np.exp(np.mean(known[at_known] - log[at_known]))
-                offset = np.mean(recorded[members] - scale * position[members])
             position[members] = scale * position[members] + offset
             log[members] += np.log(scale)
         self.position, self.log = position, log
 
-    def settle(self, sd_m: np.ndarray, times: float) -> tuple[csc_matrix, np.ndarray]:
-        """Solve for positions and logs by Gauss-Newton steps. The standard deviations of recorded positions are `sd_m`,
-        float (N,), and those of the ties are multiplied by `times`. Returns the normal matrix (2 N, 2 N), and the
-        robust weight of each tie, float (T,), 0..1."""
+    def settle(self, sd_m: float, times: float) -> tuple[csc_matrix, np.ndarray]:
+        """Solve for positions and logs by Gauss-Newton steps. The standard deviation of recorded positions is `sd_m`,
+        and those of the ties are multiplied by `times`. Returns the normal matrix (2 N, 2 N), and the robust weight of
+        each tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MOVES):
             agree = _agree(self.off_ties() / times)
@@ -181,26 +172,23 @@ class _Graph:
         self, by_step: np.ndarray, by_turn: np.ndarray, by_recorded: np.ndarray
     ) -> tuple[csc_matrix, np.ndarray]:
         """Return the weighted Jacobian (R, 2 N) and the weighted residuals, complex (R,). The R rows are those of the
-        steps, the turns, the recorded positions and the known logs, in this order; the arguments are the weights."""
+        steps, the turns and the recorded positions, in this order; the arguments are the weights."""
         count, many, ties = len(self._recorded), len(self._ties), self._ties
         steps, turns = self._residuals()
         unit = np.exp(-self.log[ties.place])
-        row, at_known = np.arange(many), np.flatnonzero(~np.isnan(self._known))
-        sure, last = np.full(len(at_known), 1 / _SURE), 2 * many + count
+        row, places = np.arange(many), np.arange(count)
         entries = (  # rows, columns and values
             (row, ties.query, by_step * unit),
             (row, ties.place, -by_step * unit),
             (row, count + ties.place, -by_step * (steps + ties.step)),
             (many + row, count + ties.query, by_turn),
             (many + row, count + ties.place, -by_turn),
-            (2 * many + np.arange(count), np.arange(count), by_recorded),
-            (last + np.arange(len(at_known)), count + at_known, sure),
+            (2 * many + places, places, by_recorded),
         )
         rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
-        jacobian = coo_matrix((values, (rows, columns)), shape=(last + len(at_known), 2 * count)).tocsc()
+        jacobian = coo_matrix((values, (rows, columns)), shape=(2 * many + count, 2 * count)).tocsc()
         from_recorded = by_recorded * (self.position - self._recorded)
-        from_known = sure * (self.log - self._known)[at_known]
-        return jacobian, np.concatenate([by_step * steps, by_turn * turns, from_recorded, from_known])
+        return jacobian, np.concatenate([by_step * steps, by_turn * turns, from_recorded])
 
 
 def _matrix(ties: Ties, count: int) -> csc_matrix:

@@ -56,27 +56,23 @@ class Cuttings:
     """Pictures that are cut from an orthophoto, at the places of a grid.
 
     `footprint_m`: ground length of a picture's side. `spacing_m`: distance between neighbouring places.
-    `area`: file that limits the places, see `missions.read_area` (None: the whole orthophoto).
-    `margin_m`: greatest distance of a place from a path of the area (None: `footprint_m`)."""
+    `area`: file that limits the places, see `missions.read_area` (None: the whole orthophoto)."""
 
     orthophoto: str
     footprint_m: float
     spacing_m: float
     area: str | None = None
-    margin_m: float | None = None
 
     def open(self, only: Collection[str] | None = None) -> Source:
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
-        from edgevpr.mapmaking.cuttings import OrthophotoSource
-        from edgevpr.mapmaking.lattice import lattice_of
+        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of
         from edgevpr.mapmaking.missions import read_area
         from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
 
         area = read_area(self.area) if self.area else None
-        margin_m = self.footprint_m if self.margin_m is None else self.margin_m
         orthophoto = Orthophoto(self.orthophoto)
-        lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area, margin_m)
+        lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area)
         return OrthophotoSource(orthophoto, lattice, self.footprint_m, time.monotonic, only=only)
 
 

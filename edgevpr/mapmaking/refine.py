@@ -30,11 +30,11 @@ _AMISS = 4.0  # standard deviations of a recorded position from which on the pic
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refined:
-    """Result of refining a map of so many `places`. Of these, `without_position` have no position, `surveyed` needed no
-    refinement, and `refined` have a pose now; for the others there were too few ties.
-    `ties`, `ties_refused`: number of ties that agree with the solution, and of those that do not.
-    `recorded_sd_m`: standard deviation of recorded positions along one axis. `moved_m`, `position_sd_m`, `footprint_m`:
-    medians of the places' moves, of the standard deviations of refined positions, and of footprints (None: no place).
+    """Result of refining a map of so many `places`. Of these, `without_position` have no position, `surveyed` were cut
+    from an orthophoto and stay as they are, and `refined` have a pose now; for the others there were too few ties.
+    `ties`: number of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along
+    one axis. `moved_m`, `position_sd_m`, `footprint_m`: medians of the places' moves, of the standard deviations of
+    refined positions, and of footprints (None: no place).
     `contradictory`: places whose recorded position the pictures contradict: (number, image, metres between the two)."""
 
     places: int
@@ -42,17 +42,11 @@ class Refined:
     surveyed: int
     refined: int = 0
     ties: int = 0
-    ties_refused: int = 0
     recorded_sd_m: float | None = None
     moved_m: float | None = None
     position_sd_m: float | None = None
     footprint_m: float | None = None
     contradictory: tuple[tuple[int, str, float], ...] = ()
-
-    @property
-    def not_tied(self) -> int:
-        """Number of places that have a position but too few ties to be refined."""
-        return self.places - self.without_position - self.surveyed - self.refined
 
 
 def refine(
@@ -63,29 +57,27 @@ def refine(
     are compared). Raises MapError if the file cannot be read or written.
     """
     places = list(_readable(place_map))
-    placed = [place for place in places if place.position]
-    surveyed = np.array([bool(place.pose and place.pose.is_surveyed) for place in placed], bool)
-    without_position = len(places) - len(placed)
-    result = Refined(places=len(places), without_position=without_position, surveyed=int(surveyed.sum()))
-    if not placed or surveyed.all():
+    with_position = [place for place in places if place.position]
+    placed = [place for place in with_position if not (place.pose and place.pose.is_surveyed)]
+    result = Refined(
+        places=len(places),
+        without_position=len(places) - len(with_position),
+        surveyed=len(with_position) - len(placed),
+    )
+    if not placed:
         return result
     recorded_at = [_recorded(place) for place in placed]
     east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
-    known_sd_m, known_log = np.full(len(placed), np.nan), np.full(len(placed), np.nan + 0j)
-    for at in np.flatnonzero(surveyed).tolist():
-        if pose := placed[at].pose:
-            known_sd_m[at] = np.sqrt((pose.covariance_m2[0] + pose.covariance_m2[2]) / 2)
-            known_log[at] = np.log(pose.footprint_m) - 1j * np.radians(pose.up_deg)
     look = looker(place_map, technique, placed, pictures(images, technique) if images else None)
     pairs = likely_pairs(recorded)
     ties = tied(watch(pairs, len(pairs)), look)
-    solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
+    solved = solve(recorded, ties_of(ties))
     more = sorted(set(overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
     if more:
         ties |= tied(watch(more, len(more)), look)
-        solved = solve(recorded, known_sd_m, ties_of(ties), known_log)
-    sure = _is_sure(solved) & ~surveyed
+        solved = solve(recorded, ties_of(ties))
+    sure = _is_sure(solved)
     _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
     amiss = sure & ~solved.recorded_counts & (off_m > _AMISS * solved.recorded_sd_m)
@@ -93,7 +85,6 @@ def refine(
         result,
         refined=int(sure.sum()),
         ties=int(solved.ties_count.sum()),
-        ties_refused=int((~solved.ties_count).sum()),
         recorded_sd_m=solved.recorded_sd_m,
         moved_m=_median(off_m[sure]),
         position_sd_m=_median(np.sqrt(solved.position_var[sure] / 2)),

@@ -17,7 +17,7 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
 from edgevpr.places.mapfiles import is_of_one_row, sentences
 from edgevpr.places.mapspec import read_stored, spec_of, write_spec
-from edgevpr.places.rows import Values
+from edgevpr.places.rows import Content, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -71,29 +71,25 @@ class MapConnection:
         format version, and UsageError for a name that no file can have."""
         path = mapfiles.existing(path)
         mapfiles.settle_left_log(path)
-        return cls._opened(path, None)
+        return cls._opened(path, adds=False)
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "Self":
         """Open an existing map to add places to it. Raises the errors of `open`, and MapBusyError while another program
         adds places to the map."""
-        path = mapfiles.existing(path)
-        lock = mapfiles.lock(path)
-        try:
-            return cls._opened(path, lock)
-        except BaseException:
-            os.close(lock)
-            raise
+        return cls._opened(mapfiles.existing(path), adds=True)
 
     @classmethod
-    def _opened(cls, path: Path, lock: int | None) -> "Self":
-        with sentences(path):
-            db = mapfiles.connect(path, "ro" if lock is None else "rw")
-            try:
-                return cls(path, db, lock)
-            except BaseException:
-                db.close()
-                raise
+    def _opened(cls, path: Path, adds: bool) -> "Self":
+        with ExitStack() as undo, sentences(path):
+            lock = mapfiles.lock(path) if adds else None
+            if lock is not None:
+                undo.callback(os.close, lock)
+            db = mapfiles.connect(path, "rw" if adds else "ro")
+            undo.callback(db.close)
+            place_map = cls(path, db, lock)
+            undo.pop_all()
+        return place_map
 
     def __enter__(self) -> "Self":
         return self
@@ -158,9 +154,9 @@ class MapConnection:
         with sentences(self.path):
             yield from rows.scan(self.db, columns)
 
-    def row(self, place_id: int, columns: str) -> Values | None:
-        """Return the values of `columns` of one place; None if it does not exist. Raises PlaceError if SQLite cannot
-        read its row."""
+    def row(self, place_id: int, columns: str) -> Content:
+        """Return the values of `columns` of one place, by name. Raises PlaceError if it does not exist, or SQLite
+        cannot read its row."""
         with sentences(self.path):
             try:
                 found = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
@@ -168,7 +164,9 @@ class MapConnection:
                 if not is_of_one_row(error):
                     raise
                 raise PlaceError(self.path, place_id, f"SQLite says: {error}") from error
-        return tuple(found) if found else None
+        if not found:
+            raise PlaceError(self.path, place_id, "its row is gone")
+        return rows.content_of(columns, found)
 
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""

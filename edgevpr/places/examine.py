@@ -1,11 +1,12 @@
-"""Operations on a whole map, for `edgevpr map`: check, repair, merge with another map, copy the best places."""
+"""Operations on whole maps, for `edgevpr map`: check, repair, merge, copy the best places."""
 
 import os
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,16 +17,11 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable
 from edgevpr.places.thin import best_places
 
-T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]  # takes items and their number, yields the same items, shows progress
-
 _MOST_FAULTS = 20  # most faults of a file that SQLite lists
-_EMPTY_BYTES = 45_056  # size of a map file without places
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
 
 
-@dataclass(frozen=True, slots=True)
-class Examined:
+class Examined(NamedTuple):
     """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` has
     the values of its row by column name; it is empty if they cannot be read."""
 
@@ -33,26 +29,16 @@ class Examined:
     problem: str | None
     content: Content
 
-    @property
-    def has_checksums(self) -> bool:
-        """True if no value of the row lacks its checksum."""
-        content, values = self.content, {"pose": "up_deg"}
-        names = ("geom", "coarse", "fine", "landmarks", "pose")
-        return all(content[values.get(name, name)] is None or content[f"{name}_crc32"] is not None for name in names)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class MapCheck:
     """The result of checking a map. `places` is the number of readable places. `damaged` has (place id, problem in few
-    words) of each other place. `faults` are SQLite's messages about the file as a whole. `without_checksums` is the
-    number of readable places that lack a checksum, because another program wrote them: damage to them would not be
-    detected."""
+    words) of each other place. `faults` are SQLite's messages about the file as a whole."""
 
     path: str
     places: int
     damaged: tuple[tuple[int, str], ...]
     faults: tuple[str, ...]
-    without_checksums: int
 
     @property
     def is_whole(self) -> bool:
@@ -77,13 +63,28 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
         yield Examined(place_id, problem, content)
 
 
-def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
-    """Copy all places of `other` into `place_map` in one transaction; return (copied, already there) as numbers.
+def merge(paths: Sequence[str], out: Path) -> tuple[list[tuple[int, int]], bool]:
+    """Make the new map `out` of the places of several maps; if that fails, leave no file. Returns for each map (places
+    copied, places that were there already) as numbers, and True if one of them was calibrated: `out` is not.
 
-    A place is already there if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). Raises
-    MapError if the techniques differ or a file cannot be read or written, and PlaceError if a place is damaged.
+    A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). The
+    mask hash is copied if all have the same. Raises MapError if the techniques differ or a file cannot be read or
+    written, and PlaceError if a place is damaged.
     """
-    place_map.require(other.spec)
+    with ExitStack() as stack:
+        unfinished = stack.enter_context(mapfiles.whole_or_none(out))
+        maps = [stack.enter_context(PlaceMap.open(path)) for path in paths]
+        for other in maps[1:]:
+            other.require(maps[0].spec)
+        masks = {each.mask_sha256 for each in maps}
+        with PlaceMap.create(unfinished, maps[0].spec) as merged:
+            if len(masks) == 1:
+                merged.record_mask(*masks)
+            return [_absorb(merged, each) for each in maps], any(each.calibration is not None for each in maps)
+
+
+def _absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
+    """Copy what is new of `other` into `place_map`; return (copied, already there) as numbers."""
     copied = already_here = 0
     with place_map.transaction():
         here = place_map.ids_by("source_image, time")
@@ -100,32 +101,24 @@ def absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
     return copied, already_here
 
 
-def check(path: str | Path, watch: Watch[Examined]) -> MapCheck:
-    """Read and check everything in the map file `path`. `watch` wraps the iteration over its places, to show progress.
-    Raises MapError for a file that cannot be opened as a map at all."""
-    places = without = 0
-    damaged = []
+def check(path: str | Path) -> MapCheck:
+    """Read and check everything in the map file `path`. Raises MapError for a file that cannot be opened as a map."""
     with PlaceMap.open(path) as place_map:
-        for each in watch(examine(place_map), len(place_map)):
-            if each.problem:
-                damaged.append((each.place_id, each.problem))
-            else:
-                places += 1
-                without += not each.has_checksums
+        problems = [(each.place_id, each.problem) for each in examine(place_map)]
         try:
             found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
         except (sqlite3.Error, UnicodeDecodeError) as error:
             found = [str(error)]
-    faults = () if found == ["ok"] else tuple(found)
-    return MapCheck(path=str(path), places=places, damaged=tuple(damaged), faults=faults, without_checksums=without)
+    damaged = tuple((place_id, problem) for place_id, problem in problems if problem)
+    return MapCheck(str(path), len(problems) - len(damaged), damaged, () if found == ["ok"] else tuple(found))
 
 
-def repair(path: str | Path, watch: Watch[Examined]) -> Path:
+def repair(path: str | Path) -> Path:
     """Replace the map by a copy of its undamaged places; keep the original as `*.damaged` and return its path.
 
     The places keep their ids, and all get checksums. Mask hash and calibration are copied if they can be read. Raises
     MapError if no place can be read, if the original of an earlier repair exists, or if the copy cannot be written. The
-    map is then unchanged. `watch` shows progress.
+    map is then unchanged.
     """
     path = mapfiles.existing(path)
     original = path.with_name(path.name + ".damaged")
@@ -135,7 +128,7 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
     lock = mapfiles.lock(path)  # meanwhile no program can add places, which the copy would lack
     try:
         with PlaceMap.open(path) as damaged:
-            if not _copy(damaged, copy, watch(examine(damaged), len(damaged))):
+            if not _copy(damaged, copy, examine(damaged)):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
         for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
             if left.exists():  # else SQLite would apply the log of the damaged map to the copy
@@ -152,14 +145,6 @@ def repair(path: str | Path, watch: Watch[Examined]) -> Path:
     return original
 
 
-def places_in(file_bytes: int, place_map: PlaceMap) -> int:
-    """Return how many places of a map fit into a file of `file_bytes`, at most all; computed from the mean size that a
-    place takes in the map's file."""
-    places = len(place_map)
-    each = (place_map.path.stat().st_size - _EMPTY_BYTES) / max(places, 1)
-    return places if each <= 0 else min(places, max(0, int((file_bytes - _EMPTY_BYTES) / each)))
-
-
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
     `thin`). Returns (number of places copied, number of readable places of the map).
@@ -169,14 +154,13 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     no part of a file is then left.
     """
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        whole = [each.place_id for each in examine(place_map) if not each.problem]
-        places = list(place_map.places(whole))
+        places = [rows.place_of(each.place_id, each.content) for each in examine(place_map) if not each.problem]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
-        kept = {whole[number] for number in best.tolist()}
+        kept = {places[number].place_id for number in best.tolist()}
         _copy(place_map, unfinished, (each for each in examine(place_map) if each.place_id in kept))
-    return len(kept), len(whole)
+    return len(kept), len(places)
 
 
 def _worth_of(place: Place) -> float:

@@ -1,7 +1,7 @@
 """The index: the part of a map that is held in RAM, in arrays that are allocated once, within a memory budget.
 
-`load_index` makes the index of a map that does not change. A `GrowingIndex` takes new places while it is in use, and
-drops its worst places when its arrays are full. `retrieve` searches an index.
+`load_index` makes the index of a map that does not change. A `GrowingIndex` takes new places while it is in use, until
+its arrays are full. `retrieve` searches an index.
 """
 
 import logging
@@ -22,7 +22,6 @@ from edgevpr.places.thin import best_places
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32  # places
-_MOVED_AT_ONCE = 256  # places
 _OUTLINE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
 
 CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.coarse_parts`
@@ -117,7 +116,7 @@ def load_index(
         )
         seen = np.fromiter(islice(place_map.outlines(), places), _OUTLINE)
         kept = seen["id"][best_places(seen["lat_deg"], seen["lon_deg"], seen["quality"], capacity)]
-        parts = (part for part in parts if _slot_of(kept, part[0]) is not None)
+        parts = _only(parts, kept)
     loaded = max(fill(into, parts, technique), default=0)
     if not loaded:
         raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
@@ -173,17 +172,19 @@ def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: 
     return min(wanted, budget_bytes // place_bytes)
 
 
-def _slot_of(ascending: Array, place_id: int) -> int | None:
-    """Return the slot of the place `place_id`, where `ascending` are the ids of all slots; None if it has none."""
-    at = int(np.searchsorted(ascending, place_id))
-    return at if at < len(ascending) and ascending[at] == place_id else None
+def _only(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
+    """Yield the parts of the places whose ids are in `ascending`."""
+    for part in parts:
+        at = int(np.searchsorted(ascending, part[0]))
+        if at < len(ascending) and ascending[at] == part[0]:
+            yield part
 
 
 class GrowingIndex:
     """The index of an open map, with free slots for more places.
 
-    `index` is a PlaceIndex of the present places, for retrieval; its arrays are views, valid until the next `add`. When
-    a place is added to full arrays, a quarter of the places is dropped first (see `thin`). The map file keeps them all.
+    `index` is a PlaceIndex of the present places, for retrieval; its arrays are views, valid until the next `add`. A
+    place for which there is no slot left is in the map file only, until the next start chooses the best again.
     """
 
     def __init__(
@@ -219,52 +220,23 @@ class GrowingIndex:
         heading None: unknown). If all places must be packed again with a new mean, they are read from the file, and
         damaged ones are left out without an error. Raises MapError if the file cannot be read: the index may then have
         fewer places, all packed with one mean."""
-        if self._taken == len(self._slots):
-            self._thin()
         point = (position.lat_deg, position.lon_deg) if position else None
         free = replace(self._slots.only(slice(self._taken, self._taken + 1)), mean=self._mean)
-        self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique))
+        self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique), default=0)
         self._in_file += 1
         # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
         if self._mean is not None and self._in_file >= 2 * self._mean_of:
             self._repack()
-
-    def _thin(self) -> None:
-        index = self.index
-        # Quality is read from the file: places are dropped too rarely to justify four more bytes per place in RAM.
-        quality = np.full(len(index), np.nan)
-        for place_id, _, _, known in self._map.outlines():
-            if (at := _slot_of(index.place_ids, place_id)) is not None:
-                quality[at] = known
-        for place_id in index.place_ids[np.isnan(quality)].tolist():
-            self._map.left_out.setdefault(place_id, "its row is gone")
-        kept = best_places(index.lat_deg, index.lon_deg, np.nan_to_num(quality), 3 * len(index) // 4, index.place_ids)
-        # A place moves to a lower slot or stays, so an overwritten place has already been moved or is dropped.
-        for start in range(0, len(kept), _MOVED_AT_ONCE):
-            block = kept[start : start + _MOVED_AT_ONCE]
-            for array in index.arrays.values():
-                array[start : start + len(block)] = array[block]
-        self._taken = len(kept)
 
     def _repack(self) -> None:
         """Pack all places again with the new mean. A place that can no longer be read is dropped, since its row is
         packed with the old mean."""
         mean = self._map.mean_coarse()
         packed = 0
+        held = _only(self._map.coarse_parts(), self.index.place_ids.copy())
         try:
-            for written in fill(replace(self.index, mean=mean), self._held_parts(), self._technique):
+            for written in fill(replace(self.index, mean=mean), held, self._technique):
                 packed = written
         finally:
             if packed:  # rows packed with the old mean and with the new one must not be mixed
                 self._mean, self._mean_of, self._taken = mean, self._in_file, packed
-
-    def _held_parts(self) -> Iterator[CoarsePart]:
-        """Yield the coarse parts of the places in the index that can be read. The caller may write each part back to
-        the index from slot 0 on: it never overwrites an id that is still needed here."""
-        held = 0
-        for part in self._map.coarse_parts():
-            while held < self._taken and self._slots.place_ids[held] < part[0]:
-                held += 1
-            if held < self._taken and self._slots.place_ids[held] == part[0]:
-                held += 1
-                yield part

@@ -24,7 +24,6 @@ from edgevpr.places.mapfiles import is_of_one_row, sentences
 from edgevpr.places.rows import Content, Unreadable, Values
 
 _OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
-_OF_FINE = "geom, geom_crc32, fine, fine_crc32"
 _OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
 _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
 
@@ -36,16 +35,6 @@ class PlaceMap(MapConnection):
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         super().__init__(path, db, lock)
         self.left_out: dict[int, str] = {}
-
-    @property
-    def map_id(self) -> str | None:
-        """The random id that the map was given when it was created; None if the file has none."""
-        return _text(self.stored.get("map_id"))
-
-    @property
-    def made_by(self) -> str | None:
-        """Name and version of the program that created the map; None if the file has none."""
-        return _text(self.stored.get("made_by"))
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
@@ -110,12 +99,9 @@ class PlaceMap(MapConnection):
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
-        found: Iterable[tuple[int, Values | None]] = self.scan(rows.OF_PLACE)
-        if place_ids is not None:
-            found = ((int(place_id), self.row(int(place_id), rows.OF_PLACE)) for place_id in place_ids)
-        for place_id, row in found:
+        for place_id in [place_id for place_id, _ in self.scan("1")] if place_ids is None else map(int, place_ids):
             with self._named(place_id):
-                place = rows.place_of(place_id, rows.content_of(rows.OF_PLACE, row))
+                place = rows.place_of(place_id, self.row(place_id, rows.OF_PLACE))
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
@@ -131,9 +117,9 @@ class PlaceMap(MapConnection):
     def mean_coarse(self) -> Singles:
         """Return the mean of all coarse parts that can be read, float32 of the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
-        for _, row in self.scan("coarse, coarse_crc32"):
+        for _, row in self.scan(columns := "coarse, coarse_crc32"):
             with suppress(Unreadable):
-                part = rows.part_of(rows.content_of("coarse, coarse_crc32", row), "coarse", self.spec.coarse)
+                part = rows.part_of(rows.content_of(columns, row), "coarse", self.spec.coarse)
                 count += 1
                 mean += (part - mean) / count
         return mean.astype(np.float32)
@@ -144,7 +130,7 @@ class PlaceMap(MapConnection):
         with self._named(place_id):
             if self.spec.fine is None:
                 raise Unreadable("it has no fine part")
-            content = rows.content_of(_OF_FINE, self.row(int(place_id), _OF_FINE))
+            content = self.row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
             point = rows.point_of(content)
             return rows.part_of(content, "fine", self.spec.fine), point
 
@@ -158,8 +144,7 @@ class PlaceMap(MapConnection):
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""
         with self._named(place_id):
-            columns = "landmarks, landmarks_crc32"
-            return rows.landmarks_of(rows.content_of(columns, self.row(int(place_id), columns)))
+            return rows.landmarks_of(self.row(int(place_id), "landmarks, landmarks_crc32"))
 
     def ids_by(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
@@ -173,8 +158,7 @@ class PlaceMap(MapConnection):
         """Return True if a place's coarse part nearly equals `coarse`, so that both are of one picture; False if the
         place cannot be read. Between two runs of a program the last bits of numbers may differ, or a few elements."""
         try:
-            content = rows.content_of("coarse", self.row(place_id, "coarse"))
-            there = rows.part_of(content, "coarse", self.spec.coarse).astype(np.float32)
+            there = rows.part_of(self.row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
         except (Unreadable, PlaceError):
             return False
         here = np.asarray(coarse, np.float32).reshape(there.shape)
@@ -199,7 +183,8 @@ class PlaceMap(MapConnection):
         with sentences(self.path):
             try:
                 row = self.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
-                return _text(json.loads(row[0])) if row else None
+                value = json.loads(row[0]) if row else None
+                return value if isinstance(value, str) else None
             except (ValueError, TypeError, RecursionError):
                 return None
             except sqlite3.Error as error:
@@ -226,7 +211,3 @@ class PlaceMap(MapConnection):
             yield
         except Unreadable as error:
             self.left_out.setdefault(place_id, str(error))
-
-
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None

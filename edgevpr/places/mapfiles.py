@@ -46,12 +46,10 @@ def existing(name: str | Path) -> Path:
     """Return the path of an existing map file. Raises UsageError as `map_path` does, and MapError if the file is
     missing or is not a regular file."""
     path = map_path(name)
-    try:
+    with sentences(path):
         if not path.exists():
             raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
         require_regular(path)
-    except OSError as error:
-        raise _closed(path, error) from error
     return path
 
 
@@ -70,10 +68,8 @@ def lock(path: Path, make: bool = False) -> int:
     map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
     program has the lock, and MapError if the file cannot be opened.
     """
-    try:
+    with sentences(path):
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
-    except OSError as error:
-        raise _closed(path, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -105,13 +101,6 @@ def remove(path: Path) -> None:
     """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
     for each in (path, *beside(path)):
         each.unlink(missing_ok=True)
-
-
-def _closed(path: Path, error: OSError) -> MapError:
-    return MapError(
-        f"{path}: it cannot be opened ({error.strerror}): check the path, and the permissions of the file and its "
-        "folder."
-    )
 
 
 def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection:
@@ -165,10 +154,12 @@ def is_of_one_row(error: sqlite3.Error) -> bool:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite in the body of `with` into a MapError that tells the user what to do; into a MapBusyError
-    if another program is writing."""
+    """Turn errors of SQLite and of the file system in the body of `with` into a MapError that tells the user what to
+    do; into a MapBusyError if another program is writing."""
     try:
         yield
+    except OSError as error:
+        raise MapError(f"{path}: {_ADVICE['unable to open']} ({error.strerror}).") from error
     except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
         said = str(error)
         if "locked" in said:

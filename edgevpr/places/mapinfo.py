@@ -14,7 +14,7 @@ from edgevpr.places.mapfiles import sentences
 Extent = tuple[float, float, float, float]
 
 _SUMMARY = """
-SELECT count(*), count(geom), avg(quality), total(is_low_quality = 1), count(up_deg), avg(footprint_m),
+SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg), avg(footprint_m),
     avg(var_east_m2 + var_north_m2), min(CASE typeof(time) WHEN 'text' THEN time END),
     max(CASE typeof(time) WHEN 'text' THEN time END)
 FROM places
@@ -30,9 +30,9 @@ WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
 class MapInfo:
     """Summary of a map. `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees. Any field is None if no place has
     the value, or if another program wrote it in another form. `with_position` and `with_pose` are numbers of places.
-    `of_low_quality` is the number added only because there would have been too wide a gap. `mean_quality` is 0..1. Of
-    the places with a pose, `footprint_m` is the mean length on the ground of a picture's longest side, and
-    `position_sd_m` the standard deviation of the positions along one axis, as root mean square."""
+    `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
+    `footprint_m` is the mean length on the ground of a picture's longest side, and `position_sd_m` the standard
+    deviation of the positions along one axis, as root mean square."""
 
     path: str
     spec: TechniqueSpec
@@ -41,13 +41,11 @@ class MapInfo:
     extent: Extent | None
     first_time: str | None
     last_time: str | None
-    mean_quality: float | None
     of_low_quality: int
     with_pose: int
     footprint_m: float | None
     position_sd_m: float | None
     file_bytes: int
-    made_by: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +63,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
         summary, extent = (place_map.db.execute(query).fetchone() for query in (_SUMMARY, _EXTENT))
-    places, with_position, quality, of_low_quality, with_pose, footprint_m, var_m2, first, last = summary
+    places, with_position, of_low_quality, with_pose, footprint_m, var_m2, first, last = summary
     is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
         path=str(place_map.path),
@@ -75,13 +73,11 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         extent=extent if with_position and is_extent else None,
         first_time=first,
         last_time=last,
-        mean_quality=quality,
         of_low_quality=int(of_low_quality),
         with_pose=with_pose,
         footprint_m=footprint_m,
         position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
         file_bytes=place_map.path.stat().st_size,
-        made_by=place_map.made_by,
     )
 
 
@@ -98,7 +94,8 @@ def identity_of(place_map: PlaceMap) -> MapIdentity:
     for place in place_map.scan(f"{rows.VALUES}, {rows.SALIENCE}, {rows.POSE}, {rows.CHECKSUMS}"):
         digest.update(repr(place).encode("utf-8", "backslashreplace"))
         places += 1
-    return MapIdentity(place_map.map_id, places, digest.hexdigest())
+    map_id = place_map.stored.get("map_id")
+    return MapIdentity(map_id if isinstance(map_id, str) else None, places, digest.hexdigest())
 
 
 def index_positions(place_map: PlaceMap) -> None:

@@ -66,7 +66,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
             f"{path} has the map format {version}, and this edgevpr reads {FORMAT_VERSION}: update edgevpr, or build "
             "the map again."
         )
-    _require_layer(path, db)
+    _require_columns(path, db)
     return stored
 
 
@@ -96,23 +96,17 @@ def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
     return [f"{name} is {there.get(name)}, not {here.get(name)}" for name in different]
 
 
-def _require_layer(path: Path, db: sqlite3.Connection) -> None:
-    """Raise MapError unless the table of places has the columns, and the kind of geometry, that every map has."""
-    # Generated columns (marked hidden) are refused: they are computed when read, so their size has no limit.
-    there = {name: (hidden, kind, key) for _, name, kind, _, _, key, hidden in db.execute("PRAGMA table_xinfo(places)")}
-    wrong = sorted(name for name in ("place_id", *rows.ALL.split(", ")) if there.get(name, (True,))[0])
-    if wrong or there["place_id"][1:] != ("INTEGER", 1):
+def _require_columns(path: Path, db: sqlite3.Connection) -> None:
+    """Raise MapError unless the table of places has the columns that every map has."""
+    # Generated columns are not in this list: they are computed when read, so their size has no limit.
+    there = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
+    lacking = [name for name in rows.ALL.split(", ") if name not in there]
+    if there.get("place_id") != ("INTEGER", 1):
+        lacking.append("place_id")
+    if lacking:
         raise MapError(
-            f"{path}: its table of places has not the columns of a map ({', '.join(wrong) or 'place_id'}): restore a "
-            "copy or build the map again."
-        )
-    layer = db.execute(
-        "SELECT column_name, upper(geometry_type_name), srs_id FROM gpkg_geometry_columns WHERE table_name = 'places'"
-    ).fetchone()
-    if layer != ("geom", "POINT", geopackage.WGS84):
-        raise MapError(
-            f"{path}: its positions are not points in WGS 84 ({layer}): give the map that edgevpr has made, or export "
-            "the layer again in EPSG:4326."
+            f"{path}: its table of places has not the columns of a map ({', '.join(lacking)}): restore a copy or build "
+            "the map again."
         )
 
 

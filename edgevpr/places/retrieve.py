@@ -1,22 +1,22 @@
 """Retrieval of the places that a query may show: a scan of the whole index, then full comparisons of the best places.
 
 A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number.
-A place that cannot be read is left out from then on, and the others are used. The loss of the right place, or of the
-rival that kept the margin small, must never make a wrong match be accepted that would have been refused. So:
+A place that cannot be read is left out from then on. Its loss must never make a wrong match be accepted that would have
+been refused. So:
 
 * The query in which a place turns out to be unreadable is refused.
 * A place that was left out keeps its row in the index, and so its scan score. A later query that may show it (see
   `Ranking.unread`) is refused, whichever place it matches.
 * A technique without a fine part needs only the row. A place that was left out then keeps its rank and score, and the
   query is refused if that place is the best.
-* If most of the places compared with one query cannot be read, the file is at fault, not the places. The query is
-  refused, and no place is left out: all are used again as soon as the file can be read again.
+* If most of the places compared with one query cannot be read, the file is at fault: the query is refused, and no
+  place is left out.
 """
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -28,9 +28,11 @@ from edgevpr.core.types import Candidate
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 
-T = TypeVar("T")
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
+# The result of scanning all rows of the index: a score per place, float32 (N,), and the score of each hypothesis,
+# float32 (N, H), -inf if it is ruled out (None: there are no hypotheses).
+Scan = tuple[Singles, Singles | None]
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
@@ -67,15 +69,6 @@ class Query:
     expected: Expectation = NOTHING
 
 
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """The result of scanning all rows of the index. `scores` float32 (N,) has one score per place. `by_hypothesis`
-    float32 (N, H) has the score of each hypothesis, -inf if it is ruled out (None: there are no hypotheses)."""
-
-    scores: Singles
-    by_hypothesis: Singles | None
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
     """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
@@ -109,7 +102,7 @@ def scan(query: Query) -> Scan:
     hint: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
         hint |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
-    return Scan(*technique.coarse_scores(query.descriptor, index.rows, index.mean, **hint))
+    return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hint)
 
 
 def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbour_m: float = 0.0) -> Ranking:
@@ -117,16 +110,14 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
 
     If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
     If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
-    compared: exact, but slow. All hypotheses of the expected height are then tried, if nothing else is expected.
+    compared, under all hypotheses of the expected height if nothing else is expected: exact, but slow.
     If all candidates are within `neighbour_m` metres of the best one, the best-scanned places elsewhere are compared as
-    well, for the margin. Without a fine part there is nothing to compare, and the scan scores rank the places. With
-    `TechniqueSpec.scan_counts`, the score is that of the comparison times the mean of the scan score and 1: for a wrong
-    place the two are nearly independent. If `expected.in_reach` is known, the candidates are places in reach, and five
-    out of reach are compared as well, in case the expectation is false; and at least five places elsewhere, because a
-    margin over fewer means little.
+    well, for the margin. Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the
+    score is that of the comparison times the mean of the scan score and 1: for a wrong place the two are nearly
+    independent. If `expected.in_reach` is known, the candidates are places in reach, and five out of reach are compared
+    as well, in case the expectation is false; and at least five elsewhere: a margin over fewer means little.
 
-    Raises PlaceError if a place cannot be read, after all candidates have been tried; the place is then left out (see
-    the module's docstring). Raises MapError if the file cannot be read.
+    Raises PlaceError if a place cannot be read; it is then left out. Raises MapError if the file cannot be read.
     """
     spec, index, in_reach = query.technique.spec, query.index, query.expected.in_reach
     looks = _Comparison(query, scanned, candidates)
@@ -141,23 +132,23 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
         )
     looks.compare(chosen)
     if len(looks.scores) < np.count_nonzero(readable):
-        best = max(looks.scores, key=looks.scores.__getitem__)
-        others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
         compared = list(looks.scores)
-        rivals, enough = np.count_nonzero(others[compared]), 1 if in_reach is None else _COMPARED_ELSEWHERE
-        if rivals < enough:
+        best = max(compared, key=looks.scores.__getitem__)
+        others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
+        rivals = np.count_nonzero(others[compared])
+        if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others[compared] = False
             looks.compare(looks.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals)))
     slots, found = np.array(list(looks.scores), np.intp), np.array(list(looks.scores.values()), np.float32)
     order = np.argsort(-found, kind="stable")
     slots, found = slots[order], found[order]
-    last = sorted((glance for glance in looks.passed_over if glance[1][0] not in looks.scores), key=lambda it: -it[0])
+    last = sorted((each for each in looks.passed_over if each[1][0] not in looks.scores), key=lambda each: -each[0])
     return Ranking(
         slots=np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
         scores=np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
         compared=looks.matches,
-        unread=_unread(scanned.scores, readable, slots[0]),
-        tried=_tried(scanned.by_hypothesis, slots, len(spec.height_ratios)),
+        unread=_unread(scanned[0], readable, slots[0]),
+        tried=_tried(scanned[1], slots, len(spec.height_ratios)),
     )
 
 
@@ -168,12 +159,12 @@ class _Comparison:
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
-        self._query, self._scanned = query, scanned.scores
+        self._query, (self._scanned, by_hypothesis) = query, scanned
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
         self._tries_all = self.is_exact and expected.in_reach is None and expected.turned_deg is None
-        is_any_height = self._tries_all and not technique.spec.height_ratios
-        self._by_hypothesis = None if is_any_height else scanned.by_hypothesis
+        is_any = self._tries_all and not technique.spec.height_ratios
+        self._by_hypothesis = None if is_any else by_hypothesis
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
@@ -190,7 +181,11 @@ class _Comparison:
         chosen = best_scanned(self._scanned, self._by_hypothesis, among, count)
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
-        glances = sorted(self._look_at(chosen, self._glance), key=lambda glance: -glance[0])
+        glances: list[Glance] = []
+        for slot, fine, hypotheses in self._read(chosen):
+            score, likely = self._query.technique.glance(self._query.descriptor, fine, hypotheses)
+            glances.append((self._with_scan(slot, score), (slot, likely)))
+        glances.sort(key=lambda glance: -glance[0])
         self.passed_over += glances[in_full:]
         return [choice for _, choice in glances[:in_full]]
 
@@ -201,27 +196,21 @@ class _Comparison:
         return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
 
     def compare(self, chosen: list[Choice]) -> None:
-        """Compare the chosen places in full. Raises PlaceError if a place cannot be read, after all have been tried;
-        it is then left out. Raises MapError if the file cannot be read."""
+        """Compare the chosen places in full. Raises as `_read` does."""
         if self._has_one_stage:
             self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
             return
-        for (slot, _), match in zip(chosen, self._look_at(chosen, self._match), strict=True):
-            self.matches[slot], self.scores[slot] = match, match.score
-
-    def _match(self, slot: int, fine: Array, hypotheses: list[int] | None) -> FineMatch:
-        match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
-        return replace(match, score=self._with_scan(slot, match.score))
-
-    def _glance(self, slot: int, fine: Array, hypotheses: list[int] | None) -> Glance:
-        score, best = self._query.technique.glance(self._query.descriptor, fine, hypotheses)
-        return self._with_scan(slot, score), (slot, best)
+        for slot, fine, hypotheses in self._read(chosen):
+            match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
+            self.scores[slot] = self._with_scan(slot, match.score)
+            self.matches[slot] = replace(match, score=self.scores[slot])
 
     def _with_scan(self, slot: int, score: float) -> float:
         return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
 
-    def _look_at(self, chosen: list[Choice], look: Callable[[int, Array, list[int] | None], T]) -> list[T]:
-        found: list[T] = []
+    def _read(self, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
+        """Yield the slots of the chosen places with their fine parts and hypotheses. Raises PlaceError if a place
+        cannot be read, after all have been tried; it is then left out. Raises MapError if the file cannot be read."""
         unreadable, place_map, index = [], self._query.place_map, self._query.index
         for slot, hypotheses in chosen:
             try:
@@ -229,11 +218,10 @@ class _Comparison:
                 _require_there(place_map, index, slot, point)
             except PlaceError as error:
                 unreadable.append(error)
-                continue
-            found.append(look(slot, fine, hypotheses))
+            else:
+                yield slot, fine, hypotheses
         if unreadable:
             raise _left_out_now(place_map, unreadable, len(chosen))
-        return found
 
 
 def together(one: Ranking, other: Ranking) -> Ranking:
@@ -250,12 +238,11 @@ def together(one: Ranking, other: Ranking) -> Ranking:
                 last[slot] = max(score, last.get(slot, score))
     scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
     scores |= {slot: min(last[slot], least) for slot in sorted(last, key=lambda slot: -last[slot])}
-    unread = np.union1d(one.unread, other.unread).astype(np.intp)
     return Ranking(
         slots=np.array(list(scores), np.intp),
         scores=np.array(list(scores.values()), np.float32),
         compared=compared,
-        unread=unread,
+        unread=np.union1d(one.unread, other.unread).astype(np.intp),
         tried=min(1.0, one.tried + other.tried),
     )
 
@@ -349,8 +336,8 @@ def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: Lat
 
 
 def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Return the error to raise for `unreadable` places, of `tried` that were read. If they are most of these, the file
-    is at fault: return one error about it. Else enter them in `left_out`, and return the error of the first."""
+    """Return the error to raise for `unreadable` ones of the places `tried`. If they are most, the error is about the
+    file; else they are entered in `left_out`, and the error is about the first."""
     first = unreadable[0]
     if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
         return MapError(

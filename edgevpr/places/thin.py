@@ -10,18 +10,10 @@ from edgevpr.core.geodesy import metres
 _BLOCK = 256  # places in a block; the least worth in each block is stored, to find the least of all quickly
 
 
-def best_places(
-    lat_deg: Floats,
-    lon_deg: Floats,
-    quality: Floats,
-    capacity: int,
-    numbers: Ints | None = None,
-) -> Ints:
+def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
     """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
 
-    `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,). `numbers` int (N,), ascending, are the
-    numbers of the places, which count also places dropped before (None: none were dropped). The distance between two
-    places without a position is estimated from their numbers.
+    `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
 
     Places are dropped one at a time, always the one of least worth. The worth of a place is its quality times the
     distance to the nearer of its two remaining neighbours along the track. So gaps stay small, and places of high
@@ -32,13 +24,12 @@ def best_places(
         return np.arange(count)
     east_m, north_m = metres(lat_deg, lon_deg)
     # If a position is unknown, the median distance of successive places is used instead.
-    number = np.arange(count) if numbers is None else numbers
-    steps_m = np.hypot(np.diff(east_m), np.diff(north_m)) / np.diff(number)
+    steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
     usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
 
     def apart_m(a: int, b: int) -> float:
         away_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
-        return usual_m * float(number[b] - number[a]) if math.isnan(away_m) else away_m
+        return usual_m * (b - a) if math.isnan(away_m) else away_m
 
     def worth(before: int, at: int, after: int) -> float:
         if before < 0 or after >= count:
@@ -47,7 +38,7 @@ def best_places(
         nearer_m = min(apart_m(before, at), apart_m(at, after))
         return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
 
-    # No lists, and few arrays: in flight, the index has already taken the whole memory budget.
+    # No lists, and few arrays: a map may have a million places.
     before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
     worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # places that were dropped have infinite worth too
     for at in range(count):

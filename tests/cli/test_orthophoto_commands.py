@@ -41,7 +41,7 @@ def run(*command: str) -> int:
 def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, capsys):
     place_map, flight = tmp_path / "m.gpkg", tmp_path / "flight"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 25)
-    assert run("map", "build", place_map, *cut, "--area", track, "--margin-m", 30, "--json") == 0
+    assert run("map", "build", place_map, *cut, "--area", track, "--json") == 0
     built = json.loads(capsys.readouterr().out)
     assert built["technique"] == "cohog"
     assert 15 <= built["places"] == built["added"]
@@ -102,7 +102,6 @@ def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, cap
             2,
             "give nadir",
         ),
-        (["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--margin-m", "5"], 2, "with --area"),
         (["--orthophoto", "GROUND", "--footprint-m", "8000", "--spacing-m", "20"], 2, "--footprint-m is 8000"),
         (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),
     ],
@@ -160,7 +159,7 @@ def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, g
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
     monkeypatch.setattr(calibrate, "asked_of", lambda technique: 6)
     path = tmp_path / "m.gpkg"
-    cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 40, "--area", track, "--margin-m", 30)
+    cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)
     assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0
     built = json.loads(capsys.readouterr().out)
     assert built["places"] == 6

@@ -17,7 +17,7 @@ from map_writer import SPEC, descriptor, frame, make_map
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Position
-from edgevpr.places.examine import absorb, repair, shrink
+from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import index_positions, info_of, nearest_m
@@ -168,16 +168,16 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
     with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
         for number in (8, 9, 10, 11):
             other.add(frame(number), descriptor(number))
-    with PlaceMap.open_for_adding(map_path) as place_map, PlaceMap.open(tmp_path / "other.gpkg") as other:
-        assert absorb(place_map, other) == (2, 2)
-        assert len(place_map) == 12
-        assert info_of(place_map).extent[2] == pytest.approx(50.0011)
-        np.testing.assert_array_equal(place_map.fine_part(12)[0], descriptor(11).fine)
-    different = dataclasses.replace(SPEC, parameters={"seed": 3})
-    with PlaceMap.create(tmp_path / "third.gpkg", different) as third, PlaceMap.open(map_path) as place_map:
-        with pytest.raises(MapError, match="seed"):
-            absorb(third, place_map)
-        assert len(third) == 0
+    assert merge([map_path, other.path], tmp_path / "both.gpkg") == ([(10, 0), (2, 2)], False)
+    with PlaceMap.open(tmp_path / "both.gpkg") as both:
+        assert len(both) == 12
+        assert info_of(both).extent[2] == pytest.approx(50.0011)
+        np.testing.assert_array_equal(both.fine_part(12)[0], descriptor(11).fine)
+    with PlaceMap.create(tmp_path / "third.gpkg", dataclasses.replace(SPEC, parameters={"seed": 3})) as third:
+        pass
+    with pytest.raises(MapError, match="seed"):
+        merge([third.path, map_path], tmp_path / "none.gpkg")
+    assert not (tmp_path / "none.gpkg").exists()
 
 
 @pytest.mark.parametrize("value", ["", "7", "null", "{", "[" * 100_000, b"\xff"])
@@ -202,7 +202,7 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
     assert shrink(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
     with contextlib.closing(sqlite3.connect(map_path)) as db, db:
         db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 2")
-    repair(map_path, lambda places, total: places)
+    repair(map_path)
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
         for each in (repaired, small):
             assert (each.mask_sha256, each.calibration) == ("m", "how sure")

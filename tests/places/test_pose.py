@@ -8,7 +8,7 @@ from test_mapfile import SPEC, descriptor, frame
 
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Pose, Position
-from edgevpr.places.examine import absorb, examine
+from edgevpr.places.examine import examine, merge
 from edgevpr.places.mapfile import PlaceMap
 
 POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
@@ -26,14 +26,17 @@ def posed(tmp_path):
 
 
 def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path):
-    with PlaceMap.open(posed) as place_map, PlaceMap.create(tmp_path / "copy.gpkg", SPEC) as copy:
-        assert absorb(copy, place_map) == (2, 0)
+    assert merge([posed], tmp_path / "copy.gpkg") == ([(2, 0)], False)
+    with PlaceMap.open(posed) as place_map, PlaceMap.open(tmp_path / "copy.gpkg") as copy:
         for each in (place_map, copy):
             first, second = each.places()
             assert first.pose == POSE
             assert second.pose is None
             assert (each.landmarks_of(1), each.landmarks_of(2)) == (LANDMARKS, None)
-            assert {(found.problem, found.has_checksums) for found in examine(each)} == {(None, True)}
+            assert {found.problem for found in examine(each)} == {None}
+            assert (
+                None not in each.db.execute("SELECT geom_crc32, coarse_crc32 FROM places WHERE place_id = 2").fetchone()
+            )
 
 
 @pytest.mark.parametrize(
