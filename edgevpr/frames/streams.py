@@ -1,4 +1,4 @@
-"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken, estimated by the time
+"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken, estimated by the
 stamps of the stream (`StampedTime`) or without (`UnstampedTime`). A thread receives packets as they come (`Arrivals`),
 the thread of `frames.live` decodes them (`StreamCapture`)."""
 
