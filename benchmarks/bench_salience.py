@@ -28,7 +28,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.salience_gate import Thresholds, maps_of, scores_of, worth_of
+from edgevpr.runtime.recognise.salience_gate import Thresholds, scores_of, worth_of
 from edgevpr.techniques.card import load_card
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
@@ -94,13 +94,11 @@ def speeds(network: str, there: list[str]) -> dict[str, float]:
     memorability = Memorability(load_card(network))
     found = {name: Detector(load_card(name)) for name in there}
     ways = {
-        "entropy": lambda: scores_of(maps_of(picture, None, None)),
-        "entropy and memorability": lambda: scores_of(maps_of(picture, memorability, None)),
+        "entropy": lambda: scores_of(picture),
+        "entropy and memorability": lambda: scores_of(picture, memorability),
     }
     for name, each in found.items():
-        ways[f"all three, {name}"] = lambda each=each: scores_of(
-            maps_of(picture, memorability, each.is_static(picture))
-        )
+        ways[f"all three, {name}"] = lambda each=each: scores_of(picture, memorability, each.is_static(picture))
     times_ms: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(31):  # in turn, so that a busy moment hits all of them; the first round only warms
         for name, way in ways.items():
@@ -160,10 +158,10 @@ def gated(
 def scores_by_gate(path: Path, memorability: Memorability, detector: Detector | None) -> dict[str, Salience]:
     """Return the scores of a picture under each gate. A criterion alone knows nothing of what moves, but staticity."""
     picture = read_image(path)
-    still = scores_of(maps_of(picture, memorability, None))
+    still = scores_of(picture, memorability)
     if detector is None:
         return dict.fromkeys(GATES, still)
-    moving = scores_of(maps_of(picture, memorability, detector.is_static(picture)))
+    moving = scores_of(picture, memorability, detector.is_static(picture))
     return {gate: moving if gate in ("all three", "staticity") else still for gate in GATES}
 
 

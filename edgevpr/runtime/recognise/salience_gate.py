@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Image, Mask, Singles
+from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
@@ -28,17 +28,6 @@ _STEPS_BELOW = 3.2
 _LEAST_STEP = 0.005
 # Longer side of the copy on which entropy is computed: a larger one costs more and gives the same.
 _LONGEST_PX = 320
-_WIDTH_PX, _CAPTION_PX, _WEIGHT = 480, 34, 0.55  # sizes of a drawn panel; weight of its colours
-
-
-@dataclass(frozen=True, slots=True)
-class Maps:
-    """Maps of one picture, (H, W) each: `memorability` float32 in 0..1 and `is_static` bool (None: not computed), and
-    `entropy` float32 in 0..1 (bits over 8)."""
-
-    memorability: Singles | None
-    is_static: Mask | None
-    entropy: Singles
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +80,7 @@ class Gate:
 
     def look(self, image: Image) -> Worth:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
-        scores = scores_of(self.maps(image))
+        scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
         # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
         usual = self.thresholds.entropy / 2
@@ -100,15 +89,14 @@ class Gate:
             usual = float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
         return worth_of(scores, self.thresholds, usual)
 
-    def maps(self, image: Image) -> Maps:
-        """Compute the maps of salience of a frame: memorability, staticity and entropy of its pixels. Raises ModelError
-        as `look` does."""
+    def scores(self, image: Image) -> Salience:
+        """Return the scores of a frame. Raises ModelError as `look` does."""
         if self._detector:
             if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
                 self._static, self._until_detection = None, self._detect_every  # None, if the detector fails
                 self._static = self._detector.is_static(image, self._footprint_m)
             self._until_detection -= 1
-        return maps_of(image, self._memorability, self._static)
+        return scores_of(image, self._memorability, self._static)
 
 
 def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> Worth:
@@ -131,8 +119,9 @@ def best_of(shortfalls: list[float]) -> list[bool]:
     return [bool(step == steps.min()) for step in steps]
 
 
-def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | None) -> Maps:
-    """Compute the maps of uint8 (H, W[, 3]); their longer side has 320 pixels at most.
+def scores_of(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
+    """Return the scores of uint8 (H, W[, 3]): the means over its pixels, of a copy whose longer side has 320 at most.
+    Pixels that are not static count as 0 in the other two scores, because a picture with many of them is worth less.
 
     `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
     """
@@ -145,38 +134,10 @@ def maps_of(image: Image, memorability: Memorability | None, is_static: Mask | N
     if is_static is not None:
         covered = cv2.resize((~is_static).astype(np.float32), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         is_static = covered < 0.5
-    return Maps(
-        memorability=None if memorability is None else as_map(memorability.matrix(image), grey.shape),
-        is_static=is_static,
-        entropy=filled_bins(grey),
-    )
-
-
-def scores_of(maps: Maps) -> Salience:
-    """Average each map over the picture. Pixels that are not static count as 0 in the other two maps, because a picture
-    with many of them is worth less."""
-    static = 1.0 if maps.is_static is None else maps.is_static
+    static = 1.0 if is_static is None else is_static
+    memorable = None if memorability is None else as_map(memorability.matrix(image), grey.shape)
     return Salience(
-        memorability=None if maps.memorability is None else float((maps.memorability * static).mean()),
-        staticity=None if maps.is_static is None else float(maps.is_static.mean()),
-        entropy=float((maps.entropy * static).mean()),
+        memorability=None if memorable is None else float((memorable * static).mean()),
+        staticity=None if is_static is None else float(is_static.mean()),
+        entropy=float((filled_bins(grey) * static).mean()),
     )
-
-
-def drawn_as_png(image: Image, maps: Maps, salience: Salience) -> bytes:
-    """Draw a picture, and its three maps over it, as four panels in a PNG file. Blue is low, red is high."""
-    size = _WIDTH_PX, round(_WIDTH_PX * image.shape[0] / image.shape[1])
-    colour = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    ground = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
-    scores = [f"{name} {'off' if score is None else f'{score:.2f}'}" for name, score in salience.scores.items()]
-    layers = (None, maps.memorability, maps.is_static, maps.entropy / MOST_ENTROPY)
-    panels = []
-    for caption, values in zip(["picture", *scores], layers, strict=True):
-        panel = ground
-        if values is not None:
-            levels = cv2.resize(np.clip(values * 255.0, 0, 255).astype(np.uint8), size)
-            panel = cv2.addWeighted(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), _WEIGHT, ground, 1 - _WEIGHT, 0)
-        panel = cv2.copyMakeBorder(panel, _CAPTION_PX, 6, 6, 6, cv2.BORDER_CONSTANT, value=(255,) * 3)
-        cv2.putText(panel, caption, (10, _CAPTION_PX - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (40,) * 3, 1, cv2.LINE_AA)
-        panels.append(panel)
-    return cv2.imencode(".png", np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])]))[1].tobytes()

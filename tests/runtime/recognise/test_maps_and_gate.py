@@ -1,19 +1,20 @@
-"""The three maps, their scores, and what passes the gate."""
+"""The three scores, and what passes the gate."""
 
 import numpy as np
 import pytest
 
 from edgevpr.core.types import Salience
 from edgevpr.frames.images import cv2
+from edgevpr.runtime.recognise.gate_networks import as_map
 from edgevpr.runtime.recognise.salience_gate import (
     MOST_ENTROPY,
     Gate,
     Thresholds,
     best_of,
-    maps_of,
     scores_of,
     worth_of,
 )
+from edgevpr.techniques.entropy import filled_bins
 
 RNG = np.random.default_rng(5)
 
@@ -34,24 +35,24 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     picture = texture()
     static = np.ones(picture.shape, bool)
     static[:, 120:] = False
-    maps = maps_of(picture, Half(), static)
-    scores = scores_of(maps)
+    scores = scores_of(picture, Half(), static)
     assert scores.staticity == pytest.approx(0.75)
-    assert scores.memorability == pytest.approx(maps.memorability[:, :120].sum() / picture.size, abs=1e-6)
-    assert scores.entropy == pytest.approx(maps.entropy[:, :120].sum() / picture.size, abs=1e-6)
-    alone = scores_of(maps_of(picture, None, None))
+    memorable = as_map(Half().matrix(picture), picture.shape)
+    assert scores.memorability == pytest.approx(memorable[:, :120].sum() / picture.size, abs=1e-6)
+    assert scores.entropy == pytest.approx(filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
+    alone = scores_of(picture)
     assert (alone.memorability, alone.staticity) == (None, None)
     assert alone.entropy > scores.entropy
 
 
-def test_a_large_picture_and_one_of_a_single_pixel_have_maps():
-    assert max(maps_of(np.zeros((900, 1200, 3), np.uint8), Half(), None).entropy.shape) == 320
-    assert maps_of(np.zeros((1, 700), np.uint8), None, None).entropy.shape == (1, 320)
-    assert scores_of(maps_of(np.zeros((1, 1), np.uint8), None, None)).entropy == 0
+def test_a_large_picture_and_one_of_a_single_pixel_have_scores():
+    assert scores_of(np.zeros((900, 1200, 3), np.uint8), Half()).memorability == pytest.approx(0.5, abs=0.02)
+    for shape in ((1, 700), (1, 1)):
+        assert scores_of(np.zeros(shape, np.uint8)).entropy == 0
 
 
 def test_no_picture_has_more_entropy_than_its_disc_has_pixels():
-    assert scores_of(maps_of(RNG.integers(0, 256, (200, 200), np.uint8), None, None)).entropy < MOST_ENTROPY < 0.793
+    assert scores_of(RNG.integers(0, 256, (200, 200), np.uint8)).entropy < MOST_ENTROPY < 0.793
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,7 @@ def test_in_bad_light_less_entropy_is_asked_for():
 def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
     gate = Gate(Thresholds(entropy=0.4))
     little = texture()
-    while not 0.2 < scores_of(maps_of(little, None, None)).entropy < 0.4:
+    while not 0.2 < scores_of(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
     assert [gate.look(little).reason for _ in range(4)] == [None] * 4
     assert all(gate.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
