@@ -82,11 +82,8 @@ def network_output(name: str) -> str | None:
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     """Make the technique `name`. `settings` are values of its parameters by name (None: all defaults); a text is
-    converted to the type of its parameter. Parameters that are not in `settings` keep their defaults.
-
-    Raises UsageError for an unknown technique or parameter, a value that cannot be read, or one out of range, and
-    ModelError for a network that cannot be used.
-    """
+    converted to the type of its parameter. Raises UsageError for an unknown technique or parameter, a value that cannot
+    be read, or one out of range, and ModelError for a network that cannot be used."""
     defaults = parameters(name)
     values = {}
     for key, value in (settings or {}).items():

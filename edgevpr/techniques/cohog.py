@@ -199,11 +199,8 @@ class CoHog:
         nadir camera they are layouts uint8 (N, 1120), compared from the one of five heights that is nearest to
         `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera since each place was mapped:
         only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Only places `in_reach`, bool
-        (N,), are looked at closer (None: all).
-
-        Returns scores float32 (N,) in 0..1 and, with a nadir camera, the score of each hypothesis, float32 (N, 120): 24
-        rotations from each height, -inf if not tried.
-        """
+        (N,), are looked at closer (None: all). Returns scores float32 (N,) in 0..1 and, with a nadir camera, the score
+        of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
         if not self._is_nadir:
             views = self._views_of(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255

@@ -165,13 +165,12 @@ def _weights(counts: tuple[float, ...]) -> Singles:
 def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
     region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
-    grid. Only pairs that agree on the shift of the `match` are used. Returns the match with the exact position: after
-    turning the query's picture and scaling it, its middle lies at the shift from that of the place's, and the
-    covariance is that of the distances by which single regions miss the fit. Returns the match as it is if fewer than 8
-    pairs agree, or if the rotation or scale found belongs to another hypothesis.
+    grid. Only pairs that agree on the shift of the `match` are used. The vote knows the shift in whole cells only, and
+    regions far from the middle miss, so the fit is repeated, each time with the regions that agree with the last one.
 
-    The vote knows the shift in whole cells, and rotation and scale only as those of the hypothesis, so regions far from
-    the middle miss. So the fit is repeated, each time with the regions that agree with the last one.
+    Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
+    from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
+    it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis.
     """
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)

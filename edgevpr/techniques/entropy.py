@@ -30,9 +30,7 @@ _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 
 def filled_bins(grey: Bytes) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
-
-    `grey` is uint8 (H, W); returns float32 (H, W) in 0..1.
-    """
+    uint8 (H, W) to float32 (H, W) in 0..1."""
     padded = _replicated(grey)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
@@ -42,11 +40,8 @@ def filled_bins(grey: Bytes) -> Singles:
 
 
 def shannon(grey: Bytes) -> Array:
-    """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up.
-
-    The authors' public code computes this, where the thesis's text has `filled_bins`. `grey` is uint8 (H, W); returns
-    float32 (H, W) in 0..1.
-    """
+    """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up,
+    as the authors' public code does: uint8 (H, W) to float32 (H, W) in 0..1."""
     height, width = grey.shape
     return cv2.resize(_shannon_of(_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
 

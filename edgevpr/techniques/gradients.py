@@ -121,11 +121,11 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     """Compute the same sums as `_vote_by_angle` for 8 orientations over 360 degrees, but faster: without angles,
     branches or scattered sums.
 
-    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant. The
-    orientation of the diagonal gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the
-    x axis if g < 0. v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi) need no angle, and g = v (_P m + _R u) / (_Q m +
-    u) to 2e-6 m. Each plane is summed over the cells once as it is, and once with its sign bits flipped by those of dx,
-    dy or both, which tell diagonal and direction. Sums and differences of these sums are the orientations.
+    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant, whose
+    orientation gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g <
+    0. With v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is
+    summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums and
+    differences of these sums are the orientations.
     """
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
@@ -177,11 +177,9 @@ def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, A
 
 
 def normalised_blocks(cells: Singles) -> Singles:
-    """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3).
-
-    `cells` is float32 (rows, cols, L); returns float32 (rows-1, cols-1, 4L) in the order top left, top right, bottom
-    left, bottom right. A block without any gradient is all zeros.
-    """
+    """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3): float32
+    (rows, cols, L) to (rows-1, cols-1, 4L) in the order top left, top right, bottom left, bottom right. A block without
+    any gradient is all zeros."""
     blocks = np.concatenate([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=2)
     length = np.sqrt(np.add.reduce(blocks * blocks, axis=2))
     blocks /= np.maximum(length, 1e-6)[:, :, None]
@@ -197,12 +195,10 @@ def unit_rows(rows: Singles) -> Singles:
 @lru_cache
 def slow_patterns(bins: int) -> Singles:
     """Return the patterns of low ("slow") frequency, which hold most of the information of a block of 2x2 cells of
-    `bins` orientations: float32 (4 * bins, patterns), one per column, orthonormal. This matrix shortens the blocks.
-
-    A pattern is a wave over the cells (mean, left against right, top against bottom, diagonal against diagonal) times a
-    wave over the orientations (a frequency of the Fourier series). Of the 32 patterns of 8 orientations, this returns
-    the 20 with the most power on the data sets used for tuning: comparing blocks is faster, and recall does not fall.
-    """
+    `bins` orientations: float32 (4 * bins, patterns), one per column, orthonormal. A pattern is a wave over the cells
+    (mean, left against right, top against bottom, diagonal against diagonal) times a wave over the orientations. Of the
+    32 patterns of 8 orientations these are the 20 with the most power on the tuning sets: comparing blocks is faster,
+    and recall does not fall."""
     frequency = _frequencies(bins)
     return np.vstack(
         [

@@ -111,14 +111,14 @@ def netvlad(
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
-    learned = load_words(model, "vlad", words)
-    sharpness = sharpness_of(learned.words) if assignment == "soft" else None
+    learned, sha256 = load_words(model, "vlad", words)
+    sharpness = sharpness_of(learned) if assignment == "soft" else None
 
     def head(features: Singles) -> Singles:
-        return vlad(local_descriptors(features), learned.words, sharpness)
+        return vlad(local_descriptors(features), learned, sharpness)
 
     parameters = {"model": model, "words": words, "assignment": assignment}
-    return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=learned.sha256)
+    return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
 
 
 def region_vlad(
@@ -133,13 +133,13 @@ def region_vlad(
     which finds fewer places on the data sets used for tuning.
     """
     backbone = region_backbone("region_vlad", model, threads, regions)
-    learned = load_words(model, "regions", words)
+    learned, sha256 = load_words(model, "regions", words)
 
     def head(features: Singles) -> Singles:
-        return vlad(describe(features, find_regions(features, regions)), learned.words)
+        return vlad(describe(features, find_regions(features, regions)), learned)
 
     parameters = {"model": model, "regions": regions, "words": words}
-    return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=learned.sha256)
+    return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
 
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
@@ -172,10 +172,10 @@ def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> Net
 def pyramid(features: Singles, levels: int) -> Singles:
     """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C * sum of
     n^2,), the largest activation of each channel in each cell of one grid of n x n after the other, n = 1 to `levels`.
+    Raises ModelError for a feature map smaller than a grid.
 
-    Cell i of n covers floor(i H / n) to ceil((i + 1) H / n), so that no activation is left out. The levels 1 to 4 (30
-    cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet (Chen et al. 2017),
-    which leaves out the row and column between two cells. Raises ModelError for a feature map smaller than a grid.
+    The levels 1 to 4 (30 cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet
+    (Chen et al. 2017), which leaves out the row and column between two cells. Here no activation is left out.
     """
     _, height, width = features.shape
     if levels > min(height, width):
@@ -194,13 +194,14 @@ def pyramid(features: Singles, levels: int) -> Singles:
 
 
 def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
-    """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), in a form that
-    fits a small board. It keeps the Euclidean length on average. The same `seed` always gives the same projection.
+    """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), which keeps
+    angles, and lengths on average. The same `seed` always gives the same projection. Raises ModelError if `length` is
+    larger than `size`.
 
-    A matrix of Gaussian values keeps the angles between vectors. For the 43 008 activations of CALC and 1064 dimensions
-    it takes 183 MB. Here its rows are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
-    activation (Hinrichs and Vybíral 2011): angles are kept as well, and the product is a correlation, which the Fourier
-    transform computes in a twentieth of the time. Raises ModelError if `length` is larger than `size`.
+    For the 43 008 activations of CALC and 1064 dimensions a matrix of Gaussian values takes 183 MB. Here its rows are
+    the cyclic shifts of *one* Gaussian vector, applied after a random sign for each activation (Hinrichs and Vybíral
+    2011): angles are kept as well, and the product is a correlation, computed by the Fourier transform in a twentieth
+    of the time.
     """
     if length > size:
         raise ModelError(
@@ -217,12 +218,9 @@ def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles]
 
 
 def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
-    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed.
-
-    The same seed must give the same matrix for as long as a map is used. NumPy promises that for the raw numbers of its
-    bit generators, not for `standard_normal` (NEP 19). So both come from the raw 64-bit numbers of PCG64: first two for
-    each pair of Gaussian values (Box and Muller 1958), then one for each sign.
-    """
+    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. The same seed must
+    give the same numbers for as long as a map is used, which NumPy promises for the raw numbers of PCG64 only (NEP 19):
+    first two for each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
     pairs = -(-size // 2)
     raw = np.random.PCG64(seed).random_raw(2 * pairs + size)
     uniform = ((raw[: 2 * pairs] >> np.uint64(11)) + 0.5) * 2.0**-53  # never 0

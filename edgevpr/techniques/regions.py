@@ -94,17 +94,17 @@ def cross_region_bow(
     `conv5_2`; a card names one feature map, which is used for both.
     """
     backbone = region_backbone("cross_region_bow", model, threads, regions)
-    learned = load_words(model, "bow", words)
+    learned, sha256 = load_words(model, "bow", words)
 
     def described(features: Singles) -> tuple[Singles, Singles]:
         found = describe(features, find_regions(features, regions))
         padded = np.zeros((regions, len(features)), np.float32)
         padded[: len(found)] = found
-        return bag_of_words(found, learned.words), padded
+        return bag_of_words(found, learned), padded
 
     # With the shipped weights every wrong match had a margin below 0.056 in every form (see `network`).
     parameters = {"model": model, "regions": regions, "words": words}
-    spec = {"name": "cross_region_bow", "parameters": parameters, "model_sha256": learned.sha256}
+    spec = {"name": "cross_region_bow", "parameters": parameters, "model_sha256": sha256}
     return RegionTechnique(backbone, described, np.any, **spec, form=form, margins=(0.07,) * 3)
 
 
@@ -117,12 +117,10 @@ def region_backbone(technique: str, model: str, threads: int, regions: int) -> B
 
 
 def square_regions(height: int, width: int) -> list[Square]:
-    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2), in its cells.
-
-    At scale l the squares are 2 min(H, W) / (l + 1) wide. There are l along the short side and l + m - 1 along the long
-    one, evenly spaced. m is the number that brings the overlap of two neighbours at the first scale closest to 40 %.
-    Raises ModelError for a feature map less than 2 wide.
-    """
+    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2). At scale l they
+    are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one. m is the
+    number that brings the overlap of two neighbours at the first scale closest to 40 %. Raises ModelError for a feature
+    map less than 2 wide."""
     short, long = min(height, width), max(height, width)
     if 2 * short // (_RMAC_SCALES + 1) < 1:
         raise ModelError(
@@ -155,10 +153,8 @@ def _starts(length: int, side: int, count: int) -> list[int]:
 
 def find_regions(features: Singles, count: int) -> Ints:
     """Find the `count` regions of the highest energy in a feature map float32 (C, H, W), or all if there are fewer.
-
-    Returns boxes int (N, 4) in cells of the feature map, highest energy first: (top, left, bottom, right), bottom and
-    right excluded. Regions of equal energy are ordered by channel, from the top, then from the left.
-    """
+    Returns boxes int (N, 4) in its cells, highest energy first: (top, left, bottom, right), bottom and right excluded.
+    Regions of equal energy are ordered by channel, from the top, then from the left."""
     channels, height, width = features.shape
     # All channels in one tall picture, an empty row between them: one search instead of one per channel.
     tall = np.zeros((channels, height + 1, width), np.float32)
@@ -190,8 +186,8 @@ def describe(features: Singles, boxes: Ints) -> Singles:
 
 def mutual_score(query: Singles, place: Singles) -> float:
     """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
-    the mutual pairs, of which each is the other's best match (negative ones count 0), divided by the larger number of
-    regions. All-zero rows are not regions. The papers do not divide, and pictures with few regions score low there."""
+    the mutual pairs, of which each is the other's best match, over the larger number of regions (by which the papers do
+    not divide). Negative cosines count 0; all-zero rows are not regions."""
     regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not regions_of_query or not regions_of_place:
         return 0.0

@@ -131,9 +131,7 @@ def import_onnxruntime() -> Any:
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
     """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs, ordered as `names`.
-
-    Raises ModelError for a run that fails, and for numbers that are not finite or beyond 1e12.
-    """
+    Raises ModelError for a run that fails, and for numbers that are not finite or beyond 1e12."""
     try:
         results: list[Array] = session.run(names, {session.get_inputs()[0].name: pictures})
     except Exception as error:  # onnxruntime's own classes, and RuntimeError

@@ -32,12 +32,11 @@ class VectorTechnique:
     """Base class of the techniques that describe a picture by one vector, and compare it with the vectors of all places
     in RAM; a subclass implements `vector`. `form` says how the vectors are kept in RAM, see above.
 
-    `similarity` is "cosine" or "l1"; the form `1bit` always compares by Hamming distance. All scores are 0 to 1.
-    For "cosine", the score in the form `float` is the cosine (0 if negative), and in `8bit` it is (1 + cosine) / 2 of
-    the vectors from which the map's mean is subtracted. For "l1" it is 1 / (1 + distance). In `1bit` it is the
-    share of equal bits. `margins` are the minimum margins of an accepted match in the forms `float`, `8bit` and `1bit`,
-    known for the shipped weights. With another `model` no match is accepted until the configuration sets a minimum
-    margin.
+    All scores are 0 to 1. With `similarity` "cosine", the score in the form `float` is the cosine (0 if negative), and
+    in `8bit` it is (1 + cosine) / 2 of the vectors from which the map's mean is subtracted. With "l1" it is 1 / (1 +
+    distance). In `1bit` it is always the share of equal bits. `margins` are the minimum margins of an accepted match in
+    the forms `float`, `8bit` and `1bit`, known for the shipped weights. With another `model` no match is accepted until
+    the configuration sets a minimum margin.
     """
 
     candidates = 1  # there is no fine part to compare
@@ -166,12 +165,9 @@ class VectorTechnique:
 
 
 class Hog(VectorTechnique):
-    """`hog`: one histogram-of-oriented-gradients vector for the whole image, compared by cosine. It has length 1 and is
-    kept in half precision (286 KB per place by default).
-
-    Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey (`w1`), cells of 8x8 pixels (`cell`), blocks of 2x2
-    cells with a stride of one cell, 9 orientations (`bins`) over 180 degrees.
-    """
+    """`hog`: one histogram-of-oriented-gradients vector for the whole image, of length 1, compared by cosine (286 KB
+    per place by default). Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey (`w1`), cells of 8x8 pixels
+    (`cell`), blocks of 2x2 cells with a stride of one cell, 9 orientations (`bins`) over 180 degrees."""
 
     def __init__(self, w1: int = 512, cell: int = 8, bins: int = 9, form: str = "float") -> None:
         if not (cell >= 2 and w1 % cell == 0 and 2 * cell <= w1 <= 4096 and 2 <= bins <= 64):

@@ -5,7 +5,6 @@ models/recipes/ writes the file of the words; the techniques in `network` and `r
 import hashlib
 import io
 import zipfile
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,19 +17,11 @@ _MAX_FILE_BYTES = 500_000_000  # 65,536 words of 2,048 numbers
 _TINY = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
-    """Learned visual words `words`, float32 (K, D). `sha256` is the hash of network and words together, which a map
-    stores."""
-
-    words: Singles
-    sha256: str
-
-
-def load_words(model: str, kind: str, count: int) -> Words:
+def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-    Raises ModelError, which ends with the command that makes the file, if it is missing or damaged, or if they were
-    learned on another network (see `Card.fingerprint`)."""
+    Returns them, float32 (K, D), and the hash of network and words together, which a map stores. Raises ModelError,
+    which ends with the command that makes the file, if it is missing or damaged, or if the words were learned on
+    another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
     recipe = "python models/recipes/train_words.py"
     command = f"make them with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
@@ -53,7 +44,7 @@ def load_words(model: str, kind: str, count: int) -> Words:
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
-    return Words(words, sha256)
+    return words, sha256
 
 
 def unit(vectors: Array) -> Array:
@@ -69,12 +60,10 @@ def local_descriptors(features: Singles) -> Singles:
 
 
 def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
-    """Compute VLAD of the descriptors `local` (N, D) about `words` (K, D): float32 (K * D,).
-
-    The part of word k is V(k) = sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). Each
-    part is scaled to length 1 (Arandjelović and Zisserman 2013), then the whole. The weight a_k is 1 for the word
-    nearest to x and 0 for the others (`sharpness` None), or that of `soft_weights`.
-    """
+    """Compute VLAD of the descriptors `local` (N, D) about `words` (K, D): float32 (K * D,). The part of word k is the
+    sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). The weight a_k is 1 for the word
+    nearest to x and 0 for the others (`sharpness` None), or that of `soft_weights`. Each part is scaled to length 1
+    (Arandjelović and Zisserman 2013), then the whole."""
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)
         weights[np.arange(len(local)), nearest(local, words)] = 1
@@ -104,11 +93,8 @@ def sharpness_of(words: Singles) -> float:
 
 def bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
-    L2-normalised: float32 (K,).
-
-    A word counts once, however often it occurs: many channels mark the same part of a picture, and counts find fewer
-    places. No inverse document frequency: it would weigh words by a map that is still being made.
-    """
+    L2-normalised: float32 (K,). Counts find fewer places: many channels mark the same part of a picture. An inverse
+    document frequency would weigh words by a map that is still being made."""
     present = np.zeros(len(words), np.float32)
     present[nearest(local, words)] = 1
     return unit(present)
