@@ -80,9 +80,7 @@ def board_names() -> tuple[str, ...]:
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
     """Load the profile called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
-
-    Raises ConfigError if there is no such board, or if the file is incomplete or invalid.
-    """
+    Raises ConfigError if there is no such board, or if the file is incomplete or invalid."""
     if name == "this":
         return _this_machine(root)
     if name.endswith((".yaml", ".yml")) or "/" in name:
@@ -116,10 +114,7 @@ def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
     """Return a profile of this machine with the score `speed`. Its power is that of the shipped profile of its board,
     else relative (idle 0 W, full load 1 W). Memory and shares are those of `load_board("this")`."""
     board, model = _this_machine(root), machine.model(root)
-    source = board.source
-    if not _recognised(root):
-        unknown = model or machine.dmi_model(root) or "machine like this"
-        source = f"nobody has measured a {unknown}: relative figures (idle 0, full load 1 W)"
+    source = board.source if _recognised(root) else "relative figures (idle 0, full load 1 W): nobody has measured it"
     return replace(board, title=machine.title(root), recognised_by=model, source=source, benchmark_score=speed)
 
 

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -101,27 +100,13 @@ def calibrate(board: Board, meter: Meter, progress: Callable[[float], None]) -> 
 
 def measure_at(meter: Meter, load: float, settle_s: float = 5.0, window_s: float = 20.0) -> tuple[float, float]:
     """Hold the `load` (0 or 1), let the meter settle for `settle_s` seconds, and measure for `window_s` seconds: short
-    windows are unreliable. Returns the utilisation of the whole machine, 0..1, and the mean power in watts."""
-    with hold_load(load):
-        time.sleep(settle_s)
-        psutil.cpu_percent()  # starts the interval of the next call
-        until_s, watts = time.monotonic() + window_s, [meter.read_w()]
-        while time.monotonic() < until_s:
-            time.sleep(_PERIOD_S)
-            watts.append(meter.read_w())
-        return psutil.cpu_percent() / 100, fmean(watts)
+    windows are unreliable. Returns the utilisation of the whole machine, 0..1, and the mean power in watts.
 
-
-@contextmanager
-def hold_load(load: float) -> Iterator[None]:
-    """Keep all usable cores busy while the block of the `with` statement runs, with one thread per core; none if `load`
-    is 0.
-
-    Each thread multiplies small float32 matrices, as cohog's matching does; NumPy lets the other threads run meanwhile.
-    NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, set by edgevpr's command line).
+    For a load of 1 each usable core has a thread that multiplies small float32 matrices, as cohog's matching does;
+    NumPy lets the other threads run meanwhile. NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, set by
+    edgevpr's command line).
     """
-    stop = threading.Event()
-    count = len(os.sched_getaffinity(0)) if load > 0 else 0
+    stop, count = threading.Event(), len(os.sched_getaffinity(0)) if load else 0
 
     def run() -> None:
         left, right = np.ones((256, 32), np.float32), np.ones((32, 256), np.float32)
@@ -129,9 +114,15 @@ def hold_load(load: float) -> Iterator[None]:
             np.matmul(left, right)
 
     with ThreadPoolExecutor(max(1, count)) as pool:
-        for _ in range(count):
-            pool.submit(run)
         try:
-            yield
+            for _ in range(count):
+                pool.submit(run)
+            time.sleep(settle_s)
+            psutil.cpu_percent()  # starts the interval of the next call
+            until_s, watts = time.monotonic() + window_s, [meter.read_w()]
+            while time.monotonic() < until_s:
+                time.sleep(_PERIOD_S)
+                watts.append(meter.read_w())
+            return psutil.cpu_percent() / 100, fmean(watts)
         finally:
             stop.set()

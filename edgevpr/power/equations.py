@@ -42,11 +42,8 @@ def parse_pack(text: str) -> Pack:
 
 def stage_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: float) -> float:
     """Return the energy in joules at the board's input during a stage of `t_s` seconds at `utilisation` (0..1): one
-    term of equation 5.6, before the division by the voltage.
-
-    The power is P = P_i + (P_b - P_i) U (5.1), which is a + s U (5.2), of encoding P_e (5.4) or of matching P_m (5.5).
-    P_i is `idle_w`, P_b is `full_w`.
-    """
+    term of equation 5.6, before the division by the voltage. The power is P = P_i + (P_b - P_i) U (5.1), which is a + s
+    U (5.2), of encoding P_e (5.4) or of matching P_m (5.5), where P_i is `idle_w` and P_b is `full_w`."""
     return (idle_w + (full_w - idle_w) * utilisation) * t_s
 
 

@@ -115,10 +115,8 @@ def query_cost(
     rss_mb: float,
     pss_mb: float | None = None,
 ) -> QueryCost:
-    """Compute the cost of one query by equations 5.1-5.6. The energies of both stages are added, not their powers.
-
-    Charges are drawn from the pack. `used_mah` is (a + s U) t. `marginal_mah` is s U t, what is added to an idle board.
-    """
+    """Compute the cost of one query by equations 5.1-5.6; the energies of both stages are added. Charges are drawn from
+    the pack: `used_mah` is (a + s U) t, and `marginal_mah` is s U t, what is added to an idle board."""
     stages = [(each.utilisation(board.cores), each.wall_s) for each in (encode, match)]
     used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
     marginal_j = sum(marginal_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
@@ -199,11 +197,8 @@ class OwnLoad:
         self._ran_s += work.cpu_s
 
     def look(self) -> tuple[float, float]:
-        """Return two shares of the time since the last call, 0..1:
-
-        * the share of all cores that this process used,
-        * the share of the time that its recorded work took if other programs kept this work waiting, else 0.
-        """
+        """Return two shares of the time since the last call, 0..1: that of all cores that this process used, and that
+        of the recorded work if other programs kept it waiting, else 0."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
         waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s

@@ -26,11 +26,9 @@ _LEAST_ROUNDS = 5
 
 def micro_benchmark() -> MachineSpeed:
     """Measure the speed of this machine, in about two seconds (longer on a slow board). Nothing else should run.
-
+    `single` (one thread) and `multi` (one a core) are the geometric means of the speeds at products and at passes.
     NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets before NumPy is
-    imported), so that each thread of ours is one core. `single` (one thread) and `multi` (one a core) are the geometric
-    means of the speeds at products and at passes.
-    """
+    imported)."""
     cores = len(os.sched_getaffinity(0))
     products, all_products = (hz / REFERENCE_PRODUCTS_HZ for hz in _rates_hz(product_round, cores))
     passes, all_passes = (hz / REFERENCE_PASSES_HZ for hz in _rates_hz(pass_round, cores))
