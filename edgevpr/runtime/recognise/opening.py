@@ -1,7 +1,7 @@
 """Makes a recogniser from a map, the technique it was made with, and its index in RAM. All programs start here."""
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.hints import Prior, Told
+from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import levelling_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
@@ -35,33 +35,22 @@ Settings = Mapping[str, int | float | str]  # parameters of a technique, by thei
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
-def open_recogniser(
-    config: Config,
-    board: Board,
-    *,
-    settings: dict[str, str] | None = None,
-    narrowed: bool = False,
-    known: Collection[str] = (),
-    follows: bool = False,
-) -> Recogniser:
+def open_recogniser(config: Config, board: Board, *, narrowed: bool = False, follows: bool = False) -> Recogniser:
     """Open the map, make its technique for the board, and load the index.
 
-    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
-    but for what is `known` of recorded ones (see `Told`). With `follows`, the queries are those of one flight, in order
-    (see `follow`). `settings` are parameters of the technique. Raises an EdgevprError that names what does not fit
-    together, such as a setting that the map was not built with.
+    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map.
+    With `follows`, the queries are those of one flight, in order (see `follow`). Raises an EdgevprError that names what
+    does not fit together, such as a setting that the map was not built with.
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
     place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
-        technique = technique_of(place_map, config.technique, _wanted(config) | (settings or {}), board)
+        technique = technique_of(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
-        prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
-        if narrowed:
-            prior = _in_flight(config, technique)
+        prior = _in_flight(config, technique) if narrowed else None
         recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -201,7 +190,7 @@ def _recogniser(
     place_map: PlaceMap,
     index: PlaceIndex,
     *,
-    prior: Prior | Told | None,
+    prior: Prior | None,
     follows: bool,
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
