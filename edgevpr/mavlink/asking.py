@@ -5,7 +5,7 @@ import select
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from edgevpr.core.errors import LinkError
@@ -37,7 +37,7 @@ class Inquiry:
     - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
     - `says_version_1`: its last message was MAVLink 1.
     - `round_trips_s`: seconds from request to answer, one number for each answered call of `message`.
-    - `others`: system ids of any other autopilots on the link.
+    - `others`: system ids of any other autopilots on the link; `reader` counts bytes that belong to no message.
     """
 
     def __init__(
@@ -47,22 +47,19 @@ class Inquiry:
         system_id: int | None = None,
         signing: Signing = NOT_SIGNING,
     ) -> None:
-        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first autopilot whose
-        heartbeat arrives), and `signing` signs and checks the messages. Raises LinkError if the port cannot be opened
-        (see `open_port`) or its other end is missing."""
+        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first one heard).
+        Raises LinkError if the port cannot be opened (see `open_port`) or its other end is missing."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
         self.says_version_1 = False
         self.round_trips_s: list[float] = []
-        self.signing = signing
+        self.signing, self.reader = signing, PacketReader(signing.admits)
         self._address = address
-        self._reader = PacketReader(signing.admits)
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
         self._arrived: deque[Message] = deque()  # from the autopilot, not yet returned to the caller
         self._heartbeat_due_s = 0.0
-        self._autopilot_heard = False
         try:
             self._port = open_port(address)
         except OSError as error:
@@ -78,11 +75,6 @@ class Inquiry:
         self._port.close()
         if isinstance(error, OSError):
             raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
-
-    @property
-    def bad_bytes(self) -> int:
-        """The number of received bytes that belong to no valid message."""
-        return self._reader.bad_bytes
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
         """Wait up to `wait_s` seconds for the heartbeat of an autopilot and return it, or None if none came. From then
@@ -124,17 +116,15 @@ class Inquiry:
         return values
 
     def _first(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
-        return next((message for message in self._messages(wait_s) if is_wanted(message)), None)
-
-    def _messages(self, wait_s: float) -> Iterator[Message]:
-        """Yield the autopilot's messages: those received already, then those that arrive within `wait_s` seconds."""
+        """Return the first wanted message of those received already, and those that arrive within `wait_s` seconds."""
         end_s = time.monotonic() + wait_s
         while True:
             while self._arrived:
-                yield self._arrived.popleft()
+                if is_wanted(message := self._arrived.popleft()):
+                    return message
             now_s = time.monotonic()
             if now_s >= end_s:
-                return
+                return None
             self._turn(now_s, min(end_s - now_s, 0.25))
 
     def _turn(self, now_s: float, wait_s: float) -> None:
@@ -147,7 +137,7 @@ class Inquiry:
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        self._arrived.extend(each for each in self._reader.feed(data, self._port.sender) if self._is_ours(each))
+        self._arrived.extend(each for each in self.reader.feed(data, self._port.sender) if self._is_ours(each))
 
     def _is_ours(self, message: Message) -> bool:
         beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -159,9 +149,8 @@ class Inquiry:
             self.others |= {message.get_srcSystem()} if beats else set()
             return False
         if beats:
-            self._autopilot_heard = True
             self._port.answer_sender()
-        if not self._autopilot_heard:
+        elif not self.heard:
             return False
         self.heard[message.get_type()] += 1
         self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
@@ -182,8 +171,7 @@ class AutopilotReading:
     - `firmware`: "ardupilot", "px4" or "other"; `vehicle`: the value of a `Kind`.
     - `version`: (major, minor, patch) of the firmware; `version_text`: the same as text, such as "4.7.0-dev".
     - `parameters`: values by name; `heard`: the names of all messages received.
-    - `gps_fix`: GPS_FIX_TYPE of the first and the second receiver.
-    - `filter_flags`: the `flags` field of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
+    - `gps_fix`: GPS_FIX_TYPE of both receivers; `filter_flags`: of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
     - `origin`: of its local frame, (latitude, longitude) in degrees.
     - `signs`: its messages are signed; `is_signed_to`: ours to it are.
     - `answers`: it has answered at least one question; `says_version_1`: it sends MAVLink 1.
@@ -261,7 +249,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         answers=answers,
         says_version_1=asking.says_version_1,
         other_systems=tuple(sorted(asking.others)),
-        bad_bytes=asking.bad_bytes,
+        bad_bytes=asking.reader.bad_bytes,
         round_trip_s=statistics.median(asking.round_trips_s) if asking.round_trips_s else None,
         clock_ahead_s=clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None,
     )

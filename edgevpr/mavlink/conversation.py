@@ -1,13 +1,18 @@
 """The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
-no port and no thread, and is used by `link` inside turns only (see `turns`)."""
+no port and no thread, and is used by `link` inside turns only. A turn is the time in which one thread, that of a link
+or of the flight, uses the conversation alone, while its clock stands still. Turns are recorded on the tape, so that a
+flight can be replayed."""
 
 import logging
 import math
 import struct
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from threading import RLock
+from typing import Any
 
 from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
 from edgevpr.mavlink import messages
@@ -177,9 +182,9 @@ class Conversation:
             if self.autopilot.hear(message, now_s, sender):
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
-                if news := self.autopilot.identity.news:
+                if self.autopilot.identity.has_moved:
                     self.fixes.break_off("another autopilot has taken its place")
-                    self.announce(Severity.WARNING, news, "autopilot")
+                    self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
             if self.autopilot.answer:
                 self._hear_answer(self.autopilot.answer, now_s)
             if not self.autopilot.identity.is_elsewhere(sender):
@@ -216,7 +221,8 @@ class Conversation:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after delays
-            return self._heartbeat(now_s), None
+            is_stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
+            return messages.heartbeat(Health.CRITICAL if is_stuck else self._health), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.listens(now_s):
             self._ask_for_position(system_id, now_s)
@@ -233,10 +239,6 @@ class Conversation:
         if text := self.texts.next(now_s):
             return text, None  # not by `send`, which copies to the ground's link: that has its own texts
         return (self._messages.popleft(), None) if self._messages else None
-
-    def _heartbeat(self, now_s: float) -> Message:
-        is_stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
-        return messages.heartbeat(Health.CRITICAL if is_stuck else self._health)
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel: a position or, once, the origin of the autopilot's local
@@ -286,3 +288,53 @@ class Conversation:
         if answer == "FAILED" and readiness.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.send(messages.message_request(self.autopilot.system_id or 0, origin))
+
+
+class Turns:
+    """Gives turns to one thread at a time. A conversation depends only on the times of its turns and on its input, so a
+    replay gives the same result."""
+
+    def __init__(self, clock: Callable[[], float], tape: Tape = NO_TAPE) -> None:
+        self._clock, self._tape = clock, tape
+        self._lock = RLock()
+        self._t_s: float | None = None  # time of the current turn; None between turns
+
+    def now_s(self) -> float:
+        """Return the time of the current turn, or that of the clock between turns."""
+        t_s = self._t_s
+        return self._clock() if t_s is None else t_s
+
+    @contextmanager
+    def taken(self, what: str) -> Iterator[None]:
+        """Context manager: take a turn in the flight's thread. `what` is its name on the tape. Inside another turn of
+        the same thread this has no effect: it is part of that turn."""
+        with self._lock:
+            if self._t_s is not None:
+                yield
+                return
+            with self.again(self._tape.read(f"turn: {what}", self._clock)):
+                yield
+
+    @contextmanager
+    def again(self, t_s: float) -> Iterator[None]:
+        """Context manager: let the time stand still at `t_s`; in a replay, this repeats a link's turn."""
+        self._t_s = t_s
+        try:
+            yield
+        finally:
+            self._t_s = None
+
+    @contextmanager
+    def of_link(self, name: str) -> Iterator[Callable[..., None]]:
+        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`
+        that notes what happens in the turn, such as `step("heard", data)`. At its end, all steps go to the tape as one
+        record; a turn without a step is not recorded."""
+        steps: list[tuple[Any, ...]] = []
+        with self._lock:
+            t_s = self._clock()
+            try:
+                with self.again(t_s):
+                    yield lambda *step: steps.append(step)
+            finally:
+                if steps:
+                    self._tape.note(name, t_s, steps)

@@ -1,5 +1,5 @@
 """Position fixes on their way to the autopilot: those that wait to be sent, and those that wait for an answer. Used by
-`conversation` inside turns only (see `turns`).
+`conversation` inside turns only.
 
 A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
 answers, so it is matched to the oldest fix sent less than a second ago: with one fix a second, and an answer within

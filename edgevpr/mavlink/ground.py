@@ -1,8 +1,7 @@
 """The people on the ground: the requests that arrive over the links, and the texts for the ground station. A wish is a
 request that only the flight itself can fulfil, such as a pause. A request that is not handled here has no effect; there
-are no parameters that could be set. Used by `conversation` inside turns only (see `turns`), and by the flight."""
+are no parameters that could be set. Used by `conversation` inside turns only, and by the flight."""
 
-import logging
 import math
 from collections import Counter
 from collections.abc import Collection
@@ -15,11 +14,8 @@ from edgevpr.mavlink.wire import Message, mavlink
 ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
 PAUSED = "not sent: paused by the ground"
 SPACING_S = 5.0
-WAITING_MAX = 16
 
 News = tuple[Severity, str, str]  # a change to be announced to the ground station: severity, text and topic
-
-log = logging.getLogger(__name__)
 
 
 class Wish(IntEnum):
@@ -116,7 +112,7 @@ class Texts:
         return len(self._waiting)
 
     def put(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text. A text without a `topic` is a topic of its own, and may be sent again."""
+        """Queue a text. A text without a `topic` is a topic of its own."""
         topic = topic or text
         if severity is Severity.WARNING:
             self._waiting.pop((topic, Severity.INFO), None)
@@ -124,28 +120,18 @@ class Texts:
         follows_warning = severity is Severity.INFO and (topic, Severity.WARNING) in self._waiting
         if not follows_warning and self._last.get(topic) == text:
             del self._waiting[topic, severity]
-        if len(self._waiting) > WAITING_MAX:
-            lost_text = self._waiting.pop(self._oldest(Severity.INFO))
-            log.warning("the ground is not told, since too many texts wait: %s", lost_text)
 
     def next(self, now_s: float) -> Message | None:
         """Return the STATUSTEXT that is to be sent now; None if no text waits, or the last one was too recent."""
         if not self._waiting or now_s - self._sent_s < self._spacing_s:
             return None
-        topic, severity = chosen = self._oldest(Severity.WARNING)
-        text = self._waiting.pop(chosen)
-        if topic != text:
-            self._last[topic] = text
-        self._sent_s = now_s
-        return status_text(severity, f"edgevpr: {text}")
+        topic, severity = chosen = min(self._waiting, key=lambda key: key[1])  # the oldest warning, else note
+        self._sent_s, self._last[topic] = now_s, self._waiting.pop(chosen)
+        return status_text(severity, f"edgevpr: {self._last[topic]}")
 
     def hurry(self) -> None:
         """Send the remaining texts without pauses: the link is about to be closed."""
         self._spacing_s = 0.0
-
-    def _oldest(self, severity: Severity) -> tuple[str, Severity]:
-        """Return the key of the oldest waiting text of this severity, or of the oldest of all if there is none."""
-        return next((key for key in self._waiting if key[1] is severity), next(iter(self._waiting)))
 
 
 def _asks(message: Message, us: tuple[int, int]) -> bool:

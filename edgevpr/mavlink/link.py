@@ -1,5 +1,5 @@
 """The link to the flight controller: its methods may be called from any thread, but only its own thread reads and
-writes the socket or serial port. Used by the flight. For turns, see `turns`."""
+writes the socket or serial port. Used by the flight."""
 
 import logging
 import select
@@ -14,9 +14,8 @@ from typing import Concatenate, ParamSpec, TypeVar
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.conversation import Conversation, LinkSettings, Turns
 from edgevpr.mavlink.ports import Line, Port, open_port
-from edgevpr.mavlink.turns import Turns
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0

@@ -42,8 +42,8 @@ class Identity:
     id. A sender with another system id never takes its place; one with the same at another address does so once our
     autopilot has been silent for 30 s.
 
-    `kept` is our autopilot (None: not heard yet). `news` is a short text if the last message has made a sender at
-    another address our autopilot, else None. `foreign_messages` counts the messages of others.
+    `kept` is our autopilot (None: not heard yet). `has_moved`: the last message has made a sender at another address
+    our autopilot. `foreign_messages` counts the messages of others.
     """
 
     def __init__(self, system_id: int | None = None) -> None:
@@ -52,14 +52,20 @@ class Identity:
         self._configured = system_id
         self._spoke_s = -math.inf
         self._has_warned = False
-        self.news: str | None = None
+        self.has_moved = False
 
     def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
         """Return True if a message of this speaker comes from our autopilot. `beats`: the message is the heartbeat of
         an autopilot, by which the speaker may become ours."""
-        self.news = None
+        self.has_moved = False
         if beats and speaker != self.kept and self._is_next(speaker, now_s):
-            self._take(speaker, now_s)
+            if self.kept is None:
+                log.info("autopilot heard: %s", speaker)
+            else:
+                silent_s = now_s - self._spoke_s
+                log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, self.kept, silent_s)
+                self.has_moved = True
+            self.kept, self._has_warned = speaker, False
         if speaker != self.kept:
             self.refuse()
             return False
@@ -90,16 +96,6 @@ class Identity:
         is_same = kept is not None and speaker.system_id == kept.system_id
         return is_same and now_s - self._spoke_s >= RETAKEN_AFTER_S
 
-    def _take(self, speaker: Speaker, now_s: float) -> None:
-        before, self.kept, self._has_warned = self.kept, speaker, False
-        if before is None:
-            log.info("autopilot heard: %s", speaker)
-        else:
-            silent_s = now_s - self._spoke_s
-            log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, before, silent_s)
-            host, port = speaker.address or ("", 0)
-            self.news = f"autopilot now at {host}:{port}"
-
 
 class Listener:
     """Base class of an object that navigates by the reports of the autopilot, and gives the positions that a continuous
@@ -125,16 +121,14 @@ class Listener:
 
 
 class Autopilot:
-    """The state of the autopilot and its vehicle, from all messages received. `identity` decides which messages come
-    from our autopilot; the others are ignored. `own_component` is our component id, `system_id` that of the autopilot
-    (None: of the first one heard)."""
+    """The state of the autopilot and its vehicle, from all messages received, of which `identity` decides whose they
+    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
 
     def __init__(self, own_component: int, system_id: int | None, listener: Listener) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
-        self._listener = listener
-        self._own_component = own_component
+        self._listener, self._own_component = listener, own_component
         self._heard_s = -math.inf
         self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
         self._forget()
@@ -201,8 +195,10 @@ class Autopilot:
 
     def _hear_report(self, message: Message, now_s: float) -> None:
         match message.get_type():
-            case "COMMAND_ACK":
-                self._hear_ack(message)
+            case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
+                known = mavlink.enums["MAV_RESULT"].get(message.result)
+                self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
+                self.acks[answer] += 1
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
                 self._heights.hear(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
@@ -267,9 +263,3 @@ class Autopilot:
         """Return the newest report of the most accurate GPS receiver; None if none had a fix in the last 2.5 s."""
         new = (receiver for _, receiver in self._gps.values() if now_s - receiver.t_s <= GPS_GONE_AFTER_S)
         return min(new, key=lambda receiver: receiver.sd_m, default=None)
-
-    def _hear_ack(self, message: Message) -> None:
-        if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
-            known = mavlink.enums["MAV_RESULT"].get(message.result)
-            self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
-            self.acks[answer] += 1

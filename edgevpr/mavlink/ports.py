@@ -79,7 +79,8 @@ class UdpOutPort(Port):
     """A UDP socket that is connected to one address: the operating system drops packets from any other."""
 
     def __init__(self, host: str, port: int) -> None:
-        super().__init__(_udp_socket(socket.socket.connect, host, port))
+        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self._sock.connect((host, port))
 
     # A datagram that no program received makes the next call fail, once; so `write` tries twice.
 
@@ -100,7 +101,8 @@ class UdpInPort(Port):
 
     def __init__(self, host: str, port: int) -> None:
         # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
-        super().__init__(_udp_socket(socket.socket.bind, host, port))
+        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self._sock.bind((host, port))
         self._peer: Sender | None = None
         self.connected = False
 
@@ -129,10 +131,6 @@ class TcpPort(Port):
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_GIVE_UP_MS)
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_SEND_BYTES)
-        if self._sock.getsockname() == self._sock.getpeername():
-            # By chance, a connection to a local port without a listener can start from this same port.
-            self.close()
-            raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
 
     def unsent(self) -> int:
         # SIOCOUTQ, which has the number of TIOCOUTQ.
@@ -209,17 +207,6 @@ def open_port(address: LinkAddress) -> Port:
             raise
         kind = LinkAddressError if error.errno == errno.EACCES and not is_serial else LinkError
         raise kind(f"{address}: {advice}.") from error
-
-
-def _udp_socket(attach: Callable[[socket.socket, Sender], None], host: str, port: int) -> socket.socket:
-    """Make a UDP socket, and attach it to `host` and `port` by `attach`: socket.bind or socket.connect."""
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        attach(sock, (host, port))
-    except (OSError, UnicodeError):
-        sock.close()
-        raise
-    return sock
 
 
 class Line:

@@ -156,7 +156,7 @@ def gps_sd_m(message: Message) -> float:
 class Readiness:
     """The autopilot's readiness to accept a fix; None: unknown. Fields that end in `_s` are the time at which something
     was last received (-inf: never). `answers_others`: it has answered another of our commands than a fix. `asked_s` is
-    when its origin was last requested, `had_origin` the result of `has_origin` just before that."""
+    when its origin was last requested, `lacked_origin` the result of `lacks_origin` just before that."""
 
     is_px4: bool = False
     is_armed: bool | None = None
@@ -166,7 +166,7 @@ class Readiness:
     gps_s: float = -math.inf  # when one of its receivers had a 3D fix
     origin_s: float = -math.inf
     asked_s: float = -math.inf
-    had_origin: bool | None = None
+    lacked_origin: bool = False
 
     def hear(self, message: Message, now_s: float) -> None:
         """Process a message of the autopilot, of any kind."""
@@ -187,20 +187,18 @@ class Readiness:
         """Return True if a GPS receiver of the autopilot has lately reported a 3D fix."""
         return now_s - self.gps_s <= _GPS_COUNTS_S
 
-    def has_origin(self, now_s: float) -> bool | None:
-        """Return True if the autopilot has an origin, False if it did not answer a request for it within two seconds,
-        None if that is unknown."""
-        if self.origin_s > -math.inf and self.origin_s >= self.asked_s:
-            return True
-        is_asked = self.asked_s > -math.inf
-        return False if is_asked and now_s - self.asked_s > _ORIGIN_WITHIN_S else self.had_origin
+    def lacks_origin(self, now_s: float) -> bool:
+        """Return True if the autopilot did not answer a request for its origin within two seconds."""
+        if self.origin_s >= self.asked_s:
+            return False
+        return self.lacked_origin or now_s - self.asked_s > _ORIGIN_WITHIN_S
 
     def asks_origin(self, now_s: float) -> bool:
-        """Return True if the origin is to be requested now, after a refused fix, and note the time. It is requested
-        every ten seconds at most, and again and again: an autopilot that has restarted has lost its origin."""
+        """Return True if the origin is to be requested now, after a refused fix, and note the time: again and again,
+        since an autopilot that has restarted has lost its origin."""
         if self.has_gps(now_s) or now_s - self.asked_s < _ASK_ORIGIN_AGAIN_S:
             return False
-        self.had_origin, self.asked_s = self.has_origin(now_s), now_s
+        self.lacked_origin, self.asked_s = self.lacks_origin(now_s), now_s
         return True
 
     def why(self, result: str, now_s: float) -> "Reason":
@@ -213,12 +211,11 @@ class Readiness:
         return known.get(result) or Reason("see its log", f"it answers {result}")
 
     def why_silent(self) -> "Reason":
-        """Return the likely reason why the autopilot does not answer fixes."""
         return FIXES_NOT_ANSWERED if self.answers_others else NO_COMMAND_ANSWERED
 
     def _why_failed(self, now_s: float) -> "Reason":
         """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
-        has_gps, lacks_origin = self.has_gps(now_s), self.has_origin(now_s) is False
+        has_gps, lacks_origin = self.has_gps(now_s), self.lacks_origin(now_s)
         # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
         if self.is_px4:
             return NO_ORIGIN if lacks_origin else NOT_PLAUSIBLE

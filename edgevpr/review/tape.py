@@ -1,9 +1,9 @@
 """Plays back the tape of a recorded flight: the code's questions to the outside world (clock, frame, temperature) get
 the answers that they got in the flight, and its links receive what they received then. `replay` uses it.
 
-A line of the tape is a note: the answer to a question of some kind, or a turn of a link. In a turn (`mavlink.turns`) a
-link works alone and its time stands still; the note has this time and the steps, such as bytes received or a packet
-sent."""
+A line of the tape is a note: the answer to a question of some kind, or a turn of a link. In a turn (see
+`mavlink.conversation`) a link works alone and its time stands still; the note has this time and the steps, such as
+bytes received or a packet sent."""
 
 import json
 import logging

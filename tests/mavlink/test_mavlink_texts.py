@@ -1,13 +1,12 @@
 """Texts for the ground: one in five seconds, of each topic the newest, warnings first, and none of them lost."""
 
-import logging
 from contextlib import closing
 
 import pytest
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
-from edgevpr.mavlink.ground import SPACING_S, WAITING_MAX, Texts
+from edgevpr.mavlink.ground import SPACING_S, Texts
 from edgevpr.mavlink.messages import Severity
 
 WARNING, INFO = Severity.WARNING, Severity.INFO
@@ -57,17 +56,6 @@ def test_a_new_warning_ends_the_note_that_all_is_well(texts):
     texts.put(WARNING, "camera lost", "camera")
     texts.put(INFO, "camera is back", "camera")
     assert [text for _, text in told(texts, 100.0)] == ["camera lost", "camera is back"], "a note hides no warning"
-
-
-def test_a_flood_drops_notes_first_and_says_what_it_drops(texts, caplog):
-    caplog.set_level(logging.WARNING, "edgevpr.mavlink")
-    texts.put(INFO, "note")
-    for number in range(WAITING_MAX + 1):
-        texts.put(WARNING, f"warning {number}")
-    assert len(texts) == WAITING_MAX
-    dropped = [record.getMessage().rpartition(": ")[2] for record in caplog.records]
-    assert dropped == ["note", "warning 0"]
-    assert [text for _, text in told(texts)] == [f"warning {number}" for number in range(1, WAITING_MAX + 1)]
 
 
 @pytest.mark.network

@@ -100,7 +100,7 @@ def _source(config: Config, offline: bool) -> str:
     if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
     if config.mapping.learn:
-        check_positions(config, None)
+        check_positions(config)
     with closing(open_source(uri, live=True)) as source:
         if not offline:
             return f"{uri}, {_with_a_frame(source, uri)}"
