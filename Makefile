@@ -44,7 +44,6 @@ results: $(VENV)/installed
 	$(BIN)/python benchmarks/run_sets.py
 	$(BIN)/python benchmarks/where.py
 	$(BIN)/python benchmarks/height_and_tilt.py
-	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/from_orthophoto.py
 	$(BIN)/python benchmarks/flights.py
 	$(BIN)/python benchmarks/figures_page.py

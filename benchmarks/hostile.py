@@ -2,8 +2,8 @@
 
 python benchmarks/hostile.py [--parts A,B] [--share S] [--seed N]
 
-Streams that break, pictures that say nothing, maps that are damaged, packets of others and
-files that are wrong are all made from a seed. The table says what was tried, how often, and what left the aircraft.
+Streams that break, pictures that say nothing, maps that are damaged and packets of others are all made from a seed. The
+table says what was tried, how often, and what left the aircraft.
 """
 
 import argparse
@@ -13,14 +13,13 @@ import base
 import damaged_streams
 import hostile_bytes
 import hostile_flights
-import hostile_inputs
 import hostile_links
 import hostile_maps
 import hostile_pictures
 from base import Row
 
-# name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet or
-# input, and in all of maps; of `bytes`, ten times as many bytes)
+# name: (title, how it is run, usual count: of the pictures of each stream, of each set of pictures, kind of packet, and
+# in all of maps; of `bytes`, ten times as many bytes)
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
@@ -28,7 +27,6 @@ PARTS = {
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
     "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
     "bytes": ("Bytes and packets: random, changed, and forged", hostile_bytes.run, 1_000_000),
-    "inputs": ("Files and command lines that are wrong", hostile_inputs.run, 150),
 }
 
 

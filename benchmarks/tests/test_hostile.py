@@ -3,15 +3,11 @@
 import base
 import hostile_bytes
 import hostile_flights
-import hostile_inputs
 import hostile_links
 import hostile_maps
 import hostile_pictures
 import pytest
 import walks
-from hypothesis import given, settings
-
-from edgevpr.frames.exif import read_exif
 
 needs_sets = pytest.mark.skipif(not base.DATA.is_dir(), reason="the image sets of ../shared/data are not there")
 # Views ahead that were accepted as places of maps made looking down, when only score and margin were asked.
@@ -42,37 +38,6 @@ def test_no_damaged_map_gives_a_traceback_or_a_wrong_position_or_loses_a_place()
     assert [row["kind"] for row in rows] == list(hostile_maps.KINDS)
     for row in rows:
         assert (row["tried"], row["tracebacks"], row["wrong_positions"], row["places_lost"]) == (2, 0, 0, 0), row
-
-
-def test_no_hostile_input_ends_a_command_otherwise_than_with_a_sentence():
-    for row in hostile_inputs.run(count=2, seed=7):
-        wrongs = [row[key] for key in ("tracebacks", "hangs", "wrong_exit_codes", "leaks")]
-        assert (row["tried"], wrongs) == (2, [0, 0, 0, 0]), row
-
-
-@pytest.mark.parametrize(
-    ("program", "wrong"),
-    [
-        ("raise ValueError", "tracebacks"),
-        ("import sys; sys.exit('edgevpr: \\x1b[31m')", "leaks"),
-        ("import sys; sys.exit(2)", "wrong_exit_codes"),  # and no sentence
-    ],
-)
-def test_what_goes_wrong_is_counted(program, wrong, tmp_path, monkeypatch):
-    (tmp_path / "edgevpr.py").write_text(program)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("PYTHONPATH", raising=False)
-    assert wrong in [each for each, _ in hostile_inputs.wrongs(["x"], tmp_path)]
-
-
-@given(hostile_inputs.with_exif())
-@settings(max_examples=150, deadline=None, derandomize=True)
-def test_exif_data_of_every_kind_ends_and_leaves_the_picture(tmp_path_factory, jpeg):
-    path = tmp_path_factory.getbasetemp() / "a.jpg"
-    path.write_bytes(jpeg)
-    tag = read_exif(path)
-    assert not tag.position or (abs(tag.position.lat_deg) <= 90 and abs(tag.position.lon_deg) <= 180)
-    assert tag.heading_deg is None or 0 <= tag.heading_deg < 360
 
 
 def test_a_flight_behind_a_damaged_stream_sends_no_fix_from_an_old_picture(monkeypatch):

@@ -20,7 +20,6 @@ PAGES = {
     "from_orthophoto": "from_orthophoto",
     "height_and_tilt": "height_and_tilt",
     "hostile": "hostile",
-    "link": "link_latency",
     "peers": "peers",
     "replay": "recorded",
     "salience": "bench_salience",
@@ -28,7 +27,6 @@ PAGES = {
     "soak": "soak",
     "sweeps": "sweeps",
     "test_arm64": "on_arm64",
-    "verification": "verification",
     "where": "where",
 }
 
