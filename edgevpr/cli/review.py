@@ -1,7 +1,6 @@
 """Commands for after a flight: `edgevpr report` and `edgevpr export`, which read its log, and `edgevpr replay`, which
 flies a recorded flight again on the ground."""
 
-import logging
 import sys
 from argparse import Namespace
 from dataclasses import asdict
@@ -13,10 +12,7 @@ from edgevpr.cli.wording import of_replay, of_what_if
 from edgevpr.core.errors import EdgevprError
 
 if TYPE_CHECKING:
-    from edgevpr.review.logged import LoggedFlight
     from edgevpr.review.overhead import Ground
-
-_log = logging.getLogger(__name__)
 
 
 def add(commands: Any) -> None:
@@ -47,12 +43,12 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.review.logged import text
+    from edgevpr.review.logged import read_flight, text
     from edgevpr.review.overhead import read_ground
     from edgevpr.review.page import Album, page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
-    flight = _read(args.log)
+    flight = read_flight(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
     frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
     ground: Ground = ()
@@ -73,24 +69,16 @@ def run_report(args: Namespace) -> int:
 def run_export(args: Namespace) -> int:
     """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON or CSV."""
     from edgevpr.review.export import WRITERS, features_of
+    from edgevpr.review.logged import read_flight
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
-    features = features_of(_read(args.log))
+    features = features_of(read_flight(args.log))
     if target == "-":
         WRITERS[form](features, sys.stdout)
     else:
         write_out(target, args.log, partial(WRITERS[form], features))
         print(f"{target}: {len(features)} points")
     return 0
-
-
-def _read(log: str) -> "LoggedFlight":
-    from edgevpr.review.logged import read_flight
-
-    flight = read_flight(log)
-    if flight.missing:
-        _log.warning("%s", flight.missing)
-    return flight
 
 
 def run_replay(args: Namespace) -> int:
@@ -106,7 +94,7 @@ def run_replay(args: Namespace) -> int:
         show({**found, **end}, args.json, of_what_if(found, again.why_ended))
         return 0
     lines, packets = compare(again.flown, again.lines), again.packets
-    is_same = not (lines.others or packets.others or packets.renumbered)
+    is_same = not (lines.others or packets.others)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
     show(value, args.json, of_replay(again, lines, packets))
     return 0 if is_same else 1

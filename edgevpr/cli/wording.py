@@ -32,8 +32,7 @@ def of_made(path: str, made: "MadeMap") -> Iterator[str]:
     if result.already_here:
         yield f"  {result.already_here} images were in the map already"
     if result.not_memorable:
-        lacking = ", ".join(f"{count} for want of {what}" for what, count in result.not_memorable.items())
-        yield f"  left out: {lacking}"
+        yield f"  left out: {result.not_memorable} that are not memorable"
     if made.without_data is not None:
         yield f"  left out: {made.without_data} for want of data, {result.says_nothing} for want of texture"
     if result.of_low_quality:
@@ -110,8 +109,7 @@ def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator
         yield f"The program differs: {name} was {then}, is {now}"
     yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
     yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
-    renumbered = f", {packets.renumbered} but for their number" if packets.renumbered else ""
-    yield f"MAVLink  {packets.alike} packets are the same{renumbered}, {len(packets.others)} differ"
+    yield f"MAVLink  {packets.alike} packets are the same, {len(packets.others)} differ"
     if again.guessed:
         yield f"This edgevpr asks {again.guessed} times for something else than the one that flew: its costs differ."
     if again.why_ended:

@@ -83,24 +83,17 @@ def _differing(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple
 
 @dataclass(slots=True)
 class Packets:
-    """Comparison of the packets that the flight sent with those that its replay sends: how many are `alike`, how many
-    `renumbered` (equal but for the sequence number, which an earlier difference has shifted), and the `others`, each in
-    a sentence."""
+    """Comparison of the packets that the flight sent with those that its replay sends: how many are `alike`, and the
+    `others`, each in a sentence."""
 
     alike: int = 0
-    renumbered: int = 0
     others: list[str] = field(default_factory=list)
 
     def compare(self, t_s: float, link: str, then: bytes | None, now: bytes | None) -> None:
-        """Compare two packets of `link` (None: none was sent) at the time `t_s` of the flight's clock. Signatures are
-        left out: no recording holds the key for them."""
-        if then is None and now is None:
-            return
-        if then and now and _unsigned(then) == _unsigned(now):
+        """Compare two packets of `link` (None: none was sent) at the time `t_s` of the flight's clock."""
+        if then and now and _content(then) == _content(now):
             self.alike += 1
-        elif then and now and _unnumbered(then) == _unnumbered(now):
-            self.renumbered += 1
-        else:
+        elif then or now:
             self.others.append(f"{t_s:.3f} s, {link}: said {_described(then)}, now {_described(now)}")
 
 
@@ -108,19 +101,16 @@ def _described(packet: bytes | None) -> str:
     if packet is None:
         return "nothing"
     (message,) = mavlink.MAVLink(None).parse_buffer(packet)
-    return f"{message} (sequence number {message.get_seq()})"
+    return str(message)
 
 
-def _unsigned(packet: bytes) -> bytes:
-    is_signed = packet[0] == mavlink.PROTOCOL_MARKER_V2 and packet[2] & mavlink.MAVLINK_IFLAG_SIGNED
-    return packet[:-_SIGNATURE_BYTES] if is_signed else packet
-
-
-def _unnumbered(packet: bytes) -> bytes:
-    """Return a packet without its sequence number, checksum (which depends on that number) and signature."""
-    at = 4 if packet[0] == mavlink.PROTOCOL_MARKER_V2 else 2
-    unsigned = _unsigned(packet)
-    return unsigned[:at] + unsigned[at + 1 : -2]
+def _content(packet: bytes) -> bytes:
+    """Return a packet without its sequence number, which counts the packets before it, its checksum, which depends on
+    that number, and its signature, for which no recording holds the key."""
+    is_new = packet[0] == mavlink.PROTOCOL_MARKER_V2
+    is_signed = is_new and packet[2] & mavlink.MAVLINK_IFLAG_SIGNED
+    at = 4 if is_new else 2
+    return packet[:at] + packet[at + 1 : -2 - _SIGNATURE_BYTES * bool(is_signed)]
 
 
 def beside(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:

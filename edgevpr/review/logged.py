@@ -1,6 +1,7 @@
 """Reads a flight log into checked values, for the report and the exports. A field that a log lacks, or that is damaged
 or of another type, becomes None."""
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -9,6 +10,8 @@ from typing import Any
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.runtime.flight.wholeflight import flight_of
+
+_log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
 _FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
@@ -70,8 +73,8 @@ class LoggedQuery:
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
-    `learnt` the positions of places learnt in flight. `missing` is a sentence about files of the flight that are not
-    there (None: all are). Times are seconds after its start; it is `span_s` long."""
+    `learnt` the positions of places learnt in flight. Times are seconds after its start; it is
+    `span_s` long."""
 
     path: Path
     start: dict[str, Any] = field(default_factory=dict)
@@ -80,17 +83,16 @@ class LoggedFlight:
     remarks: list[tuple[float, str, str]] = field(default_factory=list)
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
-    missing: str | None = None
     span_s: float = 0.0
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
-    """Read the last flight of the log `path`. Raises UsageError if there is no such file, and EdgevprError if it has no
-    line of a flight (see `wholeflight.flight_of`)."""
+    """Read the last flight of the log `path`, and warn if files of it are missing. Raises UsageError if there is no
+    such file, and EdgevprError if it has no line of a flight (see `wholeflight.flight_of`)."""
     lines = flight_of(path)
     flight = read_lines(lines, Path(path))
-    flight.missing = lines.missing
     if lines.missing:
+        _log.warning("%s", lines.missing)
         flight.remarks.insert(0, (0.0, "missing", lines.missing))
     return flight
 

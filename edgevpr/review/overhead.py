@@ -42,20 +42,19 @@ class Layer:
 
 
 def read_ground(path: str | Path) -> Ground:
-    """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be read,
-    or is damaged."""
+    """Read the places of the map file `path` that have a position, some thousands at most. Raises EdgevprError for a
+    map that cannot be read, or is damaged."""
     with PlaceMap.open(path) as place_map:
-        return [
-            ((place.position.lat_deg, place.position.lon_deg), place.pose)
-            for place in place_map.places()
-            if place.position
-        ]
+        found = [(place.position, place.pose) for place in place_map.places() if place.position]
+    step = -(-len(found) // _MOST_PLACES) or 1
+    return [((at.lat_deg, at.lon_deg), pose) for at, pose in found[::step]]
 
 
-def layers_of(flight: LoggedFlight) -> list[Layer]:
-    """Return the layers of a flight, from the bottom to the top. Those without points are left out."""
+def layers_of(ground: Ground, flight: LoggedFlight) -> list[Layer]:
+    """Return the layers of the drawing, from the bottom to the top. Those without points are left out."""
     queries = flight.queries
     layers = [
+        Layer("places of the map", "places", [[at for at, _ in ground]]),
         Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("GPS", "gps", _known_ways(query.gps_at for query in queries), are_dots=False),
@@ -73,18 +72,15 @@ def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
     return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
 
 
-def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()) -> str:
-    """Return HTML with the ground, the layers over it, and a label at each of the `named` points (its name, position);
-    "" if nothing has a position."""
-    everything = [at for at, _ in ground] + [at for layer in layers for way in layer.ways for at in way]
+def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Point]]) -> str:
+    """Return HTML with the ground that is seen, the layers over it, and a label at each of the `named` points (its
+    name, position); "" if nothing has a position."""
+    everything = [at for layer in layers for way in layer.ways for at in way]
     if not everything:
         return ""
     view = _View(everything, max((pose.footprint_m for _, pose in ground if pose), default=20.0))
-    shown = ground[:: -(-len(ground) // _MOST_PLACES) or 1]
-    squares = "".join(view.square(at, pose) for at, pose in shown if pose)
-    paths = f'<path class="footprints" d="{squares}"/>' if squares else ""
-    if shown:
-        paths += f'<path class="dots place layer-places" d="{dots(view.on([at for at, _ in shown]))}"/>'
+    squares = "".join(view.square(at, pose) for at, pose in ground if pose)
+    paths = f'<path class="footprints" d="{squares}"/>'
     for layer in layers:
         kind, path = ("dots", dots) if layer.are_dots else ("line", way)
         drawn = "".join(path(view.on(points)) for points in layer.ways)
@@ -96,9 +92,8 @@ def draw(ground: Ground, layers: Sequence[Layer], named: Iterable[tuple[str, Poi
         for x, y in view.on([at])
     )
     boxes = "".join(
-        f'<label class="key {colour}"><input type="checkbox" checked id="show-{colour}">{escape(name)}</label>'
-        for name, colour in [("places of the map", "places")][: len(shown)]
-        + [(each.name, each.colour) for each in layers]
+        f'<label class="key {each.colour}"><input type="checkbox" checked id="show-{each.colour}">{each.name}</label>'
+        for each in layers
     )
     shape = _WIDE / view.high  # labels are placed in per cent of width and height: they fit this shape only
     length_m, share = view.ruler()

@@ -86,7 +86,8 @@ def page_of(flight: LoggedFlight, ground: Ground, frames: Album, references: Alb
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
     `no_ground` is a sentence on why there is no `ground`."""
     queries, moments = flight.queries, list(enumerate(worst(flight.queries), start=1))
-    positions = [(str(at), query.at or query.autopilot_at or query.gps_at) for at, (query, _) in moments]
+    positions = ((str(at), query.at or query.autopilot_at or query.gps_at) for at, (query, _) in moments)
+    named = [(name, at) for name, at in positions if at]
     time = text(flight.start, "time") or next((text(each.line, "time") for each in queries), None)
     title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
     start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
@@ -96,7 +97,7 @@ def page_of(flight: LoggedFlight, ground: Ground, frames: Album, references: Alb
         heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
         section("", _figures(queries)),
         notes(_notes(flight, bool(ground), no_ground)),
-        section("Over the ground", draw(ground, layers_of(flight), [(name, at) for name, at in positions if at])),
+        section("Over the ground", draw(ground, layers_of(ground, flight), named)),
         section("What became of every query", _lanes(flight)),
         section("Over time", _charts(flight)),
         section("Worst moments", "".join(_moment(at, *each, frames, references) for at, each in moments)),

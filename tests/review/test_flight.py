@@ -66,8 +66,8 @@ def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark
     first.unlink()
     flight = read_flight(path)
     assert (flight.start["map"], flight.start["repeated"]) == ("m.gpkg", True)
-    assert flight.remarks[0] == (0.0, "missing", flight.missing)
-    assert "flight.jsonl: 1." in flight.missing
+    assert flight.remarks[0][:2] == (0.0, "missing")
+    assert "flight.jsonl: 1." in flight.remarks[0][2]
     assert 0 < len(flight.queries) < 4
 
 

@@ -72,7 +72,7 @@ def is_the_same(log, **how):
     assert lines.others == []
     assert again.packets.others == []
     assert lines.alike == len(again.lines) > 0
-    assert (again.packets.renumbered, again.guessed) == (0, 0)
+    assert again.guessed == 0
     return again, lines
 
 
@@ -225,7 +225,6 @@ def test_code_that_says_and_asks_more_than_what_flew_is_told_apart_from_another_
     assert main(["replay", str(tmp_path / "flight.jsonl"), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert found["guessed"] >= 2
-    assert found["packets"]["renumbered"] > 0
     assert any("vpr_gps_m" in each for each in found["packets"]["others"])
     kinds = {each["kind"] for each in found["lines"]["others"]}
     assert kinds <= {"end"}, "every query ends as it did"
