@@ -151,7 +151,7 @@ def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     parse_links(config.mavlink.link, config.mavlink.ground)
     if config.mapping.learn:
-        check_positions(config, positions)
+        check_positions(config)
     board = load_board(config.board)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
         for parameter, value in _MALLOC.items():

@@ -53,16 +53,21 @@ _MAY_BE_THE_SAME = 12  # places that may show the same ground: so many overlap o
 @dataclass(frozen=True, slots=True)
 class Overlay:
     """Guess of how one picture lies on another, such as the query on a place. `shift_share` (dx, dy), `rotation_deg`
-    and `scale` (None: unknown) have the same meaning as in `Agreement`."""
+    and `scale` (None: unknown) are as in `Agreement`."""
 
     shift_share: tuple[float, float]
     rotation_deg: float
     scale: float | None = None
 
+    @property
+    def turn_scale(self) -> np.complex64:
+        """Rotation and scale as one complex factor."""
+        return np.complex64((self.scale or 1.0) * np.exp(1j * np.deg2rad(self.rotation_deg)))
+
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
     """Return how one place lies on another, given the overlays `one` and `other` of the same query on these places."""
-    turn_scale = _turn_scale(other) / _turn_scale(one)
+    turn_scale = other.turn_scale / one.turn_scale
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
     rotation_deg = float(np.angle(turn_scale, deg=True)) % 360
@@ -165,20 +170,16 @@ class Verification:
         return describe(self.picture.image, self.picture.mask, OF_QUERY)
 
     def proof(self, ranking: Ranking) -> Agreement | None:
-        """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that the
-        match of this place gives. None if they cannot be compared: the place has no landmarks, or its match no shift or
-        rotation.
-
-        Raises PlaceError if the landmarks of the place cannot be read; the place is then left out.
-        """
+        """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that its
+        match gives. None if the place has no landmarks, or its match no shift or rotation. Raises PlaceError if the
+        landmarks cannot be read; the place is then left out."""
         expected, known = self._place(ranking, int(ranking.slots[0]))
         return held_against(self._query, known, expected) if expected and known is not None else None
 
     def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
-        that agree on the overlay given by the match of that place. It is 0 if there is no place elsewhere, and the
-        largest possible number if its landmarks are unknown. The places with the numbers `same` do not count as
-        elsewhere. Raises PlaceError as `proof` does."""
+        that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
+        landmarks are unknown. Places with the numbers `same` are not elsewhere. Raises PlaceError as `proof` does."""
         away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
         if not len(away):
             return 0
@@ -186,9 +187,9 @@ class Verification:
         return OF_PLACE if known is None else agreement(self._query, known, expected).inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
-        """Of the best few places compared, return the numbers of those that show the same ground as the best one: their
-        landmarks agree with those of the best place, on the overlay that follows from the two matches. Empty if the
-        best place has a position, since distances then tell the same. Raises PlaceError as `proof` does."""
+        """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
+        landmarks of both agree, on the overlay that follows from their matches. Empty if the best place has a position,
+        since distances then tell the same. Raises PlaceError as `proof` does."""
         slots = ranking.compared_slots[:_MAY_BE_THE_SAME]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
@@ -203,8 +204,8 @@ class Verification:
         )
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
-        """Return the overlay of the query on the place in row `slot` of the index, by its match, and the place's
-        landmarks (None: unknown). Both are None if the match has no shift or rotation."""
+        """Return the overlay of the query on the place in row `slot`, by its match, and the place's landmarks (None:
+        unknown). Both are None if the match has no shift or rotation."""
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
             return None, None
@@ -231,16 +232,11 @@ def _differing_bits(one: Bytes, other: Bytes) -> Singles:
     return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
 
 
-def _turn_scale(expected: Overlay) -> np.complex64:
-    """Return rotation and scale of an overlay as one complex factor."""
-    return np.complex64((expected.scale or 1.0) * np.exp(1j * np.deg2rad(expected.rotation_deg)))
-
-
 def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, expected: Overlay) -> Bools:
     """Return bool (N, M): True where a landmark of the query can be that landmark of the place, by position, direction
     and size, if the query lies on the place about as `expected`. `asked` (N,) and `known` (M,) are their points."""
     factor = _ANY_SCALE if expected.scale is None else _SCALE
-    laid = _turn_scale(expected) * asked + np.complex64(complex(*expected.shift_share))
+    laid = expected.turn_scale * asked + np.complex64(complex(*expected.shift_share))
     room = _STEP + np.abs(asked) * (factor - 1 + np.radians(_TURN_DEG) / 2)
     there: Bools = np.abs(laid[:, None] - known) <= room[:, None].astype(np.float32)
     turned = np.radians(query.angle_deg + expected.rotation_deg)[:, None] - np.radians(place.angle_deg)
@@ -250,12 +246,11 @@ def _plausible(query: Landmarks, place: Landmarks, asked: Array, known: Array, e
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Return True for each way near to the expected overlay (None: for each way with a plausible scale). A way is given
-    by its two complex numbers `turn_scale` (rotation and scale) and `shift`, or arrays of them; the result has their
-    shape."""
+    """Return True for each way near to the expected overlay (None: for each way with a plausible scale). `turn_scale`
+    and `shift` are its two complex numbers, or arrays of them; the result has their shape."""
     if expected is None:  # only the scale is limited
         return np.asarray((np.abs(turn_scale) >= _LEAST_SCALE) & (np.abs(turn_scale) <= _MOST_SCALE))
-    beside = turn_scale / _turn_scale(expected)
+    beside = turn_scale / expected.turn_scale
     turned, stretched = np.abs(np.angle(beside, deg=True)), np.abs(np.log(np.abs(beside)))
     most = np.log(_ANY_SCALE if expected.scale is None else _SCALE)
     is_there = np.abs(shift - complex(*expected.shift_share)) <= _STEP

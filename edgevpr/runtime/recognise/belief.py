@@ -64,8 +64,8 @@ class _Hypotheses:
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """One way in which each of M hypotheses can have moved: its probability `share` (M,), and the Gaussian of the new
-    position, mean `at` (M, 2) and `covariance` (M, 2, 2). The density is nowhere below `least`."""
+    """One way in which each of M hypotheses can have moved: its probability `share` (M,), and the new position `at`
+    (M, 2) with its `covariance` (M, 2, 2). The density is nowhere below `least`."""
 
     share: Doubles
     at: Doubles
@@ -131,11 +131,10 @@ def moved(elapsed_s: float | None, speed_max: float, velocity: tuple[float, floa
     unknown), which is not used without a time or if it is too high to be true."""
     if elapsed_s is None or not elapsed_s > 0:
         return Moved(reach=speed_max, elapsed_s=1.0)
-    elapsed_s = min(elapsed_s, _LONGEST_S)
-    reach = speed_max * elapsed_s
-    if velocity is None or not math.hypot(*velocity) <= 2 * speed_max:  # NaN, or too fast even if it is twice the truth
-        return Moved(reach=reach, elapsed_s=elapsed_s)
-    return Moved(reach=reach, elapsed_s=elapsed_s, by=elapsed_s * np.asarray(velocity, float))
+    elapsed_s, by = min(elapsed_s, _LONGEST_S), None
+    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
+        by = elapsed_s * np.asarray(velocity, float)
+    return Moved(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by)
 
 
 class Belief:
@@ -179,8 +178,8 @@ class Belief:
         return self._posterior(p)
 
     def _left(self) -> tuple[_Hypotheses, float, float]:
-        """Apply the chances of leaving, entering and jumping between two queries. Returns the hypotheses with less `w`
-        and `credited`, the probability of being lost, and that of having entered or jumped to any place."""
+        """Return the hypotheses after the chances of leaving, entering and jumping between two queries, the probability
+        of being lost, and that of having entered or jumped to any place."""
         held = float(self._now.w.sum())
         lost = (1 - self._enters) * self._lost + _LEAVES * held
         stays = 1 - _LEAVES - _JUMPS

@@ -16,7 +16,7 @@ from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Posterior, Proposals, moved
+from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Proposals, moved
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import share_of
 from edgevpr.runtime.recognise.judge import Sureness
@@ -52,9 +52,8 @@ class Followed:
 
 
 class _Survey:
-    """Measures of a map that the belief needs, computed when the map has `places` places: the `origin` of the belief's
-    plane (None: the map has no positions), the `scale` with the distances that count, and `spread`, the standard
-    deviation of the position of a place without a pose."""
+    """Measures of a map of so many `places`: the `origin` of the belief's plane (None: the map has no positions), the
+    `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
@@ -72,13 +71,13 @@ class _Survey:
             )
 
     def is_outdated(self, index: PlaceIndex) -> bool:
-        """Return True if the measures must be computed again: most places have a position now, and either they had none
-        before, or there are twice as many places. The first few places do not show how far apart the others are."""
+        """Return True if most places have a position now, and either they had none before, or there are twice as many:
+        the first few places do not show how far apart the others are."""
         is_measured = self.origin is not None and len(index) < 2 * self.places
         return not is_measured and bool((~np.isnan(index.lat_deg)).mean() > _HALF)
 
     def positions(self, slots: Ints, index: PlaceIndex) -> Doubles:
-        """Return the positions of places in the plane of the belief: float (K, 2), NaN if unknown."""
+        """Return positions in the plane of the belief, float (K, 2), NaN if unknown."""
         if self.origin is None:
             return np.stack([index.place_ids[slots].astype(float), np.zeros(len(slots))], 1)
         lat_deg, lon_deg = index.lat_deg[slots], index.lon_deg[slots]
@@ -135,7 +134,11 @@ class Follower:
             if confidence > _HALF and np.hypot(*(posterior.at - at)) <= near:
                 confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this look
             confidence = self._not_by_repetition(at, confidence, float(proposed.p[is_near].sum()))
-        estimate = _on_earth(posterior, survey.origin)
+        estimate = None
+        if survey.origin and posterior.mass:
+            position = Position(*moved_by(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
+            covariance_m2, heading_deg = triple(posterior.covariance), posterior.heading_deg
+            estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)
 
     def saw_nothing(self, index: PlaceIndex) -> None:
@@ -156,9 +159,8 @@ class Follower:
         return moved(self._elapsed_s, self._fastest_m_s, self._velocity_m_s)
 
     def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Return `confidence`, limited if position `at` is over the same ground as the query before: repeated pictures
-        of it prove nothing new. The limit is the confidence after the first picture there or, if larger, `by_itself`,
-        that of this look alone."""
+        """Return `confidence` or, if position `at` is over the same ground as the query before, of which repeated
+        pictures prove nothing new, at most that after the first picture there, or that of this look `by_itself`."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence
@@ -167,19 +169,10 @@ class Follower:
         return min(confidence, max(arrived[1], by_itself))
 
 
-def _on_earth(posterior: Posterior, origin: Position | None) -> Located | None:
-    if origin is None or not posterior.mass:
-        return None
-    lat_deg, lon_deg = moved_by(origin.lat_deg, origin.lon_deg, *posterior.at.tolist())
-    at, covariance_m2 = Position(lat_deg, lon_deg), triple(posterior.covariance)
-    return Located(position=at, covariance_m2=covariance_m2, heading_deg=posterior.heading_deg)
-
-
 def _proposals(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Turn a ranking into what the query proposes to the belief. Returns the slots of the proposed places, int (K,),
-    and their proposals. `where` is as in `Follower.heard`."""
+    """Return what the query proposes to the belief, as in `Follower.heard`: the slots, int (K,), and the proposals."""
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
     covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))
@@ -207,8 +200,7 @@ def _proposals(
 
 
 def _shares(votes: Doubles) -> Doubles:
-    """Divide a probability among K places: return the share (K,) of each, with a sum of 1. `votes` (K,) are the shares
-    of regions that agree at each place (see `share_of`)."""
+    """Return the share (K,) of each of K places in a probability. `votes` (K,) is what `share_of` says of each."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

@@ -46,8 +46,8 @@ class Hints:
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
     def agree_with(self, found: Candidate, heading_within_deg: float | None) -> bool:
-        """Return True if a match agrees with these hints. `heading_within_deg` is the largest error of a heading (None:
-        headings are not compared). A position or heading that is unknown counts as agreeing."""
+        """Return True if a match agrees with these hints, as far as both are known. `heading_within_deg` is the largest
+        error of a heading (None: headings are not compared)."""
         place, turned_deg = found.place, found.match.rotation_deg
         if self.reach and place.position:
             here, there = self.reach.position, place.position
@@ -77,36 +77,28 @@ class Prior:
         self._known: Hints | None = None
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame; None if there are none, or if hints are not trusted now. An area that contains
-        all places or none is no hint, nor is a heading if the index knows no headings.
+        """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
-        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown.
+        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown. It
+        has flown from the autopilot's position if that has GPS (without, it drifts, and our own fix is better), else
+        from our last fix if that is at most a minute old.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
-        reach = self._reach(frame.t_mono_s, vehicle, margin_m)
+        known, reach = self._last_fix, None
+        if vehicle and vehicle.has_gps:
+            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s
+        elif known and frame.t_mono_s - known[1] > _FIX_GOOD_FOR_S:
+            known = None
+        if known and self._reach_m_s:
+            reach = Reach(known[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - known[1]))
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None
 
-    def _reach(self, now_s: float, vehicle: Vehicle | None, margin_m: float) -> Reach | None:
-        """Return the area where the aircraft must be by its last known position, None if that is unknown or no speed is
-        set. The position is that of the autopilot if it has GPS (without, it drifts, and our own fix is better), else
-        our last fix if that is at most a minute old."""
-        known = self._last_fix if self._last_fix and now_s - self._last_fix[1] <= _FIX_GOOD_FOR_S else None
-        if vehicle and vehicle.has_gps:
-            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s
-        if not known or not self._reach_m_s:
-            return None
-        return Reach(known[0], margin_m + self._reach_m_s * abs(now_s - known[1]))
-
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
-        """Decide from the result of a query whether the next one uses hints. Keep position and height of an accepted
-        match.
-
-        An accepted match decides whether hints are trusted: they are if it agrees with them. Until there is one,
-        queries with hints and without alternate.
-        """
+        """Keep position and height of an accepted match. The next query uses hints if it agrees with them. Until there
+        is one, queries with hints and without alternate."""
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
         if self._known is None:
@@ -138,8 +130,8 @@ class Told:
         self.looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame, as `Prior.hints` does. The aircraft is within `TOLD_REACH_M` metres of its
-        recorded position; `vehicle` and `margin_m`, which are those of a flight, do not count."""
+        """Return the hints for a frame. The aircraft is within `TOLD_REACH_M` metres of its recorded position. The
+        arguments `vehicle` and `margin_m`, of a flight, do not count."""
         ratio: float | None = 1.0
         if self._map_height_m is not None:
             ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
@@ -169,7 +161,6 @@ def lacking(
 ) -> str | None:
     """Return a sentence on why no query can be asked with what is `known` (see `Told`); None if some can. `sequence` is
     the number of queries that are matched together."""
-    # A place that a hint kept out of one query of a sequence would count as compared and unlike it.
     if known and sequence > 1:
         return f"{sequence} queries are matched together, and what is known narrows only single ones: leave one out."
     for part, (field, columns) in _NEEDED.items():
@@ -180,8 +171,7 @@ def lacking(
 
 
 def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
-    """Return what narrows a search of the index; None if nothing does. An area that contains all places or none does
-    not, nor does a heading if the index knows no headings."""
+    """Return what narrows a search of the index; None if nothing does. An area of all places or of none does not."""
     if reach and not 0 < index.within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.knows_headings:

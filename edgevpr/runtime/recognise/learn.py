@@ -17,10 +17,7 @@ from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import MapBusyError, MapError, PlaceError, UsageError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame, Place, Position, Vehicle
-from edgevpr.frames.exif import read_exif
-from edgevpr.frames.images import list_images
 from edgevpr.frames.level import View
-from edgevpr.frames.positions import find_positions
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapinfo import nearest_m
 from edgevpr.places.retrieve import named
@@ -162,15 +159,10 @@ def _require_no_contradiction(followed: Followed | None, position: Position) -> 
         raise _LeftOut("where the flight so far contradicts it")
 
 
-def check_positions(config: Config, positions: Path | None) -> None:
-    """Raise UsageError if no frame can ever have a position: there is neither a link nor a recording with positions."""
-    folder = Path(config.source.uri or "")
-    if config.mavlink.link is None and not (folder.is_dir() and (positions or _has_positions(folder))):
+def check_positions(config: Config) -> None:
+    """Raise UsageError if no frame can ever have a position: there is neither a link nor a folder of images."""
+    if config.mavlink.link is None and not Path(config.source.uri or "").is_dir():
         raise UsageError(
             "There is nothing to learn positions from: name the flight controller with --link, or a folder of images "
             "with positions (--positions, or EXIF)."
         )
-
-
-def _has_positions(folder: Path) -> bool:
-    return bool(find_positions(folder)) or any(read_exif(path).position for path in list_images(folder))
