@@ -107,10 +107,10 @@ def _described(packet: bytes | None) -> str:
 def _content(packet: bytes) -> bytes:
     """Return a packet without its sequence number, which counts the packets before it, its checksum, which depends on
     that number, and its signature, for which no recording holds the key."""
-    is_new = packet[0] == mavlink.PROTOCOL_MARKER_V2
-    is_signed = is_new and packet[2] & mavlink.MAVLINK_IFLAG_SIGNED
-    at = 4 if is_new else 2
-    return packet[:at] + packet[at + 1 : -2 - _SIGNATURE_BYTES * bool(is_signed)]
+    if packet[0] != mavlink.PROTOCOL_MARKER_V2:
+        return packet[:2] + packet[3:-2]
+    signature_bytes = _SIGNATURE_BYTES if packet[2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
+    return packet[:2] + packet[3:4] + packet[5 : -2 - signature_bytes]
 
 
 def beside(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.ports import LOST
-from edgevpr.mavlink.signing import KEY_BYTES, Signing
-from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.mavlink.signing import Signing
+from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import Packets
 from edgevpr.runtime.flight.world import StopNow
 
@@ -139,8 +139,8 @@ class SupposedGround(GroundLink, SupposedLink):
 
 
 class ReplayedSigning(Signing):
-    """Signing without the real key: signs with a key of zeros, and admits the messages that the flight admitted.
-    `verdicts` has, for each of the next messages, why the flight refused it (None: it did not)."""
+    """Signing without the key: signs nothing, and admits the messages that the flight admitted. `verdicts` has, for
+    each of the next messages, why the flight refused it (None: it did not)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -149,11 +149,6 @@ class ReplayedSigning(Signing):
     def of_ground(self) -> "ReplayedSigning":
         """Return the signing of the link to the ground station."""
         return ReplayedSigning()
-
-    def stamp(self, packer: mavlink.MAVLink) -> None:
-        """Make `packer` sign its next message, with a key of zeros."""
-        signing = packer.signing
-        signing.sign_outgoing, signing.secret_key, signing.link_id, signing.timestamp = True, bytes(KEY_BYTES), 1, 1
 
     def admits(self, message: Message) -> bool:
         """Return True if the flight accepted this message's signature."""
