@@ -167,12 +167,8 @@ class MachineLoad:
 
 def machine_load() -> MachineLoad:
     """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
-    memory = psutil.virtual_memory()
-    return MachineLoad(
-        tuple(percent / 100 for percent in psutil.cpu_percent(percpu=True)),
-        memory.total - memory.available,
-        memory.total,
-    )
+    memory, percents = psutil.virtual_memory(), psutil.cpu_percent(percpu=True)
+    return MachineLoad(tuple(each / 100 for each in percents), memory.total - memory.available, memory.total)
 
 
 class OwnLoad:

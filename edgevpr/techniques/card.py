@@ -23,10 +23,9 @@ _ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputRule:
     """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std` (None: 1). `mean` and `std` are one
-    number, or one per channel. With `equalise` the histogram of the brightness is equalised first. `resize` is the
-    interpolation by which the picture is stretched to `height` x `width`. With `pad`, a grey level, it is not
-    stretched: it keeps its proportions in the upper left corner, and the rest has that level. `layout` is the order of
-    the axes of the input and of feature maps, NCHW."""
+    number, or one per channel. With `equalise` the histogram of the brightness is equalised first. The picture is
+    stretched to `height` x `width` by the interpolation `resize`; with `pad`, a grey level, it keeps its proportions in
+    the upper left corner, and the rest has that level. `layout`, NCHW, is the order of axes."""
 
     layout: str
     height: int = bounded(8, 4096)

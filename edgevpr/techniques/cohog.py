@@ -159,8 +159,7 @@ class CoHog:
             # In float64 a rounded number of the layout is the same on every processor.
             coarse = layout.of_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
-            middle = placecode.middle(blocks, seen)
-            coarse = np.rint(255 * placecode.grid(middle, np.ones(middle.shape[:2], bool))[0]).astype(np.uint8)
+            coarse = np.rint(255 * placecode.grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         picture = Picture(grey if self._is_nadir else None, allowed, seen)
         return Descriptor(
@@ -204,8 +203,8 @@ class CoHog:
         if not self._is_nadir:
             views = self._views_of(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
-            middle, seen = (placecode.middle(each, views.seen) for each in (views.blocks(1.0, 0)[0], views.seen))
-            asked = placecode.hypotheses(*placecode.grid(middle, seen), mean_grid)
+            own = placecode.grid(views.blocks(1.0, 0)[0], views.seen, views.seen)
+            asked = placecode.hypotheses(*own, mean_grid)
             return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
         ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
         self._views_of(query).keep(ratio)

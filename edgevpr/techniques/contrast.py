@@ -27,13 +27,13 @@ def stretched(
     grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], kept: float, wanted: float, sigma_pixels: float
 ) -> Singles:
     """Return a square picture, stretched if its contrast is below `kept`: at half of it or less to `wanted`, which is
-    at most four times `kept`. For each doubling of the contrast the sigma of the blur is `sigma_pixels`, in pixels of
-    the picture as it came.
+    at most four times `kept`. For each doubling of the contrast it is blurred by a sigma of `sigma_pixels`, in pixels
+    of the picture as it came.
 
     Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
     of allowed pixels. `grey` is float32 (side, side), 0 to 255; the same array is returned where its contrast is enough
     or too low to be that of ground. `allowed` is bool (side, side) (None: all). `pixel_px` is the width and height, in
-    pixels of the square, of a pixel of the picture as it came. Returns float32 (side, side), 0 to 255.
+    pixels of the square, of a pixel of the picture as it came.
     """
     low, high = _ends(grey, allowed)
     found = high - low

@@ -32,11 +32,10 @@ _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions alon
 def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> FineMatch:
     """Find the shift on which most regions agree. `asking` and `best` are int (G,): the good regions of the query, and
     for each the most similar region of the reference. `sides` are the regions along one side of the query's grid and of
-    the reference's, both even or both odd.
+    the reference's, both even or both odd. A shift is counted from the middle of one grid to that of the other.
 
-    A shift is counted from the middle of one grid to that of the other. For each shift, a vote that is n cells off it,
-    along rows or columns, has the weight `counts[n]`; one further off has none. The peak is the shift with the largest
-    sum of weights. The score is its share of all votes, 0 without any region.
+    A vote that is n cells off a shift, along rows or columns, has the weight `counts[n]`; one further off has none. The
+    peak is the shift with the largest sum of weights. The score is its share of all votes, 0 without any region.
     """
     if not len(asking):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)

@@ -57,11 +57,9 @@ def block_means(per_pixel: Array, cell_px: int) -> Array:
 def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
     """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result equals
     `block_means(entropy(grey), cell_px) >= threshold`, where `which` names the entropy: "filled_bins" or "shannon".
-
-    Cheap bounds of the entropy decide nearly every block, and only the pixels under the others are computed exactly.
-    `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1),
-    False where `among`, bool of this shape, is False (True: consider all).
-    """
+    Cheap bounds decide nearly every block, and only the pixels under the others are computed exactly. `grey` is uint8
+    (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1), False where `among`,
+    bool of this shape, is False (True: consider all)."""
     bounds = _BOUNDS[which](grey, cell_px)
     low = bounds.low
     undecided = (bounds.blocks(low) < threshold + _ROUNDING) & (bounds.blocks(bounds.high) >= threshold - _ROUNDING)

@@ -74,13 +74,11 @@ def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
 
 
 def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
-    """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2).
-
-    The steps are: the square root of the image over its maximum, central differences, and the gradient magnitude, which
-    is shared between the two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or
-    uint8 (H, W), 0 to 255, with sides that are multiples of `cell_px`. Pixels where the bool (H, W) `allowed` is False
-    do not count (None: all do). Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0.
-    """
+    """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2):
+    the square root of the image over its maximum, central differences, and the gradient magnitude, shared between the
+    two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to 255,
+    with sides that are multiples of `cell_px`. Pixels where the bool (H, W) `allowed` is False do not count (None: all
+    do). Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0."""
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border

@@ -94,12 +94,10 @@ def of_place(patterns: Array, good: Bools, side: int) -> Bytes:
 
 def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
     """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
-
-    `turned_deg` (N,) is the rotation under which each place is expected. Then only the nearest rotation and the two
-    beside it are scored, and the others are -inf. If it is NaN, or None, all are scored. `likely` bool (N,) tells which
-    places may be compared by the fine grid (None: all). A pair that is compared by the fine grid has a score of 0 to 1;
-    any other has its score by the coarse grid, less 1.
-    """
+    `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two beside it
+    are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,) tells which places may be
+    compared by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse
+    grid, less 1."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
     turns = np.full(len(rows), -1)
     if turned_deg is not None:

@@ -33,8 +33,8 @@ Head = Callable[[Singles], Singles]  # from an output of a network to a vector, 
 
 
 class NetworkVector(VectorTechnique):
-    """A technique whose vector is made by a function `head` of one output of a network (None: the vector is the output
-    itself). The head raises ModelError for a feature map that is too small for it. `spec` are further arguments of
+    """A technique whose vector is made by the function `head` of one output of a network (None: it is the output
+    itself). The head raises ModelError for a feature map that is too small. `spec`: further arguments of
     `VectorTechnique`."""
 
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
@@ -49,8 +49,8 @@ class NetworkVector(VectorTechnique):
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
     """Make `calc`: the output `descriptor` of the network with the card `model`, a convolutional autoencoder that
-    learned to give the HOG of a picture from a changed copy of it. Vectors are compared by cosine, and kept in RAM in
-    the `form` "float", "8bit" or "1bit".
+    learned to give the HOG of a picture from a changed copy of it, compared by cosine. `form` is "float", "8bit" or
+    "1bit".
 
     Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
     histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.
@@ -67,8 +67,8 @@ def alexnet(
     from `seed`, compared by cosine.
 
     Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, in the form of thesis
-    4.2.1: `conv3` of AlexNet, projected as by `gaussian_projection`. The 1064 dimensions are those of the public code
-    of the thesis's author. The form `1bit` is the locality-sensitive hash of the paper's section IV-D.
+    4.2.1: `conv3` of AlexNet, projected; 1064 dimensions as in the public code of the thesis's author. The form `1bit`
+    is the locality-sensitive hash of the paper's section IV-D.
     """
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
@@ -83,30 +83,27 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
     `conv5` of a network trained from scratch on the places of SPED (give its card as `model`), with spatial pyramid
-    pooling. The vector is divided by its sum: the L1 difference then compares the distribution of the activations, not
-    their total, and finds more places on the data sets used for tuning.
+    pooling. The vector is divided by its sum, so that the L1 difference compares how the activations are distributed:
+    that finds more places on the tuning sets.
     """
     return _pyramid("amosnet", model, form, threads, levels)
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1).
-
-    Its top five convolutional layers were started from CaffeNet instead of from scratch. Only the weights differ, so
-    give their card as `model`. With the same card both techniques are equal.
-    """
+    """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1), whose top five
+    convolutional layers were started from CaffeNet instead of from scratch. Give their card as `model`."""
     return _pyramid("hybridnet", model, form, threads, levels)
 
 
 def netvlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, words: int = 64, assignment: str = "soft"
 ) -> NetworkVector:
-    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, compared by
-    cosine. The `assignment` of a position to the words is "soft" or "hard".
+    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, compared by cosine.
+    The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1, not whitened. The paper trains words and network together. Here the words are learned afterwards (by
-    models/recipes/train_words.py), which is how the paper starts (its section 3.1).
+    thesis 4.2.1, not whitened. The paper trains words and network together, but starts from words learned afterwards
+    (section 3.1), which is what models/recipes/train_words.py makes.
     """
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
@@ -129,8 +126,7 @@ def region_vlad(
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length
-    1, and so has each word's part of the vector. The authors' code takes the signed square root of these parts instead,
-    which finds fewer places on the data sets used for tuning.
+    1, and so has each word's part of the vector; its signed square root, as in the authors' code, finds fewer places.
     """
     backbone = region_backbone("region_vlad", model, threads, regions)
     learned, sha256 = load_words(model, "regions", words)
@@ -143,9 +139,9 @@ def region_vlad(
 
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make the technique of a card: the vector of its network. A map records no parameters of it, since the hash of the
-    network in the map covers them. The margins of its wrong matches are unknown: no match is accepted until the
-    configuration sets a minimum margin."""
+    """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
+    network covers them. No match is accepted until the configuration sets a minimum margin: that of wrong matches is
+    unknown."""
     backbone = Backbone(card, "descriptor", threads)
     sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)

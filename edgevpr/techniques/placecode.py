@@ -29,25 +29,18 @@ _ENOUGH = (SIDE - abs(_DX)) * (SIDE - abs(_DY)) >= _MIN_OVERLAP * SIDE**2
 SHIFTS = np.stack([_DX[_ENOUGH], _DY[_ENOUGH]], axis=1).astype(np.int8)
 
 
-def grid(blocks: Singles, seen: Bools) -> tuple[Singles, Bools]:
-    """Make the grid of a picture from the blocks float32 (n, n, 4 L) where `seen`, bool (n, n), is True. A block has L
-    numbers, one per orientation, for each of its 2x2 cells. These four are averaged, then the blocks in each of 12x12
-    larger cells. Each cell has length 1, so that contrast and haze do not count. Returns the grid float32 (12, 12, L),
-    and bool (12, 12), True where at least half of the cell is seen."""
-    n, bins = len(blocks), blocks.shape[2] // 4
-    source = blocks.reshape(n * n, 4, bins).mean(axis=1) * seen.reshape(-1, 1)
-    at = _sources(n)
-    cells = source[at].mean(axis=1)
-    cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
-    return cells.reshape(SIDE, SIDE, bins), (seen.ravel()[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
-
-
-def middle(per_block: Array, seen: Bools) -> Array:
-    """Cut out the middle square, at least 12 wide, of values per block, so that it holds no border of the picture.
-    `seen`, bool (n, n), is True for blocks that belong to the picture."""
+def grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
+    """Make the grid of a picture from its blocks float32 (n, n, 4 L): from the middle square, at least 12 wide, of
+    those `seen`, bool (n, n), so that it holds no border of the picture. A block has L numbers, one per orientation,
+    for each of its 2x2 cells. These four are averaged, then the blocks `counted`, bool (n, n), in each of 12x12 larger
+    cells. Each cell has length 1, so that contrast and haze do not count. Returns the grid float32 (12, 12, L), and
+    bool (12, 12), True where at least half of the cell is counted."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
-    start = (len(seen) - n) // 2
-    return per_block[start : start + n, start : start + n]
+    middle, at = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _sources(n)
+    per_block, counts = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), counted[middle, middle].ravel()
+    cells = (per_block * counts[:, None])[at].mean(axis=1)
+    cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
+    return cells.reshape(SIDE, SIDE, -1), (counts[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
 def special(grids: Floats, mean: Floats) -> Array:

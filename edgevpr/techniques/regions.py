@@ -67,9 +67,9 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
     `model` is the card of the network, `form` the form of the vector in RAM, `threads` the network's number of threads.
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
-    the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised. The squares of two pictures are matched
-    mutually, without a check of geometry. The coarse part is the sum of the squares' vectors, which the paper compares
-    by cosine. The quality is the share of squares with any activation.
+    the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without a check of
+    geometry. The coarse part is the sum of the squares' vectors. The quality is the share of squares with any
+    activation.
     """
     backbone = open_backbone(model, "features", threads)
     squares = square_regions(*backbone.shape[1:])
@@ -91,7 +91,7 @@ def cross_region_bow(
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
-    `conv5_2`; a card names one feature map, which is used for both.
+    `conv5_2`; here one feature map is used for both.
     """
     backbone = region_backbone("cross_region_bow", model, threads, regions)
     learned, sha256 = load_words(model, "bow", words)

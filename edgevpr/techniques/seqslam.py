@@ -14,6 +14,7 @@ from edgevpr.core.arrays import Array, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import UsageError
 
+_SEQUENCE = 10  # queries that are matched together, unless the configuration sets another number
 _WINDOW = 10  # R_window of the paper: five places before and five after
 _GREYEST = 128  # a pixel as bright as the mean of its patch
 _STEPS = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
@@ -22,28 +23,25 @@ _LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation do
 
 class SeqSlam:
     """SeqSLAM: a place is a small picture of `width` x `height` pixels, a byte each (2 KB by default), normalised in
-    patches of `patch` x `patch` pixels. `sequence` is the number of successive queries that are matched together. The
-    map does not depend on it."""
+    patches of `patch` x `patch` pixels."""
 
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
     min_margin = 0.25  # of one query; wrong matches on corridor and aerial_caliterra (tuning) had less than 0.16
     min_quality = 0.4  # real pictures have 0.8 or more
 
-    def __init__(self, width: int = 64, height: int = 32, patch: int = 8, sequence: int = 10) -> None:
+    def __init__(self, width: int = 64, height: int = 32, patch: int = 8) -> None:
         if not (2 <= patch <= width <= 512 and patch <= height <= 512 and width % patch == height % patch == 0):
             raise UsageError(
                 f"seqslam cannot use width={width}, height={height}, patch={patch}: width and height must be "
                 "multiples of patch (at least 2 pixels), at most 512."
             )
-        if not 1 <= sequence <= 100:
-            raise UsageError(f"seqslam cannot match {sequence} queries together: sequence must be 1 to 100.")
         self._width, self._height, self._patch = width, height, patch
         self.spec = TechniqueSpec(
             name="seqslam",
             parameters={"width": width, "height": height, "patch": patch},
             coarse=PartSpec((width * height,), "|u1"),
-            sequence=sequence,
+            sequence=_SEQUENCE,
         )
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:

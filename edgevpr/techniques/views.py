@@ -149,11 +149,7 @@ def turned_blocks(blocks: Singles, quarters: int) -> Singles:
     """Turn the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
     orientations must be a multiple of 4. The result equals the blocks of the turned picture, but for rounding."""
     for _ in range(quarters % QUARTERS):
-        blocks = np.rot90(_turned_block(blocks))
+        cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
+        oriented = np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1)  # orientations turn from x to y (down)
+        blocks = np.rot90(oriented.reshape(blocks.shape))
     return np.ascontiguousarray(blocks)
-
-
-def _turned_block(blocks: Singles) -> Singles:
-    """Turn each of the blocks (..., 4 L) counter-clockwise by a quarter turn; orientations turn from x to y (down)."""
-    cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
-    return np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1).reshape(blocks.shape)

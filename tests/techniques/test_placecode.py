@@ -6,6 +6,7 @@ from edgevpr.techniques import placecode
 from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
 
 _CELL_PX = 512 / 12
+ALL = np.ones((31, 31), bool)
 
 
 def _picture(seed: int, side_px: int = 1024) -> np.ndarray:
@@ -32,13 +33,13 @@ def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0) -> np.ndarray
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
     grounds = [_picture(seed) for seed in range(12)]
-    grids = np.stack([placecode.grid(_blocks(_view(ground)), np.ones((31, 31), bool))[0] for ground in grounds])
+    grids = np.stack([placecode.grid(_blocks(_view(ground)), ALL, ALL)[0] for ground in grounds])
     mean = grids.mean(axis=0)
     return grounds, mean, placecode.pack(grids, mean)
 
 
 def _ask(image: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    return placecode.hypotheses(*placecode.grid(_blocks(image), np.ones((31, 31), bool)), mean)
+    return placecode.hypotheses(*placecode.grid(_blocks(image), ALL, ALL), mean)
 
 
 def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
@@ -70,7 +71,7 @@ def test_what_a_mask_hides_says_nothing(town):
     image[:, 256:] = 0  # part of the aircraft
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
-    grid, in_view = placecode.grid(_blocks(image), seen)
+    grid, in_view = placecode.grid(_blocks(image), ALL, seen)
     asked = placecode.hypotheses(grid, in_view, mean)
     assert placecode.scan(asked, codes).argmax() == 2
     assert _best_shift(asked, codes[2]) == [0, 0]
