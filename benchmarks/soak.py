@@ -1,5 +1,5 @@
-"""An hour of flight, looked at from outside: `make soak MINUTES=60` writes benchmarks/results/soak.md, soak.json and
-soak.png, and ends with code 1 where memory, descriptors or threads grow.
+"""An hour of flight, looked at from outside: `make soak MINUTES=60` writes benchmarks/results/soak.md and soak.json,
+and ends with code 1 where memory, descriptors or threads grow.
 
 python benchmarks/soak.py [--minutes M]
 
@@ -24,9 +24,9 @@ from tempfile import TemporaryDirectory
 import base
 import psutil
 import yaml
-from base import RESULTS, Row
+from base import Row
 from rtsp_camera import free_port
-from soak_page import draw, page, verdict
+from soak_page import page, verdict
 from soak_world import FOV_DEG, Autopilot, FilmCamera, make_world
 
 from edgevpr.core.errors import EdgevprError
@@ -51,7 +51,6 @@ def main() -> None:
     with TemporaryDirectory(prefix="edgevpr-soak-") as folder:
         found = base.made_by() | run(Path(folder), 60 * minutes, _EVERY_S)
     base.write("soak", found, page(found))
-    draw(found, RESULTS / "soak.png")
     sys.exit("\n".join(f"soak: {each}" for each in verdict(found)) or None)
 
 

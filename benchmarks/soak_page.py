@@ -1,7 +1,5 @@
-"""The verdict over a soak, its page and its picture. A sample is a look at the process `t_s` after its first query:
+"""The verdict over a soak, and its page. A sample is a look at the process `t_s` after its first query:
 `away` names what is not there, `is_calm` says that all has been there for a while."""
-
-from pathlib import Path
 
 import base
 import numpy as np
@@ -80,28 +78,7 @@ Statuses read: {soak["statuses"]}.
 The flight: {soak["end"].get("queries", 0):g} queries, {soak["end"].get("accepted", 0):g} accepted; {cores:.2f} cores;
 flight log at most {max(each["log_mb"] for each in samples):.2f} MB, tlog {samples[-1]["tlog_mb"]:.1f} MB;
 {soak["tracebacks"]} tracebacks, exit code {soak["exit_code"]}.
-
-![memory, descriptors and threads, and files over time](soak.png)
 """
-
-
-def draw(soak: Row, path: Path) -> None:
-    """Draw the figures over time; what is away is shaded."""
-    samples = soak["samples"]
-    t_min = np.array([each["t_s"] for each in samples]) / 60
-    drawn, axes = base.panels(10, 6, 3, 3, sharex=True)
-    panels = {"memory, MB": ("rss_mb",), "count": ("descriptors", "threads"), "files, MB": ("log_mb", "tlog_mb")}
-    for axis, (label, names) in zip(axes, panels.items(), strict=True):
-        for name in names:
-            axis.plot(t_min, [each[name] for each in samples], lw=1.2, label=name.removesuffix("_mb"))
-        away = [bool(each["away"]) for each in samples]
-        axis.fill_between(t_min, 0, 1, away, transform=axis.get_xaxis_transform(), color="#eeeeee", zorder=0)
-        axis.set(ylabel=label, xlim=(0, t_min[-1]))
-        axis.legend(loc="lower right", fontsize=8)
-    first_mb = growth(samples)["first_mb"]
-    axes[0].axhspan(first_mb, first_mb + GROWTH_MB, color="C0", alpha=0.08, linewidth=0)
-    axes[2].set_xlabel("minutes of flight (shaded above: the growth that is allowed; beside: something is away)")
-    base.save(drawn, path)
 
 
 def _range(counts: list[int]) -> str:

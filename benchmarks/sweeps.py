@@ -15,11 +15,9 @@ Where a view shows nothing it is black and masked, so no edge of it is taken for
 picture starts from the view that is not turned. Techniques are opened as they fly; maps of `cohog` are refined and
 calibrated as `map build` does. The networks run on the one that edgevpr ships, `calc`. `seqslam` needs a flight.
 
-What is measured of a set stays in sweeps_work/, so that an interrupted run goes on. `--techniques cohog` measures that
-technique anew and keeps the other rows of the page.
+What is measured of a set stays in sweeps_work/, so that an interrupted run goes on.
 """
 
-import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -79,40 +77,22 @@ Asked = tuple[Recogniser, Shown, list[str]]  # a walk over a map, what it is sho
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--techniques", metavar="A,B", help="those to measure anew (default: all)")
-    wanted = parser.parse_args().techniques
     rows: list[Row] = []
     for folder in base.find_sets(names=SETS):
-        if wanted:
-            rows += swept(folder, tuple(wanted.split(",")))
-        else:
-            rows += base.kept(WORK / f"{folder.name}.json", partial(swept, folder))
+        rows += base.kept(WORK / f"{folder.name}.json", partial(swept, folder))
     found = {**base.made_by(), "rows": rows}
-    if wanted:
-        found = with_anew(base.read("sweeps"), found)
-        rows = found["rows"]
     base.write("sweeps", found, page(found))
     draw(rows, RESULTS / "sweeps.png")
 
 
-def with_anew(before: Row, anew: Row) -> Row:
-    """Return what was found before, with the rows that were measured anew in their places, and when that was."""
-    rows = {(row["set"], row["technique"]): row for row in anew["rows"]}
-    names = list(dict.fromkeys(row["technique"] for row in anew["rows"]))
-    again = {**before.get("again", {}), **{name: {key: anew[key] for key in ("commit", "date")} for name in names}}
-    kept = [rows.get((row["set"], row["technique"]), row) for row in before["rows"]]
-    return {**before, "again": again, "rows": kept}
-
-
-def swept(folder: Path, names: tuple[str, ...] = TECHNIQUES) -> list[Row]:
+def swept(folder: Path) -> list[Row]:
     """Return what each technique finds in its map of a set, at all levels of all sweeps."""
     camera = camera_of(folder.name)
     starts = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder))
-    rows = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in names]
+    rows = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
     with ExitStack() as stack:
         asked = []
-        for name in names:
+        for name in TECHNIQUES:
             technique, shown = create(name, {"camera": camera} if name == "cohog" else {}), Shown()
             place_map, index, _ = stack.enter_context(walks.map_of(folder, technique, folder / "ref"))
             walk = walks.walk(place_map, index, technique, levelling=shown)
@@ -244,8 +224,7 @@ def page(found: Row) -> str:
         parts.append(f"## {name} ({base.use_of(name).replace('tune', 'tuned on')})")
         parts.append("recall@1; in brackets accepted and, of these, wrong.")
         parts.append(base.table(lines, columns))
-    again = [f"`{name}` again at commit {of['commit']}, {of['date']}." for name, of in found.get("again", {}).items()]
-    return "\n\n".join([*parts, " ".join([base.made_line(found, "make sweeps"), *again])])
+    return "\n\n".join([*parts, base.made_line(found, "make sweeps")])
 
 
 def draw(found: list[Row], path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from foreign_places import GENERATED, MIRRORED, foreign
 from sites import chosen, covering
 from sweep_changes import OF_CAMERA, SWEEPS, spoilt, view
-from sweeps import with_anew
 
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 
@@ -85,11 +84,3 @@ def test_a_sweep_of_the_picture_starts_from_hardly_any_and_goes_on(sweep):
         off.append(float(np.abs(after - grey).mean()))
     assert off[0] < 2
     assert off[-1] > off[0] + 1
-
-
-def test_what_is_measured_anew_takes_its_place_and_the_others_stay():
-    before = {"commit": "a", "date": "1", "rows": [{"set": "s", "technique": name, "levels": [1]} for name in "xyz"]}
-    anew = {"commit": "b", "date": "2", "rows": [{"set": "s", "technique": "y", "levels": [2]}]}
-    found = with_anew(before, anew)
-    assert [row["levels"] for row in found["rows"]] == [[1], [2], [1]]
-    assert (found["commit"], found["again"]) == ("a", {"y": {"commit": "b", "date": "2"}})

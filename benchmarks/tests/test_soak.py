@@ -3,7 +3,7 @@
 import base
 import pytest
 import soak
-from soak_page import draw, growth, page, verdict
+from soak_page import growth, page, verdict
 
 
 def made_up(grown_mb_s: float = 0.0, later: dict | None = None, last: dict | None = None, **more: object) -> dict:
@@ -66,5 +66,3 @@ def test_a_real_soak_of_some_seconds(tmp_path):
     assert 0 < last["log_mb"] <= found["log_limit_mb"]
     assert all(each["rss_mb"] > 0 for each in found["samples"])
     assert "autopilot frozen: 1" in page(base.made_by() | found)
-    draw(found, tmp_path / "soak.png")
-    assert (tmp_path / "soak.png").stat().st_size > 1000
