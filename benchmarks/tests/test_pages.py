@@ -21,7 +21,6 @@ PAGES = {
     "height_and_tilt": "height_and_tilt",
     "hostile": "hostile",
     "peers": "peers",
-    "replay": "recorded",
     "salience": "bench_salience",
     "sites": "sites",
     "soak": "soak",
