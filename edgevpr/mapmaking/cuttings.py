@@ -14,8 +14,7 @@ from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.missions import Area
-from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, local_crs
-from edgevpr.mapmaking.rasters import CRS, geometry_mask, rasterio, transform
+from edgevpr.mapmaking.orthophoto import CRS, WGS84, Orthophoto, geometry_mask, local_crs, rasterio, transform
 
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels

@@ -28,8 +28,9 @@ from edgevpr.core.arrays import Complexes, Floats
 _ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
 _MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that ends them, as a share of a footprint
 _LONGEST_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
-_FIRST = 3.0  # first estimate of `Solved.times`
-_LEAST = 0.5  # least value of `Solved.times`: ties that agree well by chance must not make the others look wrong
+# Factor from the given to the real standard deviations of ties: the first estimate, and the least, since ties that
+# agree well by chance must not make the others look wrong.
+_FIRST, _LEAST = 3.0, 0.5
 _LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions: the least, and the first estimate
 _GONE = 0.1  # a tie or position with a smaller weight counts as contradicting the others
 _MEDIAN_OF_FOUR = 1.832  # median length of a vector of four standard normal numbers
@@ -41,8 +42,7 @@ _AT_ONCE = 256  # columns of the inverse that are computed together
 class Ties:
     """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the numbers of the two pictures.
     `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are the
-    standard deviations of step and turn along one axis, up to a factor that all share; `solve` estimates this factor
-    (`Solved.times`)."""
+    standard deviations of step and turn along one axis, up to a factor that all share, which `solve` estimates."""
 
     query: np.ndarray
     place: np.ndarray
@@ -61,7 +61,6 @@ class Solved:
     (N,): footprint and direction, see the module.
     `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
     `component`, int (N,): number of the group of places, connected by ties, that each place belongs to.
-    `times`: factor from the given to the real standard deviations of ties.
     `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
     `recorded_counts` (N,), `ties_count` (T,): bool, False for positions and ties that contradict the others."""
 
@@ -70,7 +69,6 @@ class Solved:
     position_var: np.ndarray
     log_var: np.ndarray
     component: np.ndarray
-    times: float
     recorded_sd_m: float
     recorded_counts: np.ndarray
     ties_count: np.ndarray
@@ -102,7 +100,6 @@ def solve(recorded: np.ndarray, ties: Ties) -> Solved:
         position_var=variance[:count],
         log_var=variance[count:],
         component=component,
-        times=times,
         recorded_sd_m=scatter_m,
         recorded_counts=_agree(off_m / sd_m) >= _GONE,
         ties_count=agree >= _GONE,

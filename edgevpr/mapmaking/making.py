@@ -96,13 +96,12 @@ class MapOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
-    """Result of `make_map`. `technique`, `cells`: name of the technique, and its `TechniqueSpec.cells`. `places`,
-    `with_position`: number of places in the map, and of those that have a position.
+    """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
+    those that have a position.
     `result`: counts of the frames read. `refined`, `calibration`: results of refining and calibrating (None: not done).
     `without_data`: number of places left out because the orthophoto has no data there (None: made from a flight)."""
 
     technique: str
-    cells: int | None
     places: int
     with_position: int
     result: MappingResult
@@ -141,8 +140,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 remove(path)
             raise
         refined, calibration = None, None
-        if order.refine and technique.spec.cells is not None:
-            images = pictures.source if isinstance(pictures, FlownPictures) and Path(pictures.source).is_dir() else None
+        if order.refine and technique.spec.cells is not None and isinstance(pictures, FlownPictures):
+            images = pictures.source if Path(pictures.source).is_dir() else None
             with _if_possible("refined"):
                 refined = refine_map(place_map, technique, images, shown)
         if order.calibrate and kinds_of(technique.spec):
@@ -150,7 +149,6 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 calibration = calibrate_map(place_map, technique, config, pictures, shown)
         return MadeMap(
             technique=technique.spec.name,
-            cells=technique.spec.cells,
             places=len(place_map),
             with_position=info_of(place_map).with_position,
             result=result,

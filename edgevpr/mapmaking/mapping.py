@@ -5,9 +5,8 @@ arise (thesis 3.4.8), the other frames are held back ("wait"). After `most_frame
 place, all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -91,14 +90,14 @@ def _frame_of(event: Recognition) -> Frame:
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
-    `not_memorable`: frames that failed the salience criteria, by the criterion that failed."""
+    `not_memorable`: frames left out because they failed a salience criterion."""
 
     added: int = 0
     without_position: int = 0
     already_here: int = 0
     of_low_quality: int = 0
     says_nothing: int = 0
-    not_memorable: dict[str, int] = field(default_factory=dict)
+    not_memorable: int = 0
 
 
 def build_map(
@@ -122,7 +121,7 @@ def build_map(
     walk = Recogniser(matcher, place_map, meter, preparation=preparation or Preparation())
     gaps = gaps or Gaps()
     ids_by_image = place_map.ids_by("source_image")
-    result, not_memorable = MappingResult(), Counter[str]()
+    result = MappingResult()
 
     def keep(kept: Iterable[Kept]) -> None:
         for event, salience in kept:
@@ -131,9 +130,9 @@ def build_map(
             place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
             result.added += 1
             result.without_position += frame.position is None
-            if salience and salience.is_low and event.worth:
+            if salience and salience.is_low:
                 result.of_low_quality += 1
-                not_memorable[event.worth.lacks or ""] -= 1
+                result.not_memorable -= 1
 
     for frame in frames:
         event = walk.step(frame)
@@ -147,9 +146,7 @@ def build_map(
         elif any(place_map.is_of(at, event.descriptor.coarse) for at in ids_by_image.get((readable(frame.name),), ())):
             result.already_here += 1
         else:
-            if event.worth and event.worth.lacks:
-                not_memorable[event.worth.lacks] += 1
+            result.not_memorable += bool(event.worth and event.worth.lacks)
             keep(gaps.take(event))
     keep(gaps.end())
-    result.not_memorable = dict(+not_memorable)
     return result

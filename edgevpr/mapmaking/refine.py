@@ -20,7 +20,7 @@ from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.mapmaking.graph import Solved, solve
 from edgevpr.mapmaking.mapping import Watch
-from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, pictures, tied, ties_of
+from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, tied, ties_of
 from edgevpr.places.mapfile import PlaceMap
 
 _LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
@@ -69,7 +69,7 @@ def refine(
     recorded_at = [_recorded(place) for place in placed]
     east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
-    look = looker(place_map, technique, placed, pictures(images, technique) if images else None)
+    look = looker(place_map, technique, placed, images)
     pairs = likely_pairs(recorded)
     ties = tied(watch(pairs, len(pairs)), look)
     solved = solve(recorded, ties_of(ties))

@@ -56,7 +56,6 @@ class Tie(NamedTuple):
 
 Pair = tuple[int, int]  # the numbers of query and place, the later one first
 Look = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie found
-Encoded = Callable[[str], Descriptor | None]  # encodes the picture of this name; None: it cannot be used
 
 
 def likely_pairs(recorded: Complexes) -> list[Pair]:
@@ -103,10 +102,11 @@ def ties_of(tie_of: dict[Pair, Tie]) -> Ties:
     return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
 
 
-def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encoded: Encoded | None) -> Look:
+def looker(place_map: PlaceMap, technique: Technique, places: list[Place], images: str | Path | None) -> Look:
     """Return the function that compares two of `places`, given by their indices in this list, and returns their tie
-    (None: none is found). `encoded` encodes the places' pictures (None: they are not at hand, so only landmarks are
+    (None: none is found). `images` is the folder of their pictures (None: they are not at hand, so only landmarks are
     compared)."""
+    paths = {decoded_name(path.name): path for path in list_images(images)} if images else {}
     coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
 
     @lru_cache(_KEPT)
@@ -119,8 +119,13 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
 
     @lru_cache(_KEPT_PICTURES)
     def descriptor(at: int) -> Descriptor | None:
-        found = encoded(places[at].source_image) if encoded else None
-        return found if found and place_map.is_of(places[at].place_id, found.coarse) else None
+        if (path := paths.get(places[at].source_image)) is None:
+            return None
+        try:
+            found = technique.encode(read_image(path))
+        except EdgevprError:
+            return None
+        return found if place_map.is_of(places[at].place_id, found.coarse) else None
 
     def by_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
         one, other = landmarks(query), landmarks(place)
@@ -148,20 +153,6 @@ def looker(place_map: PlaceMap, technique: Technique, places: list[Place], encod
         return tie or (_tie(vote, _OF_VOTE) if match.score >= _VOTE else None)
 
     return look
-
-
-def pictures(folder: str | Path, technique: Technique) -> Encoded:
-    """Return a function that is given the name of a picture in `folder`, and returns its descriptor (None: the picture
-    is missing or cannot be used)."""
-    paths = {decoded_name(path.name): path for path in list_images(folder)}
-
-    def encoded(name: str) -> Descriptor | None:
-        try:
-            return technique.encode(read_image(paths[name])) if name in paths else None
-        except EdgevprError:
-            return None
-
-    return encoded
 
 
 def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:

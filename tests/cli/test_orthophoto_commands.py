@@ -162,7 +162,7 @@ def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, g
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)
     assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0
     built = json.loads(capsys.readouterr().out)
-    assert built["places"] == 6
+    assert built["places"] == 9
     assert "calibration" not in built
     assert run("map", "calibrate", path, *cut, "--json") == 0
     found = json.loads(capsys.readouterr().out)["calibration"]

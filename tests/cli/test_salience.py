@@ -81,7 +81,7 @@ def test_frames_of_little_worth_are_left_out_and_a_gap_is_bounded_by_the_best_of
     assert max(np.diff([14, *low, 45])) <= 21
     assert built["added"] == len(places)
     assert built["of_low_quality"] == len(low)
-    assert built["not_memorable"] == {"entropy": 30 - len(low)}
+    assert built["not_memorable"] == 30 - len(low)
     capsys.readouterr()
     assert main(["map", "info", str(place_map)]) == 0
     assert f"  salience    {len(low)} of low quality" in capsys.readouterr().out

@@ -229,7 +229,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
         frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
         place_map.add(frame, descriptor)
     found, (place,) = refined_of(tmp_path / "m.gpkg")
-    assert (found.surveyed, found.refined, found.not_tied) == (1, 0, 0)
+    assert (found.surveyed, found.refined) == (1, 0)
     assert place.pose == lies
 
 
