@@ -71,9 +71,9 @@ def _descriptors(
 
     def described(picture: Image) -> Singles:
         features = backbone.run(picture)
-        return (
-            local_descriptors(features) if kind == "vlad" else describe(features, find_regions(features, REGIONS[kind]))
-        )
+        if kind == "vlad":
+            return local_descriptors(features)
+        return describe(features, find_regions(features, REGIONS[kind]))
 
     share = -(-max(_POINTS, _POINTS_PER_WORD * count) // sum(len(list_images(name)) for name in folders))
     points = []
