@@ -73,8 +73,12 @@ def levelling_of(
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal:
             return None
-    is_now = config.uri is not None and is_live(config.uri)
-    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now)
+    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now(config))
+
+
+def is_now(config: SourceConfig) -> bool:
+    """Return True if frames are taken now, so that the autopilot's reports hold for them."""
+    return config.uri is not None and is_live(config.uri)
 
 
 def seen_as(frame: Frame, view: View) -> Frame:

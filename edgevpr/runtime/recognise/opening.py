@@ -10,7 +10,6 @@ from edgevpr.core.config import Config, SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, mask_of
-from edgevpr.frames.source import is_live
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
@@ -24,7 +23,7 @@ from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import levelling_of
+from edgevpr.runtime.recognise.levelling import is_now, levelling_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
 from edgevpr.techniques.card import load_card
@@ -50,8 +49,7 @@ def open_recogniser(config: Config, board: Board, *, narrowed: bool = False, fol
         technique = technique_of(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
-        prior = _in_flight(config, technique) if narrowed else None
-        recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
+        recogniser = _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
         on_error.pop_all()
     return recogniser
 
@@ -73,8 +71,8 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         index_positions(place_map)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior, follows = _in_flight(config, technique), config.match.follow
-        recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
+        index, follows = growing.index, config.match.follow
+        recogniser = _recogniser(config, board, technique, place_map, index, narrowed=True, follows=follows)
         on_error.pop_all()
     return recogniser, growing
 
@@ -174,15 +172,6 @@ def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
-def _in_flight(config: Config, technique: Technique) -> Prior:
-    """Make what narrows the queries of a flight."""
-    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, _is_now(config))
-
-
-def _is_now(config: Config) -> bool:
-    return config.source.uri is not None and is_live(config.source.uri)
-
-
 def _recogniser(
     config: Config,
     board: Board,
@@ -190,18 +179,21 @@ def _recogniser(
     place_map: PlaceMap,
     index: PlaceIndex,
     *,
-    prior: Prior | None,
+    narrowed: bool,
     follows: bool,
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
     matcher = Matcher(technique, index, rule, search_of(length))
-    mask = mask_of(config.source.mask)
+    mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
-    follower = None
+    prior = follower = None
+    # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
+    if narrowed and matcher.search is None:
+        prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_live)
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and kinds_of(technique.spec):
-        follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=_is_now(config))
+        follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
     levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
     recogniser = Recogniser(
@@ -210,11 +202,10 @@ def _recogniser(
         meter_of(config, board),
         WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=config.mavlink.min_accuracy_m),
         preparation=Preparation(levelling=levelling, mask=mask, gate=gate_of(config.salience, board.threads)),
-        # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
-        prior=None if matcher.search else prior,
+        prior=prior,
         follower=follower,
     )
-    if isinstance(prior, Prior):  # a flight
+    if narrowed:
         place_map.wait_at_most(_WAIT_S)
     return recogniser
 

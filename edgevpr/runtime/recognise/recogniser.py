@@ -132,8 +132,14 @@ class Recogniser:
         """
         self.meter.begin()
         event = Recognition(frame=frame, vehicle=vehicle)
+        preparation = self._preparation
         try:
-            picture, descriptor = self._encode(event, frame)
+            with self.meter.step("prepare"):
+                event.picture = picture = preparation.picture(frame, vehicle)
+            with self.meter.step("gate"):
+                event.worth = preparation.gate.look(frame.image) if preparation.gate else None
+            with self.meter.step("encode"):
+                event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
             verdict, where = self._recognise(event, frame, picture, descriptor)
             event.accepted, event.reason = verdict.accepted, verdict.reason
             if event.accepted and where:
@@ -158,17 +164,6 @@ class Recogniser:
         down."""
         picture = event.picture if self.technique.spec.cells else None
         return packed(describe(picture.image, picture.mask)) if picture else None
-
-    def _encode(self, event: Recognition, frame: Frame) -> tuple[Levelled, Descriptor]:
-        """Prepare the picture of a frame, judge its worth by the gate, and encode it."""
-        preparation = self._preparation
-        with self.meter.step("prepare"):
-            event.picture = picture = preparation.picture(frame, event.vehicle)
-        with self.meter.step("gate"):
-            event.worth = preparation.gate.look(frame.image) if preparation.gate else None
-        with self.meter.step("encode"):
-            event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
-        return picture, descriptor
 
     def _recognise(
         self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor
