@@ -55,13 +55,10 @@ def of_refined(path: str, refined: "Refined") -> Iterator[str]:
     if refined.footprint_m:
         moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
         yield f"  position    {moved}; as recorded they scatter by {refined.recorded_sd_m:.1f} m"
-        yield f"  footprint   {refined.footprint_m:.0f} m (median)"
     if refined.surveyed:
         yield f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
         yield f"  not tied    {not_tied} stay where they were recorded: a fix there is as fine as the spacing"
-    if refined.without_position:
-        yield f"  no position {refined.without_position} places"
     for place_id, image, off_m in refined.contradictory:
         yield f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies"
 
