@@ -59,10 +59,8 @@ def cores_online(root: Path = _ROOT) -> int:
 
 def cores(root: Path = _ROOT) -> float:
     """Return how many cores this process may use, by CPU affinity and the quotas (cpu.max) of its control groups."""
-    usable = float(len(os.sched_getaffinity(0)))
-    for quota_us, period_us in _cgroup_limits("cpu.max", root):
-        usable = min(usable, int(quota_us) / int(period_us))
-    return usable
+    quotas = (int(quota_us) / int(period_us) for quota_us, period_us in _cgroup_limits("cpu.max", root))
+    return min([float(len(os.sched_getaffinity(0))), *quotas])
 
 
 def ram_mb(root: Path = _ROOT) -> float:

@@ -61,8 +61,7 @@ class OwnMemory:
 
 class QueryMeter:
     """Measures the steps of one query after another, and the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) return seconds; `memory_mb` returns what `OwnMemory.look` does (None:
-    that method is used)."""
+    `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` what `OwnMemory.look` does (None: that)."""
 
     def __init__(
         self,
@@ -134,9 +133,8 @@ def query_cost(
 
 
 class RunningEnergy:
-    """Adds up the stages of a flight, from the creation of this object on: `marginal_j` is the energy that they added,
-    in joules at the board's input, and `stages_cpu_s` their CPU-seconds. `clock` returns wall seconds, `cpu_clock`
-    CPU-seconds of all threads."""
+    """Adds up the stages of a flight, from the creation of this object on: `marginal_j`, the energy that they added, in
+    joules at the board's input, and `stages_cpu_s`, their CPU-seconds. `cpu_clock` counts all threads."""
 
     def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
@@ -173,8 +171,7 @@ def machine_load() -> MachineLoad:
 
 class OwnLoad:
     """Measures two shares between two calls of `look`: how much of all `cores` this process uses, and for how much of
-    the time other programs keep its work waiting. `clock` returns wall seconds, `cpu_clock` CPU-seconds of all threads
-    of this process."""
+    the time other programs keep its work waiting. `cpu_clock` counts all threads of this process."""
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock

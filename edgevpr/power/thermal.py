@@ -55,8 +55,7 @@ class ThermalWatch:
 
     def _reasons(self, bits: int, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
         """Yield a pair for each sign that the machine slows down: True if it does so now (False: it is only a warning,
-        or over), and a text about the sign. `bits` are the flags of the firmware (0: none), `khz` is the CPU's
-        frequency now."""
+        or over), and a text. `bits` are the flags of the firmware (0: none), `khz` is the CPU's frequency now."""
         if now := [word for bit, word in _BITS if bits & bit]:
             yield bool(bits & _SLOWS), f"{', '.join(now)} now"
         if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:
@@ -75,9 +74,8 @@ class ThermalWatch:
 
 
 def limit_c(root: Path = Path("/")) -> float:
-    """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU's
-    zones. If the kernel has none (Raspberry Pi: its firmware slows it down), it is 80 degrees, or 10 below the point
-    where the machine switches off if that is lower."""
+    """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU.
+    If the kernel has none (Raspberry Pi), it is 80 degrees, or 10 below the point where the machine switches off."""
     trips: dict[str, list[float]] = {}
     for zone in _cpu_zones(root):
         for path in zone.glob("trip_point_*_type"):
