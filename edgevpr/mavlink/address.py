@@ -26,8 +26,7 @@ class LinkAddress:
 
 
 def parse_link(url: str) -> LinkAddress:
-    """Parse the text of a link, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError, with a message of one
-    sentence, for any text that has none of the forms in FORMS."""
+    """Parse the text of a link, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError for none of the FORMS."""
     kind, _, rest = url.partition(":")
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
@@ -41,8 +40,7 @@ def parse_link(url: str) -> LinkAddress:
 
 
 def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
-    """Parse the texts of the links to flight controller and ground station; None stands for no link. Raises
-    LinkAddressError for a text that is no address, and for a `ground` without a `flight`."""
+    """Parse the links to flight controller and ground station (None: no link). Raises LinkAddressError."""
     if flight is None and ground is not None:
         raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
     return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))

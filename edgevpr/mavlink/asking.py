@@ -6,12 +6,13 @@ import statistics
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.channel import Answers, Kind, kind_of
+from edgevpr.mavlink.channel import Kind, kind_of
 from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -28,7 +29,7 @@ _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTO
 _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
 
 
-class Inquiry:
+class Inquiry(AbstractContextManager["Inquiry"]):
     """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as every
     companion computer does, because some ports of autopilots do not answer without. Use it as a context manager, which
     raises LinkError when the connection is lost.
@@ -63,13 +64,8 @@ class Inquiry:
         try:
             self._port = open_port(address)
         except OSError as error:
-            raise LinkError(
-                f"{address} is not there ({error.strerror or error}): connect it or start the other end, or correct "
-                "the link."
-            ) from error
-
-    def __enter__(self) -> "Inquiry":
-        return self
+            why = error.strerror or error
+            raise LinkError(f"{address} is not there ({why}): connect it, start it, or correct the link.") from error
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
@@ -86,8 +82,7 @@ class Inquiry:
         self._first(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
-        """Request one message by its number (MAV_CMD_REQUEST_MESSAGE) and return it; None if the autopilot refuses, or
-        does not answer three requests."""
+        """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it; None: it was refused, or not answered."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(TRIES):
             sent_s = time.monotonic()
@@ -200,9 +195,8 @@ class AutopilotReading:
     clock_ahead_s: float | None
 
     @property
-    def asked(self) -> Answers:
-        """The answers on which the flight bases its choice of the channel."""
-        return Answers(kind=Kind(self.vehicle), parameters=self.parameters)
+    def kind(self) -> Kind:
+        return Kind(self.vehicle)
 
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:

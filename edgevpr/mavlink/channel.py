@@ -72,29 +72,19 @@ class Choice:
     lag_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answers:
-    """Answers of an autopilot on which the choice of a channel depends. `parameters`: values by name; parameters that
-    the autopilot does not have are left out."""
-
-    kind: Kind
-    parameters: Mapping[str, float]
-
-
 def kind_of(mav_type: int) -> Kind:
     """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
     in forward flight it dead-reckons as one, and its type does not tell whether it hovers."""
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), Kind.OTHER)
 
 
-def ardupilot_choice(answers: Answers) -> Choice:
+def ardupilot_choice(kind: Kind, parameters: Mapping[str, float]) -> Choice:
     """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
+    `parameters` has values by name, without those that the autopilot does not have.
 
     A plane dead-reckons without GPS for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
-    Without GPS and optical flow a copter lands after some seconds and a rover stops, and single fixes do not prevent
-    that.
+    Without GPS and optical flow a copter lands after some seconds and a rover stops, whatever single fixes say.
     """
-    parameters = answers.parameters
     for number in range(len(_RECEIVERS)):
         name = receiver_name(parameters, number)
         if parameters.get(name) == MAVLINK_GPS:
@@ -103,35 +93,27 @@ def ardupilot_choice(answers: Answers) -> Choice:
             return Choice(Channel.GPS_INPUT, reason, number, delay_ms / 1e3 if delay_ms else _GPS_LAG_S)
     if parameters.get(_VISION) == _MAVLINK_VISION:
         return Choice(Channel.ODOMETRY, f"ODOMETRY, as its {_VISION} is {_MAVLINK_VISION}")
-    if answers.kind is Kind.PLANE:
+    if kind is Kind.PLANE:
         return Choice(Channel.COMMAND, "command 43003, which a plane that reckons takes at any time")
     return Choice(
         Channel.COMMAND,
-        f"command 43003, which a {answers.kind.value} without GPS takes only as long as optical flow carries it: set "
+        f"command 43003, which a {kind.value} without GPS takes only as long as optical flow carries it: set "
         f"{receiver_name(parameters, SECOND)}={MAVLINK_GPS} to give it a continuous position",
     )
 
 
 def receiver_name(parameters: Mapping[str, float], number: int) -> str:
-    """Return the name of the parameter that sets the type of GPS receiver `number` (0: the first): GPS1_TYPE, or
-    GPS_TYPE in ArduPilot before 4.6."""
+    """Return the name of the parameter for the type of GPS receiver `number` (0: the first), before and since 4.6."""
     return _known_name(parameters, _RECEIVERS[number])
 
 
-def px4_choice(answers: Answers) -> Choice:
-    """Choose the channel for a PX4: message 296 if its parameter CONTROL lets it fuse positions, else command 43003.
-    PX4 ignores a message 296 that has no accuracy, and takes the delay of the position from one of its own
-    parameters."""
-    if not px4_can_fuse(answers):
+def px4_choice(_kind: Kind, parameters: Mapping[str, float]) -> Choice:
+    """Choose the channel for a PX4: message 296 if its parameter CONTROL lets it fuse positions, else command 43003."""
+    if CONTROL not in parameters:
         return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.17 has)")
-    if int(answers.parameters[CONTROL]) & FUSES_POSITION:
+    if int(parameters[CONTROL]) & FUSES_POSITION:
         return Choice(Channel.SENSOR, f"message 296, as its {CONTROL} fuses positions")
     return Choice(Channel.COMMAND, f"command 43003, as its {CONTROL} fuses no positions of message 296")
-
-
-def px4_can_fuse(answers: Answers) -> bool:
-    """Return True if this PX4 has message 296 in its firmware, so that its parameter CONTROL can switch it on."""
-    return CONTROL in answers.parameters
 
 
 def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
@@ -142,8 +124,8 @@ ARDUPILOT_PARAMETERS = (*(name for names in _RECEIVERS + _DELAYS for name in nam
 PX4_PARAMETERS = (CONTROL,)
 _OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
 # Name, the parameters on which the channel depends, and the function that chooses it.
-_Firmware = tuple[str, tuple[str, ...], Callable[[Answers], Choice]]
-_UNKNOWN: _Firmware = ("unknown firmware", (), lambda answers: _OF_ANY)
+_Firmware = tuple[str, tuple[str, ...], Callable[[Kind, Mapping[str, float]], Choice]]
+_UNKNOWN: _Firmware = ("unknown firmware", (), lambda kind, parameters: _OF_ANY)
 _FIRMWARES: dict[int, _Firmware] = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ARDUPILOT_PARAMETERS, ardupilot_choice),
     mavlink.MAV_AUTOPILOT_PX4: ("PX4", PX4_PARAMETERS, px4_choice),
@@ -202,6 +184,6 @@ class Interview:
     def _choose(self) -> None:
         self._is_over = True
         name, _, choose = _FIRMWARES.get(self._autopilot, _UNKNOWN)
-        self.choice = choose(Answers(kind=self._kind, parameters=self._parameters))
+        self.choice = choose(self._kind, self._parameters)
         version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
         log.info("%s%s on a %s: positions go to it by %s", name, version, self._kind.value, self.choice.reason)

@@ -150,8 +150,7 @@ class Conversation:
         return min(longest_s, max(0.0, self._state_due_s - self._clock()))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        """Choose and pack the next message. Returns None if nothing is due, else the packet, and the fix that it
-        contains (None: it contains none)."""
+        """Choose and pack the next message. Returns its packet and the fix in it, if any; None: nothing is due."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
             self.settings.signing.stamp(self._packer)
@@ -175,8 +174,7 @@ class Conversation:
         self.sent["COMMAND_INT"] += len(fixes)
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
-        """Process bytes received from `sender` (None: a link with one sender only) at `now_s`. Returns True if they
-        contain a heartbeat of the autopilot."""
+        """Process bytes received from `sender` at `now_s`. Returns True if they contain the autopilot's heartbeat."""
         is_ours = False
         for message in self.reader.feed(data, sender):
             if self.autopilot.hear(message, now_s, sender):
@@ -209,7 +207,7 @@ class Conversation:
     def break_off(self, lost_fixes: int) -> None:
         """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
-        self.autopilot.forget_presence()
+        self.autopilot.heard_s = -math.inf  # another one may be at the port when it is open again
         self.reader.forget_partial_message()
 
     def end(self) -> None:
@@ -241,8 +239,7 @@ class Conversation:
         return (self._messages.popleft(), None) if self._messages else None
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
-        """Make the next message of a continuous channel: a position or, once, the origin of the autopilot's local
-        frame. None: it is not due, or something is not known."""
+        """Make the next message of a continuous channel, if any: a position or, once, the origin of its local frame."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
@@ -250,7 +247,8 @@ class Conversation:
         t_s = now_s - choice.lag_s
         state = self.settings.listener.state_at(t_s)
         if choice.channel is Channel.GPS_INPUT:
-            return messages.gps_input(state, choice.receiver, t_s, autopilot.unix_s(t_s))
+            t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
+            return messages.gps_input(state, choice.receiver, t_s, t_unix_s)
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")
             here, self._origin = self._origin, None
@@ -260,8 +258,7 @@ class Conversation:
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
-        """Queue the questions that choose the channel, and request reports again if they have stopped: an autopilot
-        that has restarted has forgotten the request."""
+        """Queue the questions that choose the channel, and request reports that have stopped, as after a restart."""
         if self._ask_position_s is None:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))
@@ -327,8 +324,7 @@ class Turns:
     @contextmanager
     def of_link(self, name: str) -> Iterator[Callable[..., None]]:
         """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`
-        that notes what happens in the turn, such as `step("heard", data)`. At its end, all steps go to the tape as one
-        record; a turn without a step is not recorded."""
+        that notes what happens in the turn, such as `step("heard", data)`. All steps go to the tape as one record."""
         steps: list[tuple[Any, ...]] = []
         with self._lock:
             t_s = self._clock()

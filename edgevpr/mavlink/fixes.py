@@ -39,9 +39,8 @@ class FixAnswer:
 
 
 class Sending:
-    """A fix to be sent by `due_s`, and its outcome. `sent` is None while the fix waits, then True, or False with the
-    reason in `why`. `t_sent_s` is when the fix was handed to the port, `outcome` the answer of the autopilot; both are
-    None until then."""
+    """A fix to be sent by `due_s`. `sent` is None while it waits, then True, or False with the reason in `why`.
+    `t_sent_s` is when it was handed to the port, `outcome` the answer of the autopilot; both are None until then."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -91,8 +90,7 @@ class Fixes:
 
     @property
     def t_fix_s(self) -> float:
-        """The time of the newest fix that the autopilot may be using: one that it accepted, has not answered yet, or
-        never answered. -inf: there is none."""
+        """The time of the newest fix that the autopilot may be using: any that it has not refused (-inf: none)."""
         return max(self._taken_s, self._under_way[-1][0] if self._under_way else -math.inf)
 
     def put(self, fix: Fix, now_s: float) -> Sending:
@@ -152,8 +150,7 @@ class Fixes:
         self.break_off("the link was lost before its answer came")
 
     def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
-        """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns the fix that it is
-        matched to, or None if no fix waits."""
+        """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns its fix, if any."""
         if self._is_stopped:
             # The answers to all those fixes may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWERED_WITHIN_S
@@ -201,11 +198,8 @@ class Fixes:
         if not is_stopped:
             log.warning("position fixes are answered again: they are sent again")
             return [(Severity.INFO, "fixes are answered again", "answers"), *news]
-        log.warning(
-            "five fixes in a row had no answer, and only one every %g s is sent until one is answered: %s",
-            TRIED_AGAIN_AFTER_S,
-            why_silent.sentence,
-        )
+        often = f"one every {TRIED_AGAIN_AFTER_S:g} s is sent until one is answered"
+        log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent.sentence)
         return [(Severity.WARNING, f"fixes unanswered: {why_silent.brief}", "answers"), *news]
 
     def _drop(self, sending: Sending, why: str) -> None:

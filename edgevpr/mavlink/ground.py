@@ -1,6 +1,5 @@
 """The people on the ground: the requests that arrive over the links, and the texts for the ground station. A wish is a
-request that only the flight itself can fulfil, such as a pause. A request that is not handled here has no effect; there
-are no parameters that could be set. Used by `conversation` inside turns only, and by the flight."""
+request that only the flight itself can fulfil, such as a pause. Used by `conversation` and the flight."""
 
 import math
 from collections import Counter
@@ -56,8 +55,7 @@ class Requests:
         return waiting
 
     def hear(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
-        """Process a message and return the replies to be sent. `us` is our (system id, component id). A TIMESYNC is
-        answered with `now_s`, the clock of all our time stamps."""
+        """Process a message and return the replies. `us` is our (system id, component id), `now_s` our clock."""
         sender = message.get_srcSystem(), message.get_srcComponent()
         if sender[0] == 0 or sender == us or not _asks(message, us):
             return ()
@@ -70,10 +68,8 @@ class Requests:
         is_wish = message.command == mavlink.MAV_CMD_USER_1
         result = self._take_wish(message.param1, sender) if is_wish else int(mavlink.MAV_RESULT_UNSUPPORTED)
         self.results[mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")] += 1
-        ack = mavlink.MAVLink_command_ack_message(
-            command=message.command, result=result, target_system=sender[0], target_component=sender[1]
-        )
-        return (ack,)
+        to = {"target_system": sender[0], "target_component": sender[1]}
+        return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
 
     def _take_wish(self, wanted: float, sender: tuple[int, int]) -> int:
         """Keep a wish, in place of a waiting one on the same subject. Returns a MAV_RESULT."""

@@ -1,11 +1,9 @@
 """The second link, to a ground station. It gets copies of the status messages and texts of the first link, and never a
 position fix. Used by the flight where `mavlink.ground` is set.
 
-No message is forwarded from one link to the other: that would let a stranger on the ground speak to the flight
-controller.
+No message is forwarded: that would let a stranger on the ground speak to the flight controller.
 """
 
-import time
 from collections.abc import Callable
 from copy import copy
 
@@ -24,11 +22,13 @@ class GroundLink(Link):
 
     name = "ground"
 
-    def __init__(self, address: LinkAddress, flight: Link, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, address: LinkAddress, flight: Link) -> None:
         told = flight._conversation
-        signing = told.settings.signing.of_ground()
         settings = LinkSettings(
-            component_id=told.settings.component_id, max_fix_age_s=0.0, clock=clock, signing=signing, tape=flight._tape
+            component_id=told.settings.component_id,
+            clock=told.settings.clock,
+            signing=told.settings.signing.of_ground(),
+            tape=told.settings.tape,
         )
         super().__init__(address, settings)
         self._turns = flight._turns
@@ -44,8 +44,7 @@ class GroundLink(Link):
 
 
 class GroundConversation(Conversation):
-    """The conversation with a ground station: it sends heartbeats and what is queued, and obeys requests of any sender,
-    none of which is taken for the autopilot."""
+    """The conversation with a ground station: no sender is taken for the autopilot, and the requests of all obeyed."""
 
     def __init__(self, flight: Conversation, settings: LinkSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings, clock)
@@ -59,8 +58,7 @@ class GroundConversation(Conversation):
         return super().next_packet()
 
     def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
-        """Process bytes received from `sender` at `now_s`. Returns True if they contain the heartbeat of a ground
-        station: the one that beat last is answered."""
+        """Process bytes received at `now_s`. Returns True if a ground station, to be answered, beats in them."""
         beats = False
         for message in self.reader.feed(data, sender):
             beats |= message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS

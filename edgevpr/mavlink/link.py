@@ -22,8 +22,6 @@ RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
 WATCH_S = 0.01  # between two checks whether a fix has left the operating system
 FLUSH_S = 0.5
 
-_USUAL = LinkSettings()
-
 P = ParamSpec("P")
 T = TypeVar("T")
 Step = Callable[..., None]  # records one event of a turn on the tape: its name, and its values
@@ -91,7 +89,7 @@ class Link:
 
     name = "link"
 
-    def __init__(self, address: LinkAddress, settings: LinkSettings = _USUAL) -> None:
+    def __init__(self, address: LinkAddress, settings: LinkSettings) -> None:
         self._address, self._settings = address, settings
         self._tape = settings.tape
         self._turns = Turns(settings.clock, settings.tape)
@@ -119,8 +117,7 @@ class Link:
         self._thread.start()
 
     def turn(self, what: str) -> AbstractContextManager[None]:
-        """Return a context manager that takes a turn: until it ends, the link sends and processes nothing and its time
-        stands still. `what` names the turn on the tape."""
+        """Take a turn: a context manager in which the link does nothing, and its time stands still (see `Turns`)."""
         return self._turns.taken(what)
 
     send = _in_turn(Conversation.send, sends=True)

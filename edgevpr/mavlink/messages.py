@@ -1,5 +1,4 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
-Used by the link and the flight.
 
 `t_mono_s` is a time of the system's monotonic clock in seconds, the only clock of a link: an autopilot keeps a single
 time correction for all messages of a link.
@@ -82,8 +81,7 @@ def heartbeat(health: Health) -> Message:
 
 def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
-    The age of the fix is sent as the processing time, and `t_sent_s` as a float32: accurate to 8 ms after one day, to
-    60 ms after ten days."""
+    The age of the fix is sent as processing time. `t_sent_s` goes as a float32: good to 8 ms after one day."""
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
         target_component=AUTOPILOT,
@@ -102,8 +100,7 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
 
 
 def position_sensor(fix: Fix, t_sent_s: float) -> Message:
-    """Make a GLOBAL_POSITION_SENSOR (296): a position found by vision, without altitude. PX4 ignores its time stamp: it
-    subtracts a delay, a parameter of its own, from the time of arrival."""
+    """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 goes by the time of its arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
         target_component=0,

@@ -67,7 +67,8 @@ class Identity:
                 self.has_moved = True
             self.kept, self._has_warned = speaker, False
         if speaker != self.kept:
-            self.refuse()
+            # Not counted where any sender may still become our autopilot.
+            self.foreign_messages += self.kept is not None or self._configured is not None
             return False
         self._spoke_s = now_s
         return True
@@ -75,10 +76,6 @@ class Identity:
     def is_elsewhere(self, address: Sender | None) -> bool:
         """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
         return self.kept is not None and address != self.kept.address
-
-    def refuse(self) -> None:
-        """Count a message of another sender in `foreign_messages`, unless any sender may still become our autopilot."""
-        self.foreign_messages += self.kept is not None or self._configured is not None
 
     def _is_next(self, speaker: Speaker, now_s: float) -> bool:
         """Return True if a speaker that is not our autopilot becomes ours by its heartbeat."""
@@ -99,8 +96,7 @@ class Identity:
 
 class Listener:
     """Base class of an object that navigates by the reports of the autopilot, and gives the positions that a continuous
-    channel sends; this one does nothing. The link's thread calls the methods, which never block and never raise. All
-    times are of the monotonic clock, in seconds."""
+    channel sends; this one does nothing. The link's thread calls the methods, which never block and never raise."""
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
@@ -112,8 +108,7 @@ class Listener:
         """Process a report of the vehicle's position and velocity."""
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Process the specific force that the accelerometers measure, m/s^2 along nose, right and down, and the
-        attitude at `t_s`."""
+        """Process the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude then."""
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
@@ -129,7 +124,7 @@ class Autopilot:
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
         self._listener, self._own_component = listener, own_component
-        self._heard_s = -math.inf
+        self.heard_s = -math.inf  # the time of its last heartbeat through the port now open
         self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
         self._forget()
 
@@ -138,7 +133,7 @@ class Autopilot:
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
-        self._utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
+        self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
         self._gps: dict[str, tuple[int, Receiver]] = {}  # receivers with a fix, each with the time stamp of its report
 
     @property
@@ -148,15 +143,10 @@ class Autopilot:
 
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
-        return now_s - self._heard_s <= SILENT_AFTER_S
-
-    def forget_presence(self) -> None:
-        """Regard the autopilot as absent until its next heartbeat: another one may be at a port that was reopened."""
-        self._heard_s = -math.inf
+        return now_s - self.heard_s <= SILENT_AFTER_S
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, moved to `t_mono_s` as far as velocity and attitude are known (see
-        `Conversation.vehicle_at`)."""
+        """Return the last report, moved to `t_mono_s`: see `Conversation.vehicle_at`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh_at(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
@@ -168,12 +158,10 @@ class Autopilot:
         return replace(vehicle, roll_deg=attitude.roll_deg, pitch_deg=attitude.pitch_deg, heading_deg=heading_deg)
 
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
-        """Process a message received at `now_s` from `address` (None: the link has one sender only). Returns True if it
-        is a heartbeat of our autopilot."""
+        """Process a message received at `now_s` from `address`. Returns True if it is a heartbeat of our autopilot."""
         self.answer = None
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
-            if self.identity.is_elsewhere(address):
-                self.identity.refuse()
+            self.identity.foreign_messages += self.identity.is_elsewhere(address)
             return False
         kind = message.get_type()
         beats = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
@@ -188,7 +176,7 @@ class Autopilot:
             return False
         self.readiness.hear(message, now_s)
         if beats:
-            self._heard_s, self.firmware = now_s, message.autopilot
+            self.heard_s, self.firmware = now_s, message.autopilot
         else:
             self._hear_report(message, now_s)
         return beats
@@ -213,17 +201,12 @@ class Autopilot:
                 nose, right, down = (axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
                 self._listener.hear_force(now_s, (nose, right, down), attitude)
             case "SYSTEM_TIME" if message.time_unix_usec:
-                self._utc_ahead_s = message.time_unix_usec / 1e6 - now_s
+                self.utc_ahead_s = message.time_unix_usec / 1e6 - now_s
             case "GPS_GLOBAL_ORIGIN":
                 self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
 
-    def unix_s(self, t_mono_s: float) -> float | None:
-        """Convert a time of our monotonic clock to the autopilot's UTC, seconds since 1970; None if that is unknown."""
-        return None if self._utc_ahead_s is None else t_mono_s + self._utc_ahead_s
-
     def _hear_position(self, message: Message, now_s: float) -> None:
-        """Process a GLOBAL_POSITION_INT. A position off the Earth, or at 0, 0, which an autopilot sends that has none,
-        sets `vehicle` to None."""
+        """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
         gps, lat_deg, lon_deg = self._best_gps(now_s), message.lat / 1e7, message.lon / 1e7
         has_gps = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
         if gps and has_gps:

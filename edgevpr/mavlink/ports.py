@@ -31,8 +31,7 @@ STUCK_S = 0.5  # a port that has accepted no byte for this time is reopened: byt
 
 class Port:
     """The base of all ports. After an error the owner closes the port and opens a new one. `connected`: there is a
-    receiver to which `write` can send. `sender`: the address from which the last bytes came; None if there can be only
-    one."""
+    receiver to send to. `sender`: the address from which the last bytes came; None if there can be only one."""
 
     connected = True
     sender: Sender | None = None
@@ -141,8 +140,7 @@ class TcpPort(Port):
 
 
 class SerialPort(Port):
-    """A serial line. It is read and written by its file descriptor, since pyserial's own non-blocking write spins when
-    the buffer is full."""
+    """A serial line, written by its file descriptor: pyserial's own write spins when the buffer is full."""
 
     _end = "the device is gone"
 
@@ -236,15 +234,13 @@ class Line:
         return not self.unsent and self.port.unsent() == 0
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
-        """Set the next packet to be written, and the fix that it contains (None: it contains none). The port must have
-        accepted the previous packet in full."""
+        """Set the next packet and the fix in it, if any, once the port has accepted the previous packet in full."""
         self._packet = self.unsent = packet
         if sending:
             self._leaving.append((self._taken + len(packet), sending))
 
     def write(self) -> None:
-        """Write as much of the packet as the port accepts without blocking. Raises OSError if the connection is lost,
-        and if the port has accepted no byte for STUCK_S seconds."""
+        """Write what the port accepts without blocking. Raises OSError if it is lost, or took nothing for STUCK_S."""
         if not self.unsent:
             return
         taken = self.port.write(self.unsent)
@@ -274,8 +270,7 @@ class Line:
         return departed
 
     def close(self) -> int:
-        """Close the port, throw away all bytes that have not left, mark their fixes as not sent, and return the number
-        of these fixes."""
+        """Close the port, throw away all bytes that have not left, and return the number of fixes in them."""
         with suppress(OSError):
             if not self.is_idle:
                 self.port.throw_away()

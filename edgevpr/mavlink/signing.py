@@ -44,6 +44,7 @@ MEANING = {
 }
 
 Stream = tuple[int, int, int]  # system, component and link id of a sender
+Clock = Callable[[], float]
 
 log = logging.getLogger(__name__)
 
@@ -60,11 +61,7 @@ class TimeStamps:
     """
 
     def __init__(
-        self,
-        path: Path,
-        mono_s: Callable[[], float] = time.monotonic,
-        utc_s: Callable[[], float] = time.time,
-        is_kept: bool = True,
+        self, path: Path, mono_s: Clock = time.monotonic, utc_s: Clock = time.time, is_kept: bool = True
     ) -> None:
         self._path, self._mono_s, self._utc_s, self._is_kept = path, mono_s, utc_s, is_kept
         self._lock, self._writing = Lock(), Lock()
@@ -211,8 +208,7 @@ def read_key(path: str) -> bytes:
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Return True if the file is a credential that systemd gives to this service alone, by an access list, which shows
-    in the mode as a right of the group to read."""
+    """Return True if systemd gives the file to this service alone; its access list shows as a right of the group."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 

@@ -1,5 +1,4 @@
-"""The telemetry log (tlog): a file of every packet of a link, in the format of ground stations, which `mavlogdump` of
-pymavlink reads. Used by the flight."""
+"""The telemetry log (tlog): a file of every packet of a link, which ground stations and pymavlink's mavlogdump read."""
 
 import errno
 import logging
@@ -8,6 +7,7 @@ import struct
 import threading
 import time
 from collections import deque
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from edgevpr.core.appending import append, keep_within, open_appending, set_aside, sync
@@ -22,7 +22,7 @@ CLOSE_S = 2.0
 _log = logging.getLogger(__name__)
 
 
-class Tlog:
+class Tlog(AbstractContextManager["Tlog"]):
     """An open tlog. For each packet it holds the microseconds since 1970 (8 bytes, big endian), then the packet. Close
     it, or use it as a context manager.
 
@@ -38,15 +38,10 @@ class Tlog:
         try:
             self._file = open_appending(self._path)
         except OSError as error:
-            raise EdgevprError(
-                f"The tlog {path} cannot be opened ({error.strerror}): give a file in a folder that is there and may "
-                "be written to."
-            ) from error
+            why = f"The tlog {path} cannot be opened ({error.strerror})"
+            raise EdgevprError(f"{why}: give a file in a folder that is there and may be written to.") from error
         self._thread = threading.Thread(target=self._run, name="tlog", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> "Tlog":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -72,12 +67,8 @@ class Tlog:
                 self._write()
             self._write()
         except OSError as error:
-            _log.warning(
-                "The tlog %s has ended (%s): make room, or give a file on another disk, for the next flight; this one "
-                "goes on without it.",
-                self._path,
-                error.strerror,
-            )
+            why = f"{self._path} has ended ({error.strerror})"
+            _log.warning("The tlog %s: make room for the next flight; this one goes on without it.", why)
         finally:
             self._ended = True
             self._waiting.clear()

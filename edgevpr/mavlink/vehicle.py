@@ -1,9 +1,6 @@
 """What the autopilot's messages of the last seconds tell: attitude, height and position accuracy of the vehicle, and
-whether the autopilot is ready to accept a fix, with the likely reasons for its answers.
-
-The reasons were read in the source code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha
-(`EKF2.cpp`).
-"""
+whether the autopilot is ready to accept a fix, with the likely reasons for its answers. These were read in the source
+code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
 import math
 from dataclasses import dataclass
@@ -25,8 +22,7 @@ DRIFT_M_S = 5.0
 _FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
 _GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 
-# ArduPilot refuses fixes until its GPS has had no fix for one second, and a receiver reports twice a second or less
-# often.
+# ArduPilot refuses fixes until its GPS has had no fix for one second; a receiver reports at most twice a second.
 _GPS_COUNTS_S = 2.5
 _ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ASK_ORIGIN_AGAIN_S = 10.0
@@ -40,8 +36,7 @@ _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees; `t_s` is when the
-    message arrived."""
+    """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`."""
 
     t_s: float
     roll_deg: float
@@ -97,8 +92,7 @@ class Heights:
         self._terrain: tuple[float, float] | None = None
 
     def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process a DISTANCE_SENSOR, whose slanted distance becomes a height by the current `attitude` (None: unknown),
-        or a TERRAIN_REPORT."""
+        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
         if message.get_type() == "TERRAIN_REPORT":
             # A spacing of 0 says that the autopilot has no terrain of this place.
             self._terrain = (message.current_height, now_s) if message.spacing else None

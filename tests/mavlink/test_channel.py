@@ -6,7 +6,7 @@ import pytest
 from conversing import Autopilot
 
 from edgevpr.core.types import Position
-from edgevpr.mavlink.channel import Answers, Channel, Kind, ardupilot_choice, px4_can_fuse, px4_choice
+from edgevpr.mavlink.channel import Channel, Kind, ardupilot_choice, px4_choice
 from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.wire import mavlink
@@ -26,10 +26,6 @@ STATE = MotionState(
 )
 
 
-def asked(kind=Kind.PLANE, **parameters):
-    return Answers(kind=kind, parameters=parameters)
-
-
 @pytest.mark.parametrize(
     ("kind", "parameters", "channel"),
     [
@@ -42,23 +38,21 @@ def asked(kind=Kind.PLANE, **parameters):
     ],
 )
 def test_an_ardupilot_gets_what_its_operator_has_set_up_else_single_fixes(kind, parameters, channel):
-    assert ardupilot_choice(asked(kind, **parameters)).channel is channel
+    assert ardupilot_choice(kind, parameters).channel is channel
 
 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
-    second = ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1, GPS2_TYPE=14, GPS2_DELAY_MS=0))
+    second = ardupilot_choice(Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
     assert (second.receiver, second.lag_s) == (1, 0.2)
-    assert "GPS2_TYPE=14" in ardupilot_choice(asked(Kind.COPTER, GPS1_TYPE=1)).reason, "what to set up"
-    first = ardupilot_choice(asked(Kind.COPTER, GPS_TYPE=14, GPS_TYPE2=1, GPS_DELAY_MS=60))
+    assert "GPS2_TYPE=14" in ardupilot_choice(Kind.COPTER, {"GPS1_TYPE": 1}).reason, "what to set up"
+    first = ardupilot_choice(Kind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
     assert (first.receiver, first.lag_s) == (0, 0.06)
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert px4_choice(asked(EKF2_AGP0_CTRL=3)).channel is Channel.SENSOR
-    assert px4_choice(asked(EKF2_AGP0_CTRL=2)).channel is Channel.COMMAND
-    assert px4_choice(asked()).channel is Channel.COMMAND
-    assert px4_can_fuse(asked(EKF2_AGP0_CTRL=0))
-    assert not px4_can_fuse(asked())
+    assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
+    assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
+    assert px4_choice(Kind.PLANE, {}).channel is Channel.COMMAND
 
 
 class Ear(Listener):

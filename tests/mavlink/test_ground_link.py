@@ -29,7 +29,7 @@ def two(clock):
     """The link to the flight controller, the autopilot, the link to the ground, the ground station."""
     with closing(UdpPort()) as port, closing(UdpPort()) as ground_port:
         flight = link_to(f"udpout:127.0.0.1:{port.number}", component_id=191, clock=clock)
-        ground = GroundLink(parse_link(f"udpout:127.0.0.1:{ground_port.number}"), flight, clock)
+        ground = GroundLink(parse_link(f"udpout:127.0.0.1:{ground_port.number}"), flight)
         with flight, ground:
             autopilot, station = Peer(port, system_id=7), Peer(ground_port, system_id=255)
             autopilot.expect("HEARTBEAT")
@@ -63,7 +63,7 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
 def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):
     with closing(UdpPort()) as port:
         flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), LinkSettings(clock=clock))
-        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight, clock):
+        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight):
             station = Peer(port, system_id=255)
             flight.announce(Severity.WARNING, "link lost", "link")
             station.expect_text("edgevpr: link lost")
@@ -119,7 +119,7 @@ def test_a_ground_station_that_is_lost_holds_up_no_fix(two, clock):
 def test_of_two_stations_at_a_listening_port_the_one_that_beat_last_is_answered(clock):
     number = free_port()
     flight = link_to("udpout:127.0.0.1:9", clock=clock)
-    ground = GroundLink(parse_link(f"udpin:127.0.0.1:{number}"), flight, clock)
+    ground = GroundLink(parse_link(f"udpin:127.0.0.1:{number}"), flight)
     beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
     with closing(UdpPort(to=number)) as one, closing(UdpPort(to=number)) as other, flight, ground:
         first, second = Peer(one, 255), Peer(other, 254)
@@ -134,7 +134,7 @@ def test_the_ground_is_spoken_to_with_the_same_key_and_another_link_id(clock, tm
     signing = Signing(bytes(32), TimeStamps(tmp_path / "time"))
     with closing(UdpPort()) as port:
         flight = link_to("udpout:127.0.0.1:9", clock=clock, signing=signing)
-        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight, clock):
+        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight):
             peer = Peer(port)
             peer.receiver._parser_of(None).signing.secret_key = bytes(32)
             heartbeat = peer.expect("HEARTBEAT")

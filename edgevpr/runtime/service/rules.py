@@ -20,7 +20,6 @@ from edgevpr.mavlink.channel import (
     Choice,
     Kind,
     ardupilot_choice,
-    px4_can_fuse,
     px4_choice,
     receiver_name,
 )
@@ -53,7 +52,7 @@ class FirmwareRules:
 
 
 def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
-    parameters, choice = reading.parameters, ardupilot_choice(reading.asked)
+    parameters, choice = reading.parameters, ardupilot_choice(reading.kind, reading.parameters)
     wanted = (("EK3_ENABLE", 1), ("AHRS_EKF_TYPE", 3))
     changes = [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]
     good, bad = "the filter that takes fixes is in use", "Only the third EKF takes fixes: use it, and reboot."
@@ -76,7 +75,7 @@ def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iter
 def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
     """Check the use of command 43003, which sends single fixes: something else, such as airspeed or optical flow, must
     carry the vehicle's position from one fix to the next."""
-    parameters, kind = reading.parameters, reading.asked.kind
+    parameters, kind = reading.parameters, reading.kind
     hovers = parameters.get("Q_ENABLE") == 1  # only planes have it, whatever type the heartbeat reports
     if kind is Kind.PLANE and not hovers:
         return fine("channel", _sentence(choice.reason))
@@ -144,7 +143,7 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
 
 
 def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
-    choice = px4_choice(reading.asked)
+    choice = px4_choice(reading.kind, reading.parameters)
     yield _px4_channel(choice, reading)
     rarity = f"a query every {intent.every_s:g} s, and PX4 drops positions after {SILENT_S:g} s of silence"
     if choice.channel is Channel.SENSOR:
@@ -161,8 +160,8 @@ def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[F
 
 def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
     parameters = reading.parameters
-    if not px4_can_fuse(reading.asked):
-        if reading.asked.kind is Kind.PLANE or parameters.get("EKF2_OF_CTRL") == 1:
+    if CONTROL not in parameters:
+        if reading.kind is Kind.PLANE or parameters.get("EKF2_OF_CTRL") == 1:
             return fine("channel", _sentence(choice.reason))
         return wrong(
             "channel",

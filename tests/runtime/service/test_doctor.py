@@ -123,7 +123,7 @@ def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
 def test_the_channel_is_the_one_that_the_flight_will_choose(vehicle, parameters, sentence):
     reading = replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)
     assert (said(reading, "channel"), wrong(reading)) == (sentence, {})
-    assert ardupilot_choice(reading.asked).channel.name in {"GPS_INPUT", "COMMAND"}
+    assert ardupilot_choice(reading.kind, reading.parameters).channel.name in {"GPS_INPUT", "COMMAND"}
 
 
 def test_the_channel_follows_from_the_older_names_too():
