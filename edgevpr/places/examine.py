@@ -13,9 +13,9 @@ import numpy as np
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
+from edgevpr.places.index import best_places
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable
-from edgevpr.places.thin import best_places
 
 _MOST_FAULTS = 20  # most faults of a file that SQLite lists
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
@@ -147,7 +147,7 @@ def repair(path: str | Path) -> Path:
 
 def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
-    `thin`). Returns (number of places copied, number of readable places of the map).
+    `best_places`). Returns (number of places copied, number of readable places of the map).
 
     The places keep their ids. Mask hash and calibration are copied; the calibration refers to places by id. Places that
     cannot be read are not copied. Raises MapError if the map cannot be read, or if `out` exists or cannot be written;

@@ -5,23 +5,24 @@ its arrays are full. `retrieve` searches an index.
 """
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Doubles, Ints, LatLon, Singles
+from edgevpr.core.arrays import Array, Bools, Doubles, Floats, Ints, LatLon, Singles
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError
-from edgevpr.core.geodesy import distance_m
+from edgevpr.core.geodesy import distance_m, metres
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.thin import best_places
 
 _log = logging.getLogger(__name__)
 _BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACKED_AT_ONCE = 32  # places
+_BLOCK = 256  # places in a block; the least worth in each block is stored, to find the least of all quickly
 _OUTLINE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
 
 CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.coarse_parts`
@@ -94,10 +95,10 @@ def load_index(
     """Load the coarse parts of the descriptors in a map, packed by the technique, into the arrays of `into` (None: into
     new ones). Return the index of the places that were loaded.
 
-    If `budget_bytes` is too small for all places, only the best are loaded: those of high quality that leave no wide
-    gaps (see `thin`). Per place, `beside_bytes` of the budget stay free for other arrays that grow with the index (see
-    `sequence`). Places that cannot be read are skipped and noted in `PlaceMap.left_out`. Raises MapError if the map has
-    no places, if none of them can be read, or if the budget is too small for one place.
+    If `budget_bytes` is too small for all places, only the `best_places` are loaded. Per place, `beside_bytes` of the
+    budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are skipped
+    and noted in `PlaceMap.left_out`. Raises MapError if the map has no places, if none of them can be read, or if the
+    budget is too small for one place.
     """
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
@@ -180,6 +181,55 @@ def _only(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
             yield part
 
 
+def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
+    """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
+
+    `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
+
+    Places are dropped one at a time, always the one of least worth. The worth of a place is its quality times the
+    distance to the nearer of its two remaining neighbours along the track. So gaps stay small, and places of high
+    quality stay; age does not matter. The first and the last place are kept.
+    """
+    count = len(quality)
+    if count <= capacity:
+        return np.arange(count)
+    east_m, north_m = metres(lat_deg, lon_deg)
+    # If a position is unknown, the median distance of successive places is used instead.
+    steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
+    usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
+
+    def apart_m(a: int, b: int) -> float:
+        away_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
+        return usual_m * (b - a) if math.isnan(away_m) else away_m
+
+    def worth(before: int, at: int, after: int) -> float:
+        if before < 0 or after >= count:
+            return math.inf
+        # A tiny share of the distance between its neighbours decides among places at the same position.
+        nearer_m = min(apart_m(before, at), apart_m(at, after))
+        return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
+
+    # No lists, and few arrays: a map may have a million places.
+    before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
+    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # places that were dropped have infinite worth too
+    for at in range(count):
+        worths[at] = worth(at - 1, at, at + 1)
+    blocks = worths.reshape(-1, _BLOCK)
+    least = blocks.min(axis=1)
+    kept = np.ones(count, bool)
+    for _ in range(count - max(capacity, 2)):
+        block = int(least.argmin())
+        at = block * _BLOCK + int(blocks[block].argmin())
+        kept[at], worths[at] = False, np.inf
+        ends = int(before[at]), int(after[at])
+        after[ends[0]], before[ends[1]] = ends[1], ends[0]
+        for end in ends:
+            worths[end] = worth(int(before[end]), end, int(after[end]))
+        for touched in {block, *(end // _BLOCK for end in ends)}:
+            least[touched] = blocks[touched].min()
+    return np.flatnonzero(kept)[:capacity]
+
+
 class GrowingIndex:
     """The index of an open map, with free slots for more places.
 
@@ -209,11 +259,6 @@ class GrowingIndex:
     @property
     def index(self) -> PlaceIndex:
         return replace(self._slots.first(self._taken), mean=self._mean)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all slots, used or free: the index never takes more."""
-        return self._slots.nbytes
 
     def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
         """Add a place that is already in the map file, with an id larger than all ids in the index (position and

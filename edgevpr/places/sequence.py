@@ -70,10 +70,6 @@ class SequenceSearch:
         """The number of queries in the sequence so far, at most `length`."""
         return len(self._rows)
 
-    @property
-    def nbytes(self) -> int:
-        return sum(row.nbytes for row in self._rows) + self.rivals.nbytes
-
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
         by the mean score of their best trajectory, with the matches of the newest query.

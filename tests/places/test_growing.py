@@ -100,7 +100,7 @@ def test_the_budget_holds_at_every_moment_of_growing(empty_map):
     tracemalloc.stop()
     assert len(growing.index) == places, "what comes later is in the file only"
     assert len(empty_map) == places + 10
-    assert growing.nbytes <= places * each
+    assert growing.index.nbytes <= places * each
     # Packing takes the ids once more; a second copy of the rows would not fit under this.
     assert peak_bytes < places * each + 80 * places + 200_000
 

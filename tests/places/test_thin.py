@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgevpr.places.thin import best_places
+from edgevpr.places.index import best_places
 
 
 def track(east_m):
