@@ -23,9 +23,8 @@ from edgevpr.review.compare import Line, Packets
 from edgevpr.review.tape import Playback, ReplayedSigning, Supposed, TapeEnded, read_tape
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
-from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.flightlog import flight_of, read_log
 from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, recording_of
-from edgevpr.runtime.flight.wholeflight import flight_of
 from edgevpr.runtime.flight.world import Stop, World
 
 _log = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.wholeflight import flight_of
+from edgevpr.runtime.flight.flightlog import flight_of
 
 _SEED = 1
 _RATE_HZ = 5.0

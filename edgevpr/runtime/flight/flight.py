@@ -24,10 +24,9 @@ from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.clock import Pace
-from edgevpr.runtime.flight.commands import Commands
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governor import Governing
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.vitals import Vitals
@@ -62,7 +61,7 @@ class Flight:
         herald, self._map_watch, self._tally = crew.herald, MapWatch(crew.herald), Tally()
         self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
         self._governing = Governing(crew, self._pace)
-        self._commands = Commands(crew)
+        self._commands = Commands(crew.link, herald, crew.learner)
         self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.tell,
@@ -93,7 +92,7 @@ class Flight:
             source, source_uri = world.open_source(step_s), config.source.uri
             stack.callback(source.close)
             if link and not source.is_live and (learner or config.mavlink.send_fixes):
-                _log.warning("%s is a recording: its fixes, and places learnt from it, do not say where you are", source_uri)
+                _log.warning("%s is a recording: its fixes, and what it learns, do not say where you are", source_uri)
             herald = Herald(flight_log, link)
             autopilot = None
             if link:

@@ -1,5 +1,5 @@
-"""The flight log: one JSON object per line. `flight` writes it, `wholeflight` reads it. A full disk or a pulled memory
-card loses lines, but never ends the flight."""
+"""The flight log: one JSON object per line. `flight` writes it; all programs that read a flight after its end use
+`flight_of`. A full disk or a pulled memory card loses lines, but never ends the flight."""
 
 import errno
 import json
@@ -10,6 +10,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from io import FileIO
 from pathlib import Path
@@ -20,14 +21,17 @@ from edgevpr.core.appending import (
     is_at,
     keep_within,
     open_appending,
+    relatives,
     set_aside,
     sync,
     sync_folder,
     try_lock,
 )
-from edgevpr.core.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import json_line
 from edgevpr.core.types import NO_TAPE, Tape
+
+Line = dict[str, Any]
 
 _log = logging.getLogger(__name__)
 _PARTS = 4  # of `max_mb`: one for the file that is written, three for the numbered files
@@ -218,25 +222,6 @@ class FlightLog:
             _log.warning("%s", sentence)
 
 
-def read_log(path: str | Path) -> Iterator[dict[str, Any]]:
-    """Yield the lines of one log file as dicts, in order. A line that was cut (battery pulled) is left out.
-    `wholeflight.flight_of` reads a flight of several files."""
-    with open(path, "rb") as handle:
-        for line in handle:
-            record = record_of(line)
-            if record is not None:
-                yield record
-
-
-def record_of(line: bytes) -> dict[str, Any] | None:
-    """Parse one line of a log. None: the line was cut, or is no JSON object."""
-    try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) else None
-
-
 def _append(file: FileIO, lines: bytes) -> None:
     end = file.seek(0, os.SEEK_END)
     if end:
@@ -261,3 +246,94 @@ def _size_of(file: FileIO) -> int:
     """Return the size of an open file in bytes, 0 for a device."""
     found = os.fstat(file.fileno())
     return found.st_size if stat.S_ISREG(found.st_mode) else 0
+
+
+def read_log(path: str | Path) -> Iterator[Line]:
+    """Yield the lines of one log file as dicts, in order. A line that was cut (battery pulled) is left out."""
+    with open(path, "rb") as handle:
+        for line in handle:
+            record = _record_of(line)
+            if record is not None:
+                yield record
+
+
+def _record_of(line: bytes) -> Line | None:
+    """Parse one line of a log. None: the line was cut, or is no JSON object."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightLines:
+    """The lines of one flight; iterate over them as often as needed. They are read from the `files`, in order. `flight`
+    identifies the flight by its start line: (time in UTC, time on the monotonic clock), None without a start line.
+    `missing` is a sentence about files that are missing (None: none are)."""
+
+    files: tuple[Path, ...]
+    flight: tuple[object, object] | None
+    missing: str | None
+
+    def __iter__(self) -> Iterator[Line]:
+        """Yield the lines, each with a `kind`; only the first start line is included."""
+        has_start = False
+        for file in self.files:
+            is_ours = self.flight is None
+            for line in read_log(file):
+                if line.get("kind") == "start":
+                    is_ours = _flight_id(line) == self.flight
+                    if is_ours and has_start:
+                        continue
+                    has_start |= is_ours
+                if is_ours and isinstance(line.get("kind"), str):
+                    yield line
+
+
+def flight_of(path: str | Path) -> FlightLines:
+    """Find the lines of the last flight in a file of a log.
+
+    If the flight has several files, it is read from its start to the end of this file. Raises UsageError if there is no
+    such file, and EdgevprError if the file has no line of a flight.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
+    if not any(isinstance(line.get("kind"), str) for line in read_log(path)):
+        raise EdgevprError(f"{path} holds no line of a flight log: give one that a flight has written.")
+    starts = _starts(path)
+    if not starts:
+        return FlightLines(files=(path,), flight=None, missing=None)
+    flight = _flight_id(starts[-1])
+    parts = {path: _parts(starts, flight)}
+    if min(parts[path]) > 1:
+        with suppress(OSError):
+            for other in relatives(path):
+                with suppress(OSError):  # a file that may not be read counts as missing
+                    found = _parts(_starts(other), flight)
+                    if found and min(found) < min(parts[path]):
+                        parts[other] = found
+    lacking = max(parts[path]) - sum(map(len, parts.values()))
+    missing = f"Files of the flight that are missing before {path}: {lacking}. The flight is read without them."
+    files = tuple(sorted(parts, key=lambda file: min(parts[file])))
+    return FlightLines(files=files, flight=flight, missing=missing if lacking > 0 else None)
+
+
+def _starts(path: Path) -> list[Line]:
+    """Return the start lines in a file, in order. Raises OSError."""
+    with open(path, "rb") as handle:
+        lines = [_record_of(line) or {} for line in handle if b'"start"' in line]
+    return [line for line in lines if line.get("kind") == "start"]
+
+
+def _flight_id(start: Line) -> tuple[object, object]:
+    return start.get("time"), start.get("t_mono_s")
+
+
+def _parts(starts: list[Line], flight: tuple[object, object]) -> list[int]:
+    """Return the numbers of the parts of a flight that begin with these start lines. Each part of a flight has one, and
+    all but that of the first part are marked as repeated."""
+    ours = [start for start in starts if _flight_id(start) == flight]
+    numbers = [start.get("part") if start.get("repeated") else 1 for start in ours]
+    return [number if isinstance(number, int) and number >= 1 else 1 for number in numbers]

@@ -1,12 +1,21 @@
-"""The herald of a flight reports what happens to the journal (the log of the process), to the flight log and to the
-ground station. `autopilot`, `commands`, `governor`, `vitals` and `watching` report through it."""
+"""What a flight tells people, and what they ask of it. The herald reports to the journal (the log of the process), to
+the flight log and to the ground station; all observers report through it. `Commands` does what ground stations ask."""
 
 import logging
 from typing import Any
 
+from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.recognise.learn import Learner
+
+_TEXTS = {
+    Wish.PAUSE: ("paused by command", "pause"),
+    Wish.RESUME: ("goes on by command", "pause"),
+    Wish.LEARN: ("learning on by command", "learning"),
+    Wish.LEARN_NOTHING: ("learning off by command", "learning"),
+}
 
 _log = logging.getLogger(__name__)
 
@@ -59,3 +68,40 @@ class Trouble:
         self.is_so = is_so
         text = self._begun if is_so else self._over
         self._herald.tell(self._kind, Severity.WARNING if is_so else Severity.INFO, text, said=text)
+
+
+class Commands:
+    """Carries out the requests (`Wish`) of ground stations. While the flight `is_paused`, nothing is recognised and no
+    fix is sent. Learning can be switched only if there is a learner and it works."""
+
+    def __init__(self, link: Link | None, herald: Herald, learner: Learner | None) -> None:
+        self.is_paused = False
+        self._link, self._herald, self._learner = link, herald, learner
+
+    @property
+    def summary(self) -> str | None:
+        """Features that a ground station has switched off, in a few words; None if there are none."""
+        off = ("paused" if self.is_paused else "", "learning off" if self._learner and self._learner.is_off else "")
+        return ", ".join(filter(None, off)) or None
+
+    def obey(self) -> None:
+        """Carry out the requests received since the last call, and tell the link which ones to accept from now on."""
+        if self._link is None:
+            return
+        for wished in self._link.take_wishes():
+            self._fulfil(wished)
+        can_learn = self._learner is not None and self._learner.trouble is None
+        self._link.offer(tuple(Wish) if can_learn else (Wish.PAUSE, Wish.RESUME))
+
+    def _fulfil(self, wished: Wished) -> None:
+        before = self.summary
+        match wished.wish:
+            case Wish.PAUSE | Wish.RESUME:
+                self.is_paused = wished.wish is Wish.PAUSE
+            case Wish.LEARN | Wish.LEARN_NOTHING if self._learner:
+                self._learner.is_off = wished.wish is Wish.LEARN_NOTHING
+        is_new = before != self.summary
+        text, topic = _TEXTS[wished.wish]
+        self._herald.note("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
+        if is_new:  # a command repeated because its answer was lost changes nothing
+            self._herald.say(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)

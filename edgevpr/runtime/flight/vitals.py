@@ -1,7 +1,6 @@
 """Reporting of how a flight goes, once a second: to systemd (with its watchdog), to the autopilot, and to the status
 file. The loop of `flight` uses it."""
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -13,14 +12,12 @@ from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import confidence_of
 from edgevpr.runtime.flight.clock import Pace
-from edgevpr.runtime.flight.commands import Commands
-from edgevpr.runtime.flight.herald import Trouble
+from edgevpr.runtime.flight.herald import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _HEALTH_S = 1.0
-_WINDOW = 10  # reports, one a second, over which rate and load are averaged
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
 
 
@@ -43,7 +40,6 @@ class Vitals:
         self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
         self._newest: dict[str, Any] | None = None
         self._match: dict[str, Any] | None = None
-        self._looks: deque[tuple[float, int, float]] = deque(maxlen=_WINDOW + 1)
 
     def tell(self, event: Recognition) -> None:
         """Keep an event for the status, if it is a query."""
@@ -112,19 +108,15 @@ class Vitals:
 
     def _status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
         """Return the status of the flight. Its keys that need a word (null: unknown):
-        - `time`: UTC; `t_mono_s`: the same on the clock of the frames; `elapsed_s`: since the start
-        - `health`: the state that heartbeats tell
-        - `source`: state of the source of frames; `latency_s`: age of the newest picture when it could be read
-        - `rate_hz`, `cpu_cores`: queries per second, and cores that this process kept busy, over the last ten seconds;
-          `asked_rate_hz`: the rate that the flight tries to keep
+        - `t_mono_s`: the `time` on the clock of the frames; `health`: the state that heartbeats tell
+        - `latency_s`: age of the newest picture when it could be read
+        - `asked_rate_hz`: queries per second that the flight tries to keep
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
-        - `throttled`: the board slows itself down
         - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)
         - `remarks`: sentences on what else people should know; `summary`: the most important values in one line.
         """
         crew, tally = self._crew, self._tally
         totals, now_s = crew.meter.totals(), crew.clock.mono_s()
-        rate_hz, cpu_cores = self._lately(totals["elapsed_s"], totals["process_cpu_s"])
         utc = datetime.fromtimestamp(crew.clock.utc_s(), timezone.utc)
         status: dict[str, Any] = {
             "version": __version__,
@@ -138,9 +130,7 @@ class Vitals:
             "queries": tally.queries,
             "accepted": tally.accepted,
             "failed": tally.failed + tally.unusable,
-            "rate_hz": rate_hz,
             "asked_rate_hz": self._pace.rate_hz,
-            "cpu_cores": cpu_cores,
             "rss_mb": crew.meter.rss_mb(),
             "machine_cpu_share": sum(load.core_shares) / max(1, len(load.core_shares)),
             "machine_ram_mb": load.ram_used_bytes / 1e6,
@@ -156,16 +146,6 @@ class Vitals:
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
-
-    def _lately(self, elapsed_s: float, cpu_s: float) -> tuple[float | None, float | None]:
-        """Return queries per second and cores kept busy over the last reports (None: this is the first one).
-        `elapsed_s` and `cpu_s` are the time and the CPU time since the start."""
-        self._looks.append((elapsed_s, self._tally.queries, cpu_s))
-        begin_s, queries, begin_cpu_s = self._looks[0]
-        span_s = elapsed_s - begin_s
-        if span_s <= 0:
-            return None, None
-        return (self._tally.queries - queries) / span_s, (cpu_s - begin_cpu_s) / span_s
 
 
 def _seen(event: Recognition) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.simulate import demo
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.wholeflight import flight_of
+from edgevpr.runtime.flight.flightlog import flight_of
 
 pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
 

@@ -21,8 +21,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.aboard import start_fields
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.wholeflight import flight_of
+from edgevpr.runtime.flight.flightlog import FlightLog, flight_of, read_log
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
 

@@ -27,11 +27,9 @@ def test_the_status_counts_what_the_flight_does_and_names_its_match(recording, t
     Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 2.0}).fly(source, status=kept)
     first, last = kept.statuses[0], kept.statuses[-1]
     assert first["queries"] == 0
-    assert not any(first[name] for name in ("newest", "match", "rate_hz", "cpu_cores"))
+    assert not any(first[name] for name in ("newest", "match"))
     assert last["accepted"] == last["queries"] > 15
-    assert last["rate_hz"] == pytest.approx(2.0, abs=0.2)
     assert last["asked_rate_hz"] == 2.0
-    assert last["cpu_cores"] == pytest.approx(0.1, abs=0.03)
     assert last["match"] == last["newest"]
     assert last["match"]["query"] == f"frame {last['queries'] - 1:06d}"
     assert last["match"]["place"] == last["queries"]

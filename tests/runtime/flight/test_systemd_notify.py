@@ -2,6 +2,7 @@
 
 import os
 import socket
+from contextlib import suppress
 
 import pytest
 
@@ -58,7 +59,7 @@ def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
 def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
         other.setblocking(False)
-        with pytest.raises(BlockingIOError):
+        with suppress(BlockingIOError):
             while True:
                 other.sendto(b"x", manager.getsockname())
     notify(WATCHDOG=1)

@@ -8,8 +8,7 @@ import pytest
 
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.wholeflight import flight_of
+from edgevpr.runtime.flight.flightlog import FlightLog, flight_of
 
 PART_MB = 0.01
 
