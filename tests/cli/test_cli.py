@@ -242,8 +242,6 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
         ),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "names none"),
         (["simulate", "flight", tmp_path / "f", "--seed", "-1"], "0 or more"),
-        (["profile"], "--map MAP, or --places N"),
-        (["profile", "--places", "-3"], "above 0"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "`query_file` is missing"),
     ]:
         code, sentence = refused(capsys, *argv)
