@@ -1,5 +1,4 @@
-"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`, `mavlink.ground`).
-Used by the flight, by `edgevpr check` and `doctor`, and by the simulated autopilot."""
+"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`, `mavlink.ground`)."""
 
 from dataclasses import dataclass
 

@@ -163,13 +163,11 @@ class Inquiry(AbstractContextManager["Inquiry"]):
 class AutopilotReading:
     """All that an autopilot tells about itself; None and empty stand for what it did not answer.
 
-    - `firmware`: "ardupilot", "px4" or "other"; `vehicle`: the value of a `Kind`.
-    - `version`: (major, minor, patch) of the firmware; `version_text`: the same as text, such as "4.7.0-dev".
+    - `firmware`: "ardupilot", "px4" or "other"; `vehicle`: the value of a `Kind`; `version`: (major, minor, patch).
     - `parameters`: values by name; `heard`: the names of all messages received.
     - `gps_fix`: GPS_FIX_TYPE of both receivers; `filter_flags`: of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
-    - `origin`: of its local frame, (latitude, longitude) in degrees.
-    - `signs`: its messages are signed; `is_signed_to`: ours to it are.
-    - `answers`: it has answered at least one question; `says_version_1`: it sends MAVLink 1.
+    - `origin`: of its local frame, (latitude, longitude) in degrees; `says_version_1`: it sends MAVLink 1.
+    - `signs`: its messages are signed; `is_signed_to`: ours to it are; `answers`: it has answered a question.
     - `other_systems`: system ids of other autopilots on the link; `bad_bytes`: bytes that belong to no valid message.
     - `round_trip_s`: median time of an answer; `clock_ahead_s`: its UTC minus that of this machine.
     """

@@ -41,11 +41,9 @@ log = logging.getLogger(__name__)
 class LinkSettings:
     """The settings of a link:
     - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
-    - `max_fix_age_s`: a fix that has waited longer, in seconds, is never sent.
-    - `clock`: the monotonic clock, in seconds, of all time stamps of the link.
-    - `listener`: is called with the reports of the vehicle, and gives the positions of a continuous channel.
+    - `max_fix_age_s`: a fix that has waited longer is never sent; `clock`: the monotonic clock of all time stamps.
+    - `listener`: hears the reports of the vehicle, and gives the positions of a continuous channel.
     - `tap`: is called with each packet written and each packet received, in the link's thread.
-    - `signing`: signs the packets sent, and checks those received.
     - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never).
     - `tape`: records, or plays back, all that is received and sent.
     """
@@ -208,7 +206,7 @@ class Conversation:
         """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
         self.autopilot.heard_s = -math.inf  # another one may be at the port when it is open again
-        self.reader.forget_partial_message()
+        self.reader.parsers.clear()  # with incomplete messages
 
     def end(self) -> None:
         """Give up all fixes, whether they wait for an answer or wait to be sent."""

@@ -226,7 +226,7 @@ class Link:
             step("answers")
         reading: list[Port | socket.socket] = [line.port, self._bell]
         writing = [line.port] if line.unsent else []
-        timeout_s = min(timeout_s, WATCH_S) if line.is_watched else self._conversation.wait_s(timeout_s)
+        timeout_s = min(timeout_s, WATCH_S) if line.leaving else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select(reading, writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)

@@ -1,5 +1,4 @@
-"""The autopilot at the other end of the link: which of the senders it is, and its state, collected from its messages:
-presence, answers to fixes, and the position and motion of its vehicle. Used by `conversation`."""
+"""The autopilot at the other end of the link: which of the senders it is, and its state as its messages tell it."""
 
 import logging
 import math
@@ -12,7 +11,16 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
-from edgevpr.mavlink.vehicle import GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness, gps_sd_m
+from edgevpr.mavlink.vehicle import (
+    GPS_REPORTS,
+    GPS_SD_M,
+    GPS_UNKNOWN,
+    Attitude,
+    Attitudes,
+    Certainty,
+    Heights,
+    Readiness,
+)
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
@@ -84,12 +92,9 @@ class Identity:
             return True
         if not self._has_warned:  # two vehicles on one link are dangerous
             self._has_warned = True
-            log.warning(
-                "another autopilot, %s, is on this link: fixes go to %s only; give each vehicle a link of its own, or "
-                "set mavlink.system_id and restart edgevpr",
-                speaker,
-                kept or f"system {self._configured}",
-            )
+            ours = kept or f"system {self._configured}"
+            advice = "give each vehicle a link of its own, or set mavlink.system_id and restart edgevpr"
+            log.warning("another autopilot, %s, is on this link: fixes go to %s only; %s", speaker, ours, advice)
         is_same = kept is not None and speaker.system_id == kept.system_id
         return is_same and now_s - self._spoke_s >= RETAKEN_AFTER_S
 
@@ -240,7 +245,8 @@ class Autopilot:
         time_usec, before = self._gps.get(name, (0, None))
         # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
         t_s = before.t_s if before and message.time_usec and message.time_usec == time_usec else now_s
-        self._gps[name] = message.time_usec, Receiver(message.lat / 1e7, message.lon / 1e7, gps_sd_m(message), t_s)
+        sd_m = GPS_SD_M if message.h_acc in GPS_UNKNOWN else message.h_acc / 1e3
+        self._gps[name] = message.time_usec, Receiver(message.lat / 1e7, message.lon / 1e7, sd_m, t_s)
 
     def _best_gps(self, now_s: float) -> Receiver | None:
         """Return the newest report of the most accurate GPS receiver; None if none had a fix in the last 2.5 s."""

@@ -220,13 +220,8 @@ class Line:
         self.port, self._clock, self._tap = port, clock, tap
         self._packet = self.unsent = b""
         self._taken = 0  # number of bytes that the port has accepted so far
-        self._leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
+        self.leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
         self._blocked_since_s: float | None = None
-
-    @property
-    def is_watched(self) -> bool:
-        """True while a fix has not left the operating system: the link must then look often whether it has."""
-        return bool(self._leaving)
 
     @property
     def is_idle(self) -> bool:
@@ -237,7 +232,7 @@ class Line:
         """Set the next packet and the fix in it, if any, once the port has accepted the previous packet in full."""
         self._packet = self.unsent = packet
         if sending:
-            self._leaving.append((self._taken + len(packet), sending))
+            self.leaving.append((self._taken + len(packet), sending))
 
     def write(self) -> None:
         """Write what the port accepts without blocking. Raises OSError if it is lost, or took nothing for STUCK_S."""
@@ -261,11 +256,11 @@ class Line:
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()
-        left = self._taken - self.port.unsent() if self._leaving else 0
-        while self._leaving and self._leaving[0][0] <= left:
-            departed.append(self._leaving.popleft()[1])
+        left = self._taken - self.port.unsent() if self.leaving else 0
+        while self.leaving and self.leaving[0][0] <= left:
+            departed.append(self.leaving.popleft()[1])
             departed[-1].settle(True)
-        if not departed and self._leaving and now_s > self._leaving[0][1].due_s:
+        if not departed and self.leaving and now_s > self.leaving[0][1].due_s:
             raise ConnectionError("a position fix has waited too long in it")
         return departed
 
@@ -275,6 +270,6 @@ class Line:
             if not self.is_idle:
                 self.port.throw_away()
         self.port.close()
-        for _, sending in self._leaving:
+        for _, sending in self.leaving:
             sending.settle(False, LOST)
-        return len(self._leaving)
+        return len(self.leaving)

@@ -20,7 +20,7 @@ GPS_SD_M = 5.0  # of a receiver that does not say how good it is
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
 _FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
-_GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
+GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 
 # ArduPilot refuses fixes until its GPS has had no fix for one second; a receiver reports at most twice a second.
 _GPS_COUNTS_S = 2.5
@@ -139,11 +139,6 @@ class Certainty:
         if self._own and now_s - self._own[1] <= _FILTER_FRESH_S:
             return self._own[0]
         return math.hypot(self._known[0], DRIFT_M_S * (now_s - self._known[1])) if self._known else None
-
-
-def gps_sd_m(message: Message) -> float:
-    """Return the standard deviation in metres of a GPS receiver's position, from one of the `GPS_REPORTS`."""
-    return GPS_SD_M if message.h_acc in _GPS_UNKNOWN else float(message.h_acc / 1e3)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -33,11 +33,7 @@ class PacketReader:
         self._admits, self._tap = admits, tap
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
-        self.forget_partial_message()
-
-    def forget_partial_message(self) -> None:
-        """Drop incomplete messages, as after the link was lost in the middle of one."""
-        self._parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the latest at the end
+        self.parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the latest at the end
 
     def feed(self, data: bytes, sender: Hashable = None) -> Iterator[Message]:
         """Yield the admitted messages that `data` completes. `sender` is its source, if there can be several."""
@@ -61,12 +57,12 @@ class PacketReader:
                 yield message
 
     def _parser_of(self, sender: Hashable) -> mavlink.MAVLink:
-        if (parser := self._parsers.pop(sender, None)) is None:
+        if (parser := self.parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
             parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
-            if len(self._parsers) == _SENDERS_MAX:
-                self._parsers.pop(next(iter(self._parsers)))
-        self._parsers[sender] = parser
+            if len(self.parsers) == _SENDERS_MAX:
+                self.parsers.pop(next(iter(self.parsers)))
+        self.parsers[sender] = parser
         return parser
 
 
