@@ -20,9 +20,12 @@ from rtsp_camera import free_port
 
 from edgevpr.cli.main import main
 from edgevpr.lab.simulate import camera as simulated
-from edgevpr.lab.simulate.autopilot import ReceivedFix, run_autopilot
+from edgevpr.lab.simulate.autopilot import serve
+from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import GeneratedFlight, to_metres, write_flight
 from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.lab.simulate.motion import Motion
+from edgevpr.mavlink.wire import Message, mavlink
 from edgevpr.runtime.flight.flightlog import read_log
 
 RATE_HZ = 40.0
@@ -60,12 +63,30 @@ def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True
     return [*rows, {"stream": "all that are damaged", "is_whole": False, **sums, "oldest_s": oldest_s}]
 
 
-def behind_s(fixes: Sequence[ReceivedFix], sent_s: dict[int, float]) -> np.ndarray:
+class _Noting(FlightController):
+    """A simulated flight controller that keeps the fixes which it has accepted, as they came."""
+
+    def __init__(self) -> None:
+        super().__init__("arduplane", Motion(), gps=False)
+        self.fixes: list[Message] = []
+
+    def hear(self, message: Message) -> list[Message]:
+        answers = super().hear(message)
+        if message.get_type() == "COMMAND_INT" and answers[0].result == mavlink.MAV_RESULT_ACCEPTED:
+            self.fixes.append(message)
+        return answers
+
+
+def behind_s(fixes: Sequence[Message], sent_s: dict[int, float]) -> np.ndarray:
     """Return by how many seconds each fix is older than it claims, float64 (N,): from the time at which the picture of
     its position was sent to the time that it gives for its own."""
-    east_m = [to_metres(fix.lat_deg, fix.lon_deg)[0] for fix in fixes]
+    east_m = [to_metres(fix.x / 1e7, fix.y / 1e7)[0] for fix in fixes]
     numbers = (np.array(east_m) - _BEGIN_EAST_M) / _STEP_M
-    return np.array([fix.t_frame_s for fix in fixes]) - np.interp(numbers, list(sent_s), list(sent_s.values()))
+    return np.array([_claimed_s(fix) for fix in fixes]) - np.interp(numbers, list(sent_s), list(sent_s.values()))
+
+
+def _claimed_s(fix: Message) -> float:
+    return float(fix.param1 - fix.param2)
 
 
 def _land(folder: Path, count: int, seed: int) -> tuple[Film, Path]:
@@ -116,7 +137,7 @@ def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Pat
         fixes = received()
     camera.close()
     begin_s = 0.0 if stream.is_whole else camera.sent_s[film.whole_at_first]
-    fixes = [fix for fix in fixes if fix.t_frame_s > begin_s]
+    fixes = [fix for fix in fixes if _claimed_s(fix) > begin_s]
     older_s = behind_s(fixes, camera.sent_s)
     return {
         "stream": stream.name,
@@ -131,16 +152,16 @@ def _flown(stream: Stream, camera: Camera, film: Film, place_map: Path, log: Pat
 
 
 @contextmanager
-def _autopilot() -> Iterator[tuple[str, Callable[[], tuple[ReceivedFix, ...]]]]:
+def _autopilot() -> Iterator[tuple[str, Callable[[], list[Message]]]]:
     """A simulated flight controller; gives the link to it, and a call that ends it and returns the fixes received."""
-    address, stop, summaries = f"127.0.0.1:{free_port()}", threading.Event(), []
-    thread = threading.Thread(target=lambda: summaries.append(run_autopilot(f"udpin:{address}", stop=stop)))
+    address, stop, controller = f"127.0.0.1:{free_port()}", threading.Event(), _Noting()
+    thread = threading.Thread(target=serve, args=(controller, f"udpin:{address}", stop))
     thread.start()
 
-    def received() -> tuple[ReceivedFix, ...]:
+    def received() -> list[Message]:
         stop.set()
         thread.join()
-        return summaries[0].fixes
+        return controller.fixes
 
     try:
         yield f"udpout:{address}", received

@@ -60,14 +60,8 @@ def simulate_autopilot(args: Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it says what it has heard
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps
-    summary = run_autopilot(
-        args.link,
-        track=track,
-        vehicle=args.vehicle,
-        gps=has_gps,
-        parameters=parameters_of(args.param, _PARAMETER),
-    )
-    show(summary, args.json, str(summary))
+    parameters = parameters_of(args.param, _PARAMETER)
+    show(run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=has_gps, parameters=parameters), args.json)
     return 0
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from edgevpr.core.errors import LinkError
-from edgevpr.lab.simulate.controller import STEP_S, FlightController, ReceivedFix
+from edgevpr.lab.simulate.controller import STEP_S, FlightController
 from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, Motion
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT
@@ -27,27 +27,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotSummary:
-    """Everything that the simulated autopilot received. `messages` counts them by name. `companion` is the last
-    companion heard, as "system/component" (None: none). `fixes_failed` counts fixes that came at a time when none is
-    accepted, as while there is GPS; `fixes_denied` counts those with a wrong form; `fixes` are the accepted ones."""
+    """Everything that the simulated autopilot received. `companion` is the last companion heard, as "system/component"
+    (None: none). `fixes_failed` counts fixes that came at a time when none is accepted, as while there is GPS;
+    `fixes_denied` counts those with a wrong form. `messages` counts all messages by name."""
 
-    messages: dict[str, int]
     companion: str | None
     fixes_accepted: int
     fixes_failed: int
     fixes_denied: int
-    fixes: tuple[ReceivedFix, ...]
     lost_packets: int
     bad_bytes: int
-
-    def __str__(self) -> str:
-        counts = ", ".join(f"{name} {count}" for name, count in sorted(self.messages.items())) or "none"
-        return (
-            f"companion: {self.companion or 'not heard'}\n"
-            f"messages:  {counts}\n"
-            f"fixes:     {self.fixes_accepted} accepted, {self.fixes_failed} failed, {self.fixes_denied} denied\n"
-            f"line:      {self.lost_packets} packets lost, {self.bad_bytes} bad bytes"
-        )
+    messages: dict[str, int]
 
 
 def run_autopilot(
@@ -64,7 +54,7 @@ def run_autopilot(
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
     and accepts no fix. `parameters` (name to value as text) are set before the start. Raises LinkError if the link
-    cannot be opened, UsageError for an unknown vehicle or parameter, and for a wrong value.
+    cannot be opened, UsageError for an unknown parameter, and for a wrong value.
     """
     motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
@@ -122,14 +112,13 @@ class _Conversation:
         answers = Counter(self._controller.answers)
         accepted, denied = answers[mavlink.MAV_RESULT_ACCEPTED], answers[mavlink.MAV_RESULT_DENIED]
         return AutopilotSummary(
-            messages=dict(self._receiver.received),
             companion=self._companion,
             fixes_accepted=accepted,
             fixes_failed=answers.total() - accepted - denied,
             fixes_denied=denied,
-            fixes=tuple(self._controller.fixes),
             lost_packets=self._lost_packets,
             bad_bytes=self._receiver.bad_bytes,
+            messages=dict(self._receiver.received),
         )
 
     def _take(self, message: Message) -> None:

@@ -3,9 +3,7 @@ is an argument, in seconds from its start. Used by `autopilot` and by tests."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
 from edgevpr.lab.simulate.firmware import FAILED, OK, UNSUPPORTED, Firmware
 from edgevpr.lab.simulate.motion import Motion
@@ -26,30 +24,17 @@ _HEARTBEAT_HZ = 1.0
 _WHERE = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN}
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedFix:
-    """An accepted position fix as it arrived. `t_frame_s` is the time of the position, by the sender's clock."""
-
-    lat_deg: float
-    lon_deg: float
-    accuracy_m: float
-    t_frame_s: float
-
-
 class FlightController:
     """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
-    start. `start_utc_s` is its UTC at the start, seconds since 1970. `fixes` are the accepted fixes, `answers` the
-    reply (a MAV_RESULT) to each fix received, and `reports` the functions that make its messages, by message number.
-    `brain` is the simulated firmware."""
+    start. `start_utc_s` is its UTC at the start, seconds since 1970. `answers` are the replies (MAV_RESULT)
+    to the fixes received, and `reports` the functions that make its messages, by message number. `brain` is the
+    simulated firmware."""
 
     def __init__(
         self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = 1_770_000_000.0
     ) -> None:
-        if vehicle not in VEHICLES:
-            raise UsageError(f"There is no vehicle {vehicle!r}: choose one of {', '.join(VEHICLES)}.")
         self.brain = VEHICLES[vehicle](motion)
         self.vehicle, self.system_id = vehicle, system_id
-        self.fixes: list[ReceivedFix] = []
         self.answers: list[int] = []
         known = {**REPORTS, self.brain.filter_report: FILTER_REPORTS[self.brain.filter_report]}
         self.reports: dict[int, Report] = {
@@ -119,11 +104,8 @@ class FlightController:
         match command.command:
             case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE if command.get_type() == "COMMAND_INT":
                 # PX4 would take it as COMMAND_LONG too, with a latitude in float32.
-                self.answers.append(result := self.brain.take_fix(command))
-                if result == OK:
-                    t_frame_s = command.param1 - command.param2
-                    self.fixes.append(ReceivedFix(command.x / 1e7, command.y / 1e7, command.param3, t_frame_s))
-                return result, []
+                self.answers.append(self.brain.take_fix(command))
+                return self.answers[-1], []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if is_known:
                 self._stream(number, command.param2)
                 return OK, []

@@ -4,8 +4,7 @@ by `controller`. They are from EKF2.cpp, ekf.cpp (resetGlobalPosToExternalObserv
 
 import math
 
-from edgevpr.lab.simulate.firmware import FAILED, NOT_NOW, OK, SD_GROWS_M_S, Firmware
-from edgevpr.lab.simulate.firmware import PX4 as PX4_PARAMETERS
+from edgevpr.lab.simulate.firmware import FAILED, NOT_NOW, OK, PX4, SD_GROWS_M_S, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D
 from edgevpr.mavlink.wire import Message, mavlink
@@ -32,7 +31,7 @@ class Px4(Firmware):
     }
 
     def __init__(self, kind: str, motion: Motion) -> None:
-        super().__init__(kind, motion, PX4_PARAMETERS)
+        super().__init__(kind, motion, PX4)
         self._fused_s = self._aided_s = -math.inf  # last fused; last not purely inertial
         self._other_s = self._other_heard_s = -math.inf  # message 296: last fused, last received
 

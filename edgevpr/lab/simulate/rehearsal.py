@@ -37,12 +37,12 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
         shots = _of_mission(path, every_m)
     if not shots:
         raise UsageError(f"{path} has no path: a track needs waypoints, or lines with lat and lon.")
-    heights_m = [height_m or shot.height_m for shot in shots]
-    if not all(over_m and over_m > 0 for over_m in heights_m):
-        raise UsageError(f"{path} does not say all heights over the ground (height_m > 0): give --height-m.")
     places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
     flown, t_s, course_deg = [], _START_UTC_S, 0.0
-    for number, (shot, over_m) in enumerate(zip(shots, heights_m, strict=True)):
+    for number, shot in enumerate(shots):
+        over_m = height_m or shot.height_m
+        if not (over_m and over_m > 0):
+            raise UsageError(f"{path} does not say all heights over the ground (height_m > 0): give --height-m.")
         # The first picture looks along the way to the second one.
         here, there = places[max(0, number - 1)], places[number or min(1, len(places) - 1)]
         if (way_m := float(distance_m(*here, *there))) > 0:
