@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.text import figure, markdown
+from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -153,6 +153,13 @@ def edgevpr(*arguments: object) -> Any:
     if done.returncode:
         raise EdgevprError(f"`{' '.join(words[2:])}` failed (see above): correct what it names.")
     return json.loads(done.stdout)
+
+
+def figure(wide_in: float, high_in: float) -> Any:
+    """Make an empty figure of so many inches."""
+    from matplotlib.figure import Figure  # not every benchmark draws
+
+    return Figure(figsize=(wide_in, high_in), layout="constrained")
 
 
 def panels(wide_in: float, high_in: float, count: int, rows: int = 1, **shared: Any) -> tuple[Any, list[Any]]:

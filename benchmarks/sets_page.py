@@ -7,7 +7,7 @@ from typing import Any
 
 import base
 
-from edgevpr.core.text import figure, markdown
+from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json
 from edgevpr.lab.evaluate.metrics import Quality
@@ -71,7 +71,7 @@ def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
     A curve of one point, where all scores are the same, is drawn as a mark."""
     columns = min(len(results), _PANELS_A_ROW)
     rows = -(-len(results) // columns)
-    drawn = figure(5.2 * columns, 4.6 * rows)
+    drawn = base.figure(5.2 * columns, 4.6 * rows)
     # A technique looks the same in every panel, whatever is beside it and whatever the order of the legend.
     names = list(dict.fromkeys(result.technique for compared in results.values() for result in compared))
     for at, (title, compared) in enumerate(results.items(), start=1):

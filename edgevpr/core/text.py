@@ -1,7 +1,6 @@
 """Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, and progress."""
 
 import json
-import logging
 import math
 import os
 import re
@@ -12,10 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from difflib import get_close_matches
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
 # user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is replaced.
@@ -156,14 +152,6 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")
         stream.flush()
-
-
-def figure(width_in: float, height_in: float) -> "Figure":
-    """Make an empty matplotlib figure; sizes in inches."""
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # hides its messages about fonts
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def nines(probability: float) -> str:
