@@ -93,10 +93,8 @@ def _seen(query: dict[str, Any] | None, now_s: float) -> str:
 def _of_link(link: dict[str, Any]) -> list[tuple[str, str]]:
     channel = _CHANNELS.get(link["channel"], link["channel"])
     heard = _known(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
-    answers = ", ".join(f"{number} {name}" for name, number in link["answers"].items()) or "none"
     return [
         ("link", f"{link['trouble'] or 'open'}, {heard or 'no flight controller is heard'}"),
         ("fixes", link["fixes"]),
-        ("answers", f"{answers}, {link['unanswered']} missing"),
         ("navigation", _known("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
     ]

@@ -11,18 +11,13 @@ MATCH = {
     "reference_image": "0812.jpg",
     "score": 0.87,
     "confidence": 0.9991,
-    "lat_deg": 50.1,
-    "lon_deg": 8.2,
     "accuracy_m": 12.0,
 }
 LINK = {
-    "connected": True,
     "trouble": None,
     "autopilot": 1,
     "channel": "COMMAND",
     "fixes": "3 fixes sent, 2 taken",
-    "answers": {"ACCEPTED": 2, "DENIED": 1},
-    "unanswered": 0,
     "accuracy_m": 7.25,
 }
 STATUS = {

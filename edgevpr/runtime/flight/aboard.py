@@ -40,7 +40,12 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
     """
     here = replace(config, map=world.place_map)
     name = world.tape.read("picked", lambda: _picked(config))
-    learning = cache(lambda: _learning(here, world, name))
+
+    @cache
+    def learning() -> tuple[Recogniser, Learner]:
+        recogniser, growing = open_learning(here, world.board, name)
+        spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
+        return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
 
     def problem() -> str | None:
         try:
@@ -85,14 +90,6 @@ def _picked(config: Config) -> str | None:
     if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
         return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     return config.technique
-
-
-def _learning(config: Config, world: World, name: str | None) -> tuple[Recogniser, Learner]:
-    """Open the recogniser of a flight and its learner. `name` is the technique for which a new map is made."""
-    recogniser, growing = open_learning(config, world.board, name)
-    spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
-    learner = Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
-    return recogniser, learner
 
 
 def rate_hz(config: Config, recogniser: Recogniser) -> float:

@@ -45,8 +45,7 @@ class ToAutopilot:
 
     @property
     def summary(self) -> str:
-        """Counts so far, in a few words: fixes sent, accepted by the autopilot, refused by it, unanswered, held back,
-        too late, and withheld; and refused messages from other systems."""
+        """Counts of fixes so far, and of refused messages from other systems, in a few words."""
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
         sent = taken if self._send_fixes else DRY_RUN
@@ -62,28 +61,23 @@ class ToAutopilot:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the link for the status, a dict:
-        - `connected`: packets can be sent; `trouble`: why the port could not be opened or was lost (None: data arrives)
+        - `trouble`: why the port could not be opened or was lost (None: data arrives)
         - `autopilot`: system id of the one heard (None: none is); `channel`: name of the `Channel` of positions
-        - `fixes`: see `summary`; `answers`: the answers to fixes, counted by result; `unanswered`: number of fixes
-        - `accuracy_m`: how well our position is known, standard deviation of one axis (None: it is not known).
+        - `fixes`: see `summary`; `accuracy_m`: see `Navigator.accuracy_m`.
         """
         with self._link.turn("state"):
             stats = self._link.stats()
             return {
-                "connected": stats.connected,
                 "trouble": stats.trouble,
                 "autopilot": stats.autopilot_system_id if stats.autopilot_heard else None,
                 "channel": self._link.channel.name,
                 "fixes": self.summary,
-                "answers": stats.acks,
-                "unanswered": stats.unanswered_fixes,
                 "accuracy_m": self._navigator.accuracy_m(self._clock.mono_s()),
             }
 
     def log_answers(self) -> None:
         """Write a log line of kind "answer" for each fix that, since the last call, was answered, was not answered in
-        time, or was given up before it was sent. Its fields:
-        - query: name of the frame; sent: whether the fix was sent
+        time, or was given up before it was sent. Its fields that need a word:
         - result: name of a MAV_RESULT (null: no answer); why: the reason, in words (null: the fix was accepted)
         - latency_ms: from sending to answer (null: no answer); t_sent_s: time of sending, on the clock of t_mono_s.
         """
@@ -107,10 +101,7 @@ class ToAutopilot:
     def told(self, event: Recognition, used_mah: float) -> Recognition:
         """Tell the autopilot and the ground station about an event: send its fix, if there is one to send, and its
         figures. Return the event with the reports of this fix (`fix`) and of the fix before it (`last_fix`), each None
-        if there is none.
-
-        `used_mah` is the charge that the board has drawn so far.
-        """
+        if there is none. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("told"):
             last = _reported(*self._last) if self._last else None
             fix, sending = self._fixed(event) if event.accepted else (None, None)
@@ -178,8 +169,8 @@ class ToAutopilot:
         return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
-        """Count the fix if it is held back because of `objection` (None: it is not held back). Report the first fix of
-        a row that is held back, and the first one after it that is not."""
+        """Count a fix that is held back because of `objection` (None: it is not). Report the first of a row, and the
+        first one after it that is not held back."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:
@@ -234,8 +225,8 @@ def unsent(event: Recognition, why: str) -> FixReport:
 
 
 def confidence_of(event: Recognition) -> float | None:
-    """Return the confidence of an accepted match: that of the match alone or, if higher, that of the belief over the
-    flight so far. None: the technique has no model of confidence."""
+    """Return the confidence of a match: that of the match alone or, if higher, that of the belief over the flight so
+    far. None: the technique has no model of confidence."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.followed.confidence if event.followed else 0.0)

@@ -11,8 +11,8 @@ from edgevpr.core.types import Tape
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Clocks, in seconds. `mono_s` is the monotonic clock, which stamps every frame and message of a flight; `wall_s`
-    times the steps of a query; `utc_s` counts from 1970; `process_cpu_s` is the CPU time of all threads of this
-    process, and `thread_cpu_s` that of the calling thread. `sleep` waits for some seconds."""
+    times the steps of a query; `utc_s` counts from 1970. The CPU times are of all threads of this process, and of the
+    calling one. `sleep` waits for some seconds."""
 
     mono_s: Callable[[], float] = time.monotonic
     wall_s: Callable[[], float] = time.perf_counter
@@ -23,8 +23,7 @@ class Clock:
 
 
 def taped(clock: Clock, tape: Tape) -> Clock:
-    """Return the same clocks with each reading recorded on the `tape` (the record of a flight's input) or played back
-    from it; `sleep` stays as it is."""
+    """Return the same clocks with each reading recorded on the `tape`, or played back from it."""
     names = [each.name for each in fields(clock) if each.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
@@ -39,7 +38,7 @@ class Pace:
         self.rate_hz = rate_hz
 
     def wait_s(self) -> float:
-        """Return the seconds until the next frame is due; 0 or less if it is due already."""
+        """Return the seconds until the next frame is due; 0 or less: it is due."""
         return self._due_s - self._clock.mono_s()
 
     def taken(self) -> None:

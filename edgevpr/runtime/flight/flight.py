@@ -199,7 +199,7 @@ class Flight:
         with meter.timed() as telling:
             try:
                 if self._crew.autopilot:
-                    event = self._crew.autopilot.told(event, meter.used_mah)
+                    event = self._crew.autopilot.told(event, meter.totals()["used_mah"])
                 elif event.accepted:
                     event = replace(event, fix=unsent(event, "there is no link"))
             except Exception:

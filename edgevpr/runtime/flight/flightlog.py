@@ -76,7 +76,7 @@ class FlightLog:
         self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
         self._file: FileIO | None = None
         self._ours: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
-        self._synced_s, self._is_synced, self._is_new = -math.inf, True, False
+        self._synced_s, self._is_synced = -math.inf, True
         self._start: dict[str, Any] = {}  # the start line, for the copies in later files
         self._part = 0  # start lines written so far
         self._warned: set[str] = set()
@@ -187,16 +187,15 @@ class FlightLog:
         if not try_lock(file):
             file.close()
             raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._at))
-        self._file, self._is_new = file, not _size_of(file)
-        if self._is_new:  # on another medium it may have the numbers of a file before it
+        self._file = file
+        if not _size_of(file):  # on another medium it may have the numbers of a file before it
             self._ours = None
+            sync_folder(self._at)
         return file
 
     def _sync(self, file: FileIO, now_s: float) -> None:
         sync(file)
-        if self._is_new:
-            sync_folder(self._at)
-        self._is_synced, self._is_new, self._synced_s = True, False, now_s
+        self._is_synced, self._synced_s = True, now_s
 
     def _note_trouble(self, error: OSError) -> None:
         """Note that the file cannot be written. It is opened anew by the next line: the card may be another one when it

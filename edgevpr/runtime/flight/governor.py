@@ -41,8 +41,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from the setting `before` to the setting `after`, and the reason `why`. `back`: it is a change up, towards
-    the setting asked for. If a limit is exceeded and nothing is left to lower, both settings are the same."""
+    """Change from the setting `before` to `after`, and the reason `why`. `back`: it is a change up. If a limit is
+    exceeded and nothing is left to lower, both settings are the same."""
 
     before: Setting
     after: Setting
@@ -115,23 +115,21 @@ class Governor:
         return None
 
     def _held_s(self, what: str, now_s: float, holds: bool) -> float:
-        """Note whether the condition `what` holds now. Return for how many seconds it has held without a break, 0 if it
-        does not hold now."""
+        """Note whether the condition `what` holds now. Return for how many seconds it has held without a break."""
         if not holds:
             self._since_s.pop(what, None)
             return 0.0
         return now_s - self._since_s.setdefault(what, now_s)
 
     def _below(self, hot: bool) -> int | None:
-        """Return the index of the next lower setting (None: there is none). If the board is `hot`, it is the next one
-        with a lower rate: fewer candidates alone would cool it too slowly to see an effect."""
+        """Return the index of the next lower setting (None: there is none). For a `hot` board it is one with a lower
+        rate: fewer candidates alone would cool it too slowly to see an effect."""
         below = range(self._at + 1, len(self._settings))
         slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
 
     def _load(self, reading: LoadReading) -> tuple[bool, str | None]:
-        """Judge a measurement, except its memory. Returns two values: True if the board is too hot; a few words about
-        the limit that is exceeded (None: none is)."""
+        """Return True if the board is too hot, and a few words about the limit that is exceeded (None: none is)."""
         allowed, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
             return True, f"{temperature_c:.0f} degrees, and {self._limit_c:.0f} are the limit"
@@ -190,7 +188,7 @@ class Governing:
         self.governor = Governor(recogniser.meter.board, crew.meter.limit_c, settings)
 
     def look(self) -> None:
-        """Measure the load of the flight if the last measurement is a second old, and change the settings if needed."""
+        """Measure the load, at most once a second, and change the settings if needed."""
         crew = self._crew
         if crew.meter.load.age_s < GOVERN_S:
             return

@@ -19,8 +19,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 class LoadReading:
     """One measurement for the governor. `cpu_share` (0..1) is the share of all cores that this process has used since
     the last measurement. `late_share` (0..1) is the share of that time that queries took, if other programs or the disk
-    kept them waiting, else 0. `rss_mb` is the memory of this process now. `temperature_c` is that of the board in
-    degrees Celsius, and `throttled` says that the board slows itself down (None: unknown)."""
+    kept them waiting, else 0. `rss_mb` is the memory of this process; the rest is of the board (None: unknown)."""
 
     cpu_share: float
     late_share: float
@@ -32,8 +31,7 @@ class LoadReading:
 class FlightMeter:
     """Meter of the charge, CPU time, memory and heat of a flight; it starts when it is made. `energy` sums up the costs
     of queries, `load` the time for which the loop is busy. `thermal` is the newest measurement of the board's heat,
-    `limit_c` the temperature at which the board slows itself down, `queries_throttled` the number of queries while it
-    did. All measurements are recorded on the `tape`."""
+    `limit_c` the temperature at which the board slows itself down. All measurements are recorded on the `tape`."""
 
     def __init__(
         self,
@@ -53,11 +51,6 @@ class FlightMeter:
         self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
 
-    @property
-    def used_mah(self) -> float:
-        """Charge that the board has drawn from the battery pack so far, mAh."""
-        return self.totals()["used_mah"]
-
     def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
         """Return a context manager that measures the code inside it: its time, and the CPU time of all threads or,
         with `thread_only`, of the calling one."""
@@ -71,10 +64,10 @@ class FlightMeter:
     def totals(self) -> dict[str, float]:
         """Return the totals since the start:
         - `used_mah`: charge drawn from the pack by the idle board and by this process (other programs are not counted)
-        - `process_mah`: the part of `used_mah` that this process added to the idle board; `process_cpu_s`: its CPU time
+        - `process_mah`: the part of it that this process added to the idle board; `process_cpu_s`: its CPU time
         - `marginal_mah`: the part of `process_mah` that queries added (reading a frame, recognising it, reporting the
           result); `stages_cpu_s`: their CPU time
-        - `elapsed_s`: time since the start; `queries_throttled`: number of queries while the board slowed itself down.
+        - `queries_throttled`: number of queries while the board slowed itself down.
         """
         process, board = self.energy.process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)

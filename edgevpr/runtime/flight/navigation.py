@@ -68,8 +68,7 @@ class ComparedFix:
 class Navigation:
     """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
     up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard
-    deviation, of one axis, of the error that all fixes share. `has_gps`: at its last report, the autopilot had a GPS
-    that is believed."""
+    deviation, of one axis, of the error that all fixes share. `has_gps`: the autopilot has a GPS that is believed."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -104,9 +103,7 @@ class Navigation:
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
         there = path.at(t_s)
-        if there is None:
-            return
-        if self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
+        if there and self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
             self._gps_s = t_s
             off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
@@ -130,8 +127,7 @@ class Navigation:
         )
 
     def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
-        """Correct our position by a fix. `is_against`: the fix contradicts the expected position, and is believed all
-        the same (see `Consistency`)."""
+        """Correct our position by a fix. `is_against`: it contradicts what was expected (see `Consistency`)."""
         if self._path:
             hear = self._filter.trust_fix if is_against else self._filter.hear_fix
             hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s)
@@ -173,7 +169,7 @@ class Navigation:
         self, position: Position, sd_m: float, velocity_m_s: Doubles, t_s: float, velocity_sd_m_s: float
     ) -> None:
         self._path = Path(position, t_s, velocity_m_s)
-        self._filter.start(np.zeros(2), sd_m, velocity_sd_m_s)
+        self._filter.start(sd_m, velocity_sd_m_s)
 
     @property
     def _unbroken(self) -> Path | None:
@@ -184,17 +180,15 @@ class Consistency:
     """Holds back a fix that contradicts the expected position, until a second, independent fix agrees with it. With
     GPS, a contradicting fix is never believed.
 
-    The path drifts slowly. If a fix lies far outside of that drift, either the fix is wrong or the path is: only
-    another fix can tell. The path moves with the aircraft, so two right fixes have the same offset from it, and two
-    wrong ones hardly ever do."""
+    The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
+    right fixes have the same offset from the path, and two wrong ones hardly ever do."""
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
 
     def weighed(self, fix: ComparedFix, has_gps: bool) -> tuple[str | None, bool]:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Returns two values:
-        - the reason why the fix is not believed (None: it is believed);
-        - True if the fix contradicts the expected position, but is believed because an earlier fix agrees with it."""
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Return why the fix is not
+        believed (None: it is), and True if it contradicts the expected position but an earlier fix agrees with it."""
         step_m = fix.off_m - fix.expected_m
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS:
             self._held = None
@@ -236,8 +230,7 @@ def positioned(event: Recognition) -> PositionedMatch | None:
 
 
 def _differ(one: ComparedFix, other: ComparedFix) -> float:
-    """Return by how many standard deviations the offsets of two fixes from the path differ; infinity if more than 30 s
-    lie between the fixes."""
+    """Return by how many standard deviations the offsets of two fixes differ; infinity if they are 30 s apart."""
     apart_s = abs(other.seen.t_s - one.seen.t_s)
     return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
 

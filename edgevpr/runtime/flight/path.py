@@ -143,11 +143,10 @@ class DriftFilter:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(8), np.zeros((8, 8))
 
-    def start(self, offset_m: Doubles, sd_m: float, velocity_sd_m_s: float) -> None:
-        """Begin with the aircraft `offset_m` (2,) beside the path. `sd_m` and `velocity_sd_m_s` are the standard
-        deviations, of one axis, of this offset and of the error of velocity."""
+    def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
+        """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
+        of its offset and of the error of velocity."""
         self._x = np.zeros(8)
-        self._x[_C] = offset_m
         of_parts = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m
         self._p = np.diag(np.repeat(np.square(of_parts), 2))
 

@@ -45,7 +45,7 @@ class Recording(Tape):
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
         """Make a folder for this flight in `folder`. The oldest recordings there are deleted until they take at most
-        half of `max_mb`; the new one may take the other half. Raises EdgevprError if the folder cannot be made."""
+        half of `max_mb`; the new one may take the other half. Raises EdgevprError."""
         self.state: str | None = None
         self._most_bytes = 1e6 * max_mb / 2
         self._waiting: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
@@ -130,8 +130,7 @@ class Recording(Tape):
                 self._tape.close()
 
     def _write(self) -> None:
-        """Write all that waits. Frames are on the disk before the lines of the tape that name them. Raises OSError,
-        also if the recording must end."""
+        """Write all that waits, frames before the lines that name them. Raises OSError if the recording must end."""
         if self._bytes_put - self._bytes_written > WAITING_BYTES or len(self._waiting) > WAITING_NOTES:
             raise OSError(errno.EIO, "the disk is too slow for it")
         notes = []
@@ -140,7 +139,11 @@ class Recording(Tape):
             if isinstance(each, bytes):
                 notes.append(each)
             else:
-                self._write_frame(*each)
+                number, jpeg = each
+                with open_appending(frame_path(self.path, number)) as file:
+                    append(file, jpeg)
+                    sync(file)
+                self._bytes_written += len(jpeg)
         if not notes:
             return
         disk = os.fstatvfs(self._tape.fileno())
@@ -150,12 +153,6 @@ class Recording(Tape):
             raise OSError(errno.EFBIG, "it is as large as half of log.record_mb allows")
         append(self._tape, b"".join(notes))
         sync(self._tape)
-
-    def _write_frame(self, number: int, jpeg: bytes) -> None:
-        with open_appending(frame_path(self.path, number)) as file:
-            append(file, jpeg)
-            sync(file)
-        self._bytes_written += len(jpeg)
 
     def _delete_oldest(self) -> None:
         *earlier, _ = recordings(self.path.parent)
@@ -174,8 +171,8 @@ def frame_path(folder: Path, number: int) -> Path:
 
 
 def recording_of(said: str | None, log: str | Path) -> Path | None:
-    """Find the recording that the log file `log` names as `said`: at that path, or in a folder of the same name beside
-    the log. None if it is in neither, or the log names none."""
+    """Find the recording that the log file `log` names as `said` (None: it names none): at that path, or in a folder of
+    the same name beside the log. None if it is in neither."""
     if not said:
         return None
     here = Path(said)
@@ -184,8 +181,7 @@ def recording_of(said: str | None, log: str | Path) -> Path | None:
 
 
 def frames_of(folder: Path) -> dict[str, Path]:
-    """Return the picture files of the recording in `folder`, as a dict whose keys are the frames' names in the flight
-    log."""
+    """Return the picture files of the recording in `folder`, by the frames' names in the flight log."""
     found = {}
     with open(folder / TAPE, "rb") as tape:
         for line in tape:

@@ -78,7 +78,6 @@ def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
 
 
 def usual_path() -> str | None:
-    """Return the path of the status file in the folder that systemd has made for the service; None if it has made
-    none."""
+    """Return the path of the status file in the folder that systemd makes for the service; None if there is none."""
     folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     return str(Path(folder) / NAME) if folder else None

@@ -149,8 +149,8 @@ class Vitals:
 
 
 def _seen(event: Recognition) -> dict[str, Any]:
-    """Return the fields of the status about a query. None: unknown; only an accepted match has a position."""
-    best, here = event.best, event.position
+    """Return the fields of the status about a query (None: unknown)."""
+    best = event.best
     return {
         "query": event.name,
         "accepted": event.accepted,
@@ -159,7 +159,5 @@ def _seen(event: Recognition) -> dict[str, Any]:
         "reference_image": best.place.source_image if best else None,
         "score": best.match.score if best else None,
         "confidence": confidence_of(event),
-        "lat_deg": here.lat_deg if here else None,
-        "lon_deg": here.lon_deg if here else None,
         "accuracy_m": event.accuracy_m,
     }

@@ -41,9 +41,8 @@ _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts the events of a flight: `queries`; `accepted` queries; `unusable` frames, which could not become a query;
-    `failed` queries; `failed_in_a_row`, the failed events since the last good one; and `nothing_in_a_row`, the last
-    pictures in a row that hold too little to be recognised."""
+    """Counts the events of a flight: `queries`, of them `accepted` and `failed` ones; `unusable` frames, which are no
+    queries; events that failed in a row, and pictures in a row that hold too little to be recognised."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
@@ -66,9 +65,8 @@ class Tally:
 
 class MapWatch:
     """Watches the map for damage. Each place that is left out because it cannot be read gets a log line of kind "left
-    out"; only the first is reported to the ground station. When the whole file cannot be read, and when it can be read
-    again, that is reported with the kind "map". `left_out` is the number of places left out.
-    """
+    out"; only the first is said. That the whole file cannot be read, or can again, is reported with the kind "map".
+    `left_out` is the number of places left out."""
 
     def __init__(self, herald: Herald) -> None:
         self.left_out = 0
@@ -80,7 +78,7 @@ class MapWatch:
         return f"{self.left_out} places of the map left out" if self.left_out else None
 
     def tell(self, event: Recognition) -> None:
-        """Check an event for places left out and for a map that cannot be read."""
+        """Check an event for unreadable places."""
         for place_id, problem in event.left_out:
             self._herald.note("left out", place=place_id, problem=problem)
         if event.left_out and not self.left_out:
@@ -99,8 +97,7 @@ class MapWatch:
 
 
 class Sight:
-    """Reports once when the aircraft leaves the map, once when the map is found again, once when the camera is tilted
-    too far, and once when it no longer is.
+    """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that is over.
 
     The map counts as left after many queries in a row that are not accepted. A picture that shows nothing, is not worth
     a search, could not be used or is tilted too far is not counted among them.
@@ -205,8 +202,7 @@ class GpsWatch:
 
 
 def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
-    """Return the offset (2,), metres east and north, from the receiver's position at the time of the frame to the
-    match."""
+    """Return the offset (2,) of the match from the receiver at the time of the frame, metres east and north."""
     here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
     flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))

@@ -51,8 +51,8 @@ class StopNow(BaseException):
 
 
 class Stop:
-    """Signal handler that ends a flight. While a frame is recognised, and before the flight begins, it raises StopNow,
-    so that a long comparison does not delay the end. Otherwise the flight ends after the present pass of its loop."""
+    """Signal handler that ends a flight: by StopNow while a frame is recognised and before the flight begins, so that
+    long work does not delay the end, otherwise after the present pass of the loop."""
 
     def __init__(self, tape: Tape = NO_TAPE) -> None:
         self._tape = tape
@@ -74,8 +74,8 @@ class Stop:
 
     @contextmanager
     def beginning(self) -> Iterator[None]:
-        """Context manager for the start of a flight: a signal raises StopNow inside it, also a signal that came before
-        it. This is not recorded, since nothing has been flown that could be replayed."""
+        """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow inside it. This is
+        not recorded, since nothing has been flown that could be replayed."""
         self._begins = True
         try:
             if self._asked:

@@ -34,7 +34,6 @@ def test_the_status_counts_what_the_flight_does_and_names_its_match(recording, t
     assert last["match"]["query"] == f"frame {last['queries'] - 1:06d}"
     assert last["match"]["place"] == last["queries"]
     assert 0 < last["t_mono_s"] - last["match"]["t_frame_s"] < 1.5
-    assert last["match"]["lat_deg"] == pytest.approx(50.0, abs=1.0)
     assert 0.9 < last["match"]["confidence"] <= 1.0
     assert last["used_mah"] > first["used_mah"]
     assert last["source"] == "streaming"
