@@ -42,13 +42,9 @@ class Inquiry(AbstractContextManager["Inquiry"]):
     """
 
     def __init__(
-        self,
-        address: LinkAddress,
-        component_id: int = 197,
-        system_id: int | None = None,
-        signing: Signing = NOT_SIGNING,
+        self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
     ) -> None:
-        """Open the link. `component_id` is our own, `system_id` that of the autopilot (None: the first one heard).
+        """Open the link. `own_id` is our component id, `system_id` that of the autopilot (None: the first one heard).
         Raises LinkError if the port cannot be opened (see `open_port`) or its other end is missing."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
@@ -58,7 +54,7 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         self.round_trips_s: list[float] = []
         self.signing, self.reader = signing, PacketReader(signing.admits)
         self._address = address
-        self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=component_id)
+        self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=own_id)
         self._arrived: deque[Message] = deque()  # from the autopilot, not yet returned to the caller
         self._heartbeat_due_s = 0.0
         try:

@@ -1,7 +1,7 @@
 """The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
-no port and no thread, and is used by `link` inside turns only. A turn is the time in which one thread, that of a link
-or of the flight, uses the conversation alone, while its clock stands still. Turns are recorded on the tape, so that a
-flight can be replayed."""
+no port and no thread, and is used inside turns only. A turn is the time in which one thread, that of a link or of the
+flight, uses it alone, while its clock stands still. Turns are recorded on the tape, so that a flight can be replayed.
+"""
 
 import logging
 import math
@@ -286,8 +286,7 @@ class Conversation:
 
 
 class Turns:
-    """Gives turns to one thread at a time. A conversation depends only on the times of its turns and on its input, so a
-    replay gives the same result."""
+    """Gives turns to one thread at a time. A conversation depends only on their times and on its input."""
 
     def __init__(self, clock: Callable[[], float], tape: Tape = NO_TAPE) -> None:
         self._clock, self._tape = clock, tape

@@ -34,10 +34,9 @@ class LinkStats:
     """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
 
     `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
-    from another autopilot or address. `withheld_fixes` were not sent because earlier ones had no answer, or because of
-    a pause. `refused_why` is about the last refused fix (None: none was). `commands` and `ignored_requests` count the
-    requests on any link (see `Requests`). `refused_signatures` are counted by reason. `reopened` is how many times the
-    port was opened again, `bad_bytes` the number of received bytes that belong to no valid message.
+    from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
+    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link,
+    `refused_signatures` refusals by reason. `reopened` is how often the port was; `bad_bytes` belong to no message.
     """
 
     connected: bool
@@ -132,7 +131,6 @@ class Link:
 
     @property
     def channel(self) -> Channel:
-        """The channel by which the autopilot is told positions."""
         return self._conversation.channel
 
     def listens(self) -> bool:

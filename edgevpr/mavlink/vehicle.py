@@ -1,5 +1,5 @@
-"""What the autopilot's messages of the last seconds tell: attitude, height and position accuracy of the vehicle, and
-whether the autopilot is ready to accept a fix, with the likely reasons for its answers. These were read in the source
+"""The state of the vehicle (attitude, height and position accuracy) from the autopilot's messages of the last seconds,
+and the autopilot's readiness to accept a fix, with the likely reasons for its answers. These were read in the source
 code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
 import math
