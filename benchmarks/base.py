@@ -141,11 +141,6 @@ def find_sets(data: Path = DATA, names: Iterable[str] | None = None, camera: str
     return [folder for name, folder in found.items() if name in wanted and camera in (None, camera_of(name))]
 
 
-def registered() -> list[Path]:
-    """Return the folders of the sets from the air whose pictures were laid on each other (pairs_overlap.csv)."""
-    return [folder for folder in find_sets(camera="nadir") if (folder / "pairs_overlap.csv").exists()]
-
-
 def edgevpr(*arguments: object) -> Any:
     """Return what a command of edgevpr prints as JSON, by `--json`. Raises EdgevprError where it fails."""
     words = [sys.executable, "-m", "edgevpr", *map(str, arguments), "--json"]

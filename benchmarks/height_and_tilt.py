@@ -43,7 +43,8 @@ class Pictures:
 
 
 def main() -> None:
-    rows = [row for folder in base.registered() for row in measured(folder)]
+    laid = [folder for folder in base.find_sets(camera="nadir") if (folder / "pairs_overlap.csv").exists()]
+    rows = [row for folder in laid for row in measured(folder)]
     found = {**base.made_by(), "rows": rows}
     base.write("height_and_tilt", found, page(found))
 

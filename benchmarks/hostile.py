@@ -1,6 +1,6 @@
 """Everything that a hostile world does, again: `make hostile` writes benchmarks/results/hostile.md and hostile.json.
 
-python benchmarks/hostile.py [--parts A,B] [--share S] [--seed N]
+python benchmarks/hostile.py [--parts A,B] [--seed N]
 
 Streams that break, pictures that say nothing, maps that are damaged and packets of others are all made from a seed. The
 table says what was tried, how often, and what left the aircraft.
@@ -33,13 +33,12 @@ PARTS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--parts", metavar="A,B", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
-    parser.add_argument("--share", type=float, default=1.0, help="of the usual counts (default: 1)")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     for name in args.parts.split(","):
         _, run, count = PARTS[name]
         print(f"trying: {name}", flush=True)
-        rows = [asdict(row) if is_dataclass(row) else row for row in run(max(1, round(args.share * count)), args.seed)]
+        rows = [asdict(row) if is_dataclass(row) else row for row in run(count, args.seed)]
         found = base.read("hostile") | {name: {**base.made_by(), "seed": args.seed, "rows": rows}}
         base.write("hostile", found, page(found))
 

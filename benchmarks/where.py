@@ -86,12 +86,9 @@ def load(folder: Path) -> Set:
 def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Solved:
     number = {name: at for at, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
-    rejected = (
-        [(row["file_a"], row["file_b"]) for row in base.read_csv(rejected_path)] if rejected_path.is_file() else []
-    )
-    rows = [
-        row for row in base.read_csv(folder / "pairs_overlap.csv") if (row["file_a"], row["file_b"]) not in rejected
-    ]
+    refused = base.read_csv(rejected_path) if rejected_path.is_file() else []
+    rejected, pairs = {(row["file_a"], row["file_b"]) for row in refused}, base.read_csv(folder / "pairs_overlap.csv")
+    rows = [row for row in pairs if (row["file_a"], row["file_b"]) not in rejected]
     longest = {name: max(picture(folder, name).shape[:2]) for name in names}
     step = [complex(float(row["dx_px"]), -float(row["dy_px"])) / longest[row["file_b"]] for row in rows]
     turn = [complex(np.log(float(row["scale"])), -np.radians(float(row["rotation_deg"]))) for row in rows]
