@@ -12,6 +12,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import base
@@ -22,23 +23,25 @@ import walks
 from base import DATA, Row, camera_of
 from matchability import NOT_LEARNT, fit, label_site, leave_one_out, site_of, write_network
 
+from edgevpr.core.config import load_config
 from edgevpr.core.text import progress
 from edgevpr.core.types import Salience
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.salience_gate import Thresholds, scores_of, worth_of
+from edgevpr.runtime.recognise.salience_gate import scores_of, worth_of
 from edgevpr.techniques.card import load_card
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
-FULL = Thresholds(0.3, 0.6, 0.4)
+OFF = replace(load_config(None).salience, memorability=0.0, staticity=0.0, entropy=0.0)
+FULL = replace(OFF, memorability=0.3, staticity=0.6, entropy=0.4)
 GATES = {
-    "none": Thresholds(),
+    "none": OFF,
     "all three": FULL,
-    "memorability": Thresholds(memorability=FULL.memorability),
-    "staticity": Thresholds(staticity=FULL.staticity),
-    "entropy": Thresholds(entropy=FULL.entropy),
+    "memorability": replace(OFF, memorability=FULL.memorability),
+    "staticity": replace(OFF, staticity=FULL.staticity),
+    "entropy": replace(OFF, entropy=FULL.entropy),
 }
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1

@@ -130,7 +130,6 @@ def map_build(args: Namespace) -> int:
     made = make_map(order, config, lambda error: leave_out(error, unusable), progress)
     more: dict[str, Any] = {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
-    more |= {} if made.without_data is None else {"without_data": made.without_data}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
     show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made))
     return exit_code(unusable)
@@ -236,7 +235,7 @@ def run_salience(args: Namespace) -> int:
 
     gate = gate_of(config_of(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    worth = worth_of(gate.scores(read_image(Path(args.image))), gate.thresholds)
+    worth = worth_of(gate.scores(read_image(Path(args.image))), gate.config)
     known = {"kept": worth.reason is None, "reason": worth.reason}
     show({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

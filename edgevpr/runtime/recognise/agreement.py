@@ -105,7 +105,7 @@ class Agreement:
 
 
 def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
-    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many agree on another overlay,
+    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many on another overlay,
     return the agreement on that one, with `is_expected` False."""
     found = agreement(query, place, expected)
     if found.inliers >= CONFIRMED:
@@ -119,8 +119,7 @@ def held_against(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
 
 
 def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures. Only ways to lay the query on the place that are near to the `expected`
-    overlay are tried (None: all ways)."""
+    """Compare the landmarks of two pictures, by ways near to the `expected` overlay only (None: by all ways)."""
     possible = min(len(query), len(place))
     nothing = Agreement(inliers=0, matched=0, possible=possible)
     if possible < _FEWEST:

@@ -102,9 +102,8 @@ class Proposals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
-    """Motion of the aircraft since the previous query. `reach` is how far it can have moved, in the unit of the map
-    (metres, or places), in `elapsed_s` seconds. `by` (2,) is its displacement by odometry, in the same unit (None:
-    unknown)."""
+    """Motion of the aircraft since the previous query, in metres or places: `reach` is how far it can have moved in
+    `elapsed_s` seconds, and `by` (2,) its displacement by odometry (None: unknown)."""
 
     reach: float
     elapsed_s: float
@@ -148,9 +147,8 @@ class Belief:
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
-        """Update the belief with the candidates that a query proposes (None: its picture shows too little), the motion
-        since the previous query, and the number of places in the map now. A candidate that is not finite counts as not
-        proposed."""
+        """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
+        are not finite do not count), the motion since the previous query, and the number of places in the map now."""
         odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
         now, lost, appears = self._left()
         ways = self._ways(now, moved, places)

@@ -47,11 +47,8 @@ class Landmarks:
 
 
 def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> Landmarks:
-    """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first.
-
-    No patch covers a pixel where `mask`, bool (H, W), is False. A picture without corners, or smaller than a patch, has
-    none.
-    """
+    """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first: none without corners,
+    or in a picture smaller than a patch. No patch covers a pixel where `mask`, bool (H, W), is False."""
     height, width = image.shape[:2]
     scale = _LONGEST_SIDE_PX / max(height, width)
     size = max(1, round(width * scale)), max(1, round(height * scale))

@@ -64,8 +64,7 @@ class Levelling:
 def levelling_of(
     config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
 ) -> Levelling | None:
-    """Make the levelling for a configuration; None if pictures are left as they are: the camera looks ahead, or its
-    lens is unknown and it is on a gimbal."""
+    """Make the levelling for a configuration; None for a camera that looks ahead, or on a gimbal with unknown lens."""
     if technique.spec.parameters.get("camera") != "nadir":
         return None
     lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)

@@ -160,8 +160,7 @@ def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple
 
 
 def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
-    """Combine the positions computed from several places. Returns their mean (2,), metres east and north of the best
-    place, and its covariance (2, 2)."""
+    """Return the mean (2,) of the positions computed from several places, and its covariance (2, 2)."""
     of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
     at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
     if len(said) > 1:

@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import is_now, levelling_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
-from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate, Thresholds
+from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
 from edgevpr.techniques.card import load_card
 
 _WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
@@ -89,10 +89,8 @@ def budget_mb(config: Config, board: Board) -> float:
 
 def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
     """Make the salience gate, None if the configuration asks for none. A criterion whose network is not named is off,
-    with a warning.
-
-    Raises ConfigError if no picture can reach a threshold or all criteria are off, ModelError for an unusable network.
-    """
+    with a warning. Raises ConfigError if nothing can pass or all criteria are off, ModelError for an unusable
+    network."""
     if not config.use:
         return None
     if config.entropy > MOST_ENTROPY:
@@ -112,18 +110,11 @@ def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
             _log.warning("no `salience.detector` is named: what moves in a picture does not count")
     if not (memorability or detector or config.entropy > 0):
         raise ConfigError("`salience.use` is true, and every criterion is off: raise a threshold, or use no salience.")
-    return Gate(
-        Thresholds(config.memorability, config.staticity, config.entropy),
-        memorability,
-        detector,
-        detect_every=config.detect_every,
-        footprint_m=config.footprint_m,
-    )
+    return Gate(config, memorability, detector)
 
 
 def meter_of(config: Config, board: Board) -> QueryMeter:
-    """Make the meter that measures time and battery charge of queries, on a board fed by the configured battery
-    pack."""
+    """Make the meter of time and battery charge of queries, on a board fed by the configured battery pack."""
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 
@@ -164,8 +155,7 @@ def technique_of(
 
 
 def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
-    """Warn if the places of a map were made with another mask than `mask`. They remain usable: a display in them is
-    just ground that is never seen."""
+    """Warn if the places of a map, which remain usable, were made with another mask than `mask`."""
     built_with = place_map.mask_sha256
     if len(place_map) and built_with != (mask.sha256 if mask else None):
         how = "without a mask" if built_with is None else "with another mask"

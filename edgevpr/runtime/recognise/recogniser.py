@@ -160,8 +160,7 @@ class Recogniser:
         return Recognition(frame=None, reason=_sentence(error), failed=True, steps=steps, cost=cost)
 
     def landmarks(self, event: Recognition) -> bytes | None:
-        """Return the landmarks to store for a frame that becomes a place; None if the technique does not look straight
-        down."""
+        """Return the landmarks to store for a frame that becomes a place; None if the camera does not look down."""
         picture = event.picture if self.technique.spec.cells else None
         return packed(describe(picture.image, picture.mask)) if picture else None
 
@@ -191,8 +190,7 @@ class Recogniser:
         return verdict, where
 
     def _found(self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor) -> _Judged:
-        """Search for a query as expected and, if nothing is accepted, at all other heights. Returns as `_judged`
-        does."""
+        """Search for a query as expected and, if nothing is accepted, at all other heights; return as `_judged`."""
         prior, spec, search = self._prior, self.technique.spec, self.search
         if prior:
             margin_m = max(self.accuracy_m, self.rule.neighbour_m)

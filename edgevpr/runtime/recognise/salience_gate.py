@@ -2,19 +2,20 @@
 
 The threshold of entropy is meant for daylight. At night or in fog all frames have less, yet the best of them are still
 worth keeping. So a frame lacks entropy only if it has less than the threshold *and* less than is usual in the present
-light (the thesis's threshold is constant). The usual entropy is estimated from the upper half of the frames before: a
-long stretch of sky or water changes only the lower half. Until enough frames are known, half of the threshold suffices.
+light (the thesis's threshold is constant), by the upper half of the frames before: a long stretch of sky or water
+changes only the lower half. Until enough frames are known, half of the threshold suffices.
 
 If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
 """
 
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Image, Mask
+from edgevpr.core.config import SalienceConfig
 from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
@@ -24,27 +25,14 @@ GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
 STEP = 0.03  # by which they are lowered at a time
 _TO_KNOW, _REMEMBERED = 8, 100  # frames that tell what entropy is usual: at least, at most
 # A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
-_STEPS_BELOW = 3.2
-_LEAST_STEP = 0.005
-# Longer side of the copy on which entropy is computed: a larger one costs more and gives the same.
-_LONGEST_PX = 320
-
-
-@dataclass(frozen=True, slots=True)
-class Thresholds:
-    """Least mean memorability, staticity and entropy (MS, SS, ES of the thesis) of a frame to keep, each 0..1; 0:
-    off."""
-
-    memorability: float = 0.0
-    staticity: float = 0.0
-    entropy: float = 0.0
+_STEPS_BELOW, _LEAST_STEP = 3.2, 0.005
+_LONGEST_PX = 320  # of the copy on which entropy is computed: a larger one costs more and gives the same
 
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """Judgement of a frame. `salience` has its scores. `short_by` is how far the worst score is below its threshold (0:
-    the frame passes), `lacks` the name of this score, and `reason` a sentence about it (both None: the frame
-    passes)."""
+    """Judgement of a frame by its scores, `salience`. `short_by` is how far the worst one is below its threshold,
+    `lacks` its name, and `reason` a sentence about it (0 and None: the frame passes)."""
 
     salience: Salience
     short_by: float = 0.0
@@ -56,20 +44,13 @@ class Gate:
     """Judges the frames of a flight, one after the other.
 
     `memorability` and `detector` are None if their criterion is off. The detector runs on every k-th frame only (k =
-    `detect_every`), and its result is used until the next. `footprint_m` is as in `Detector.is_static`.
+    `detect_every` of the configuration), and its result is used until the next.
     """
 
     def __init__(
-        self,
-        thresholds: Thresholds,
-        memorability: Memorability | None = None,
-        detector: Detector | None = None,
-        *,
-        detect_every: int = 1,
-        footprint_m: float | None = None,
+        self, config: SalienceConfig, memorability: Memorability | None = None, detector: Detector | None = None
     ) -> None:
-        self.thresholds, self._memorability, self._detector = thresholds, memorability, detector
-        self._detect_every, self._footprint_m = detect_every, footprint_m
+        self.config, self._memorability, self._detector = config, memorability, detector
         self.forget()
 
     def forget(self) -> None:
@@ -83,27 +64,26 @@ class Gate:
         scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
         # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
-        usual = self.thresholds.entropy / 2
+        usual = self.config.entropy / 2
         if len(self._entropies) >= _TO_KNOW:
             middle, high = np.percentile(self._entropies, (75, 90))
             usual = float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
-        return worth_of(scores, self.thresholds, usual)
+        return worth_of(scores, self.config, usual)
 
     def scores(self, image: Image) -> Salience:
         """Return the scores of a frame. Raises ModelError as `look` does."""
         if self._detector:
             if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
-                self._static, self._until_detection = None, self._detect_every  # None, if the detector fails
-                self._static = self._detector.is_static(image, self._footprint_m)
+                self._static, self._until_detection = None, self.config.detect_every  # None, if the detector fails
+                self._static = self._detector.is_static(image, self.config.footprint_m)
             self._until_detection -= 1
         return scores_of(image, self._memorability, self._static)
 
 
-def worth_of(salience: Salience, thresholds: Thresholds, usual: float = 1.0) -> Worth:
-    """Compare the scores of a frame with the thresholds; entropy only needs to reach `usual` if that is lower. A score
-    that is None is not compared."""
-    least = asdict(thresholds) | {"entropy": min(thresholds.entropy, usual)}
+def worth_of(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> Worth:
+    """Compare the scores of a frame (None: not) with their thresholds, entropy with `usual` if that is lower."""
     known = salience.scores
+    least = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
     short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
     worst = max(short, key=lambda name: short[name], default=None)
     if worst is None or short[worst] <= 0:

@@ -1,15 +1,17 @@
 """The three scores, and what passes the gate."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from edgevpr.core.config import load_config
 from edgevpr.core.types import Salience
 from edgevpr.frames.images import cv2
 from edgevpr.runtime.recognise.gate_networks import as_map
 from edgevpr.runtime.recognise.salience_gate import (
     MOST_ENTROPY,
     Gate,
-    Thresholds,
     best_of,
     scores_of,
     worth_of,
@@ -17,6 +19,11 @@ from edgevpr.runtime.recognise.salience_gate import (
 from edgevpr.techniques.entropy import filled_bins
 
 RNG = np.random.default_rng(5)
+
+
+def asked(memorability=0.0, staticity=0.0, entropy=0.0, **keys):
+    thresholds = {"memorability": memorability, "staticity": staticity, "entropy": entropy}
+    return replace(load_config(None).salience, **thresholds, **keys)
 
 
 class Half:
@@ -58,12 +65,12 @@ def test_no_picture_has_more_entropy_than_its_disc_has_pixels():
 @pytest.mark.parametrize(
     ("thresholds", "lacks"),
     [
-        (Thresholds(0.5, 0.6, 0.4), None),
-        (Thresholds(0.51, 0.6, 0.4), "memorability"),
-        (Thresholds(0.5, 0.95, 0.4), "staticity"),
-        (Thresholds(0.5, 0.6, 0.7), "entropy"),
-        (Thresholds(0.51, 0.95, 0.7), "entropy"),  # the one that is farthest below
-        (Thresholds(0, 0, 0), None),
+        (asked(0.5, 0.6, 0.4), None),
+        (asked(0.51, 0.6, 0.4), "memorability"),
+        (asked(0.5, 0.95, 0.4), "staticity"),
+        (asked(0.5, 0.6, 0.7), "entropy"),
+        (asked(0.51, 0.95, 0.7), "entropy"),  # the one that is farthest below
+        (asked(0, 0, 0), None),
     ],
 )
 def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
@@ -73,13 +80,13 @@ def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
 
 
 def test_a_score_that_was_not_looked_at_is_not_asked_for():
-    assert worth_of(Salience(None, None, 0.5), Thresholds(0.9, 0.9, 0.4)).reason is None
+    assert worth_of(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
 
 
 def test_in_bad_light_less_entropy_is_asked_for():
     day = [texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
-    by_day, at_night = Gate(Thresholds(entropy=0.4)), Gate(Thresholds(entropy=0.4))
+    by_day, at_night = Gate(asked(entropy=0.4)), Gate(asked(entropy=0.4))
     assert all(by_day.look(picture).reason is None for picture in day)
     passed = [at_night.look(picture).reason is None for picture in night]
     assert sum(passed) >= 36
@@ -87,7 +94,7 @@ def test_in_bad_light_less_entropy_is_asked_for():
 
 
 def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
-    gate = Gate(Thresholds(entropy=0.4))
+    gate = Gate(asked(entropy=0.4))
     little = texture()
     while not 0.2 < scores_of(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
@@ -96,7 +103,7 @@ def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
 
 
 def test_a_long_stretch_without_information_does_not_become_usual():
-    gate = Gate(Thresholds(entropy=0.4))
+    gate = Gate(asked(entropy=0.4))
     for _ in range(30):
         assert gate.look(texture()).reason is None
     empty = np.full((120, 160), 77, np.uint8)
@@ -112,7 +119,7 @@ def test_the_detector_looks_at_every_kth_frame_only():
             return np.ones(image.shape[:2], bool)
 
     detector = Counting()
-    gate = Gate(Thresholds(staticity=0.6), detector=detector, detect_every=4)
+    gate = Gate(asked(staticity=0.6, detect_every=4), detector=detector)
     for _ in range(9):
         gate.look(texture())
     assert detector.looks == 3
