@@ -263,14 +263,9 @@ class Flight:
             **({"ground": crew.ground.stats()} if crew.ground else {}),
             **({"learnt": crew.learner.totals} if crew.learner else {}),
         )
-        _log.info(
-            "%d queries, %d accepted%s, %.3f mAh (%.3f of them for recognising)",
-            self._tally.queries,
-            self._tally.accepted,
-            f", {crew.autopilot.summary}" if crew.autopilot else "",
-            totals["used_mah"],
-            totals["marginal_mah"],
-        )
+        fixes = f", {crew.autopilot.summary}" if crew.autopilot else ""
+        counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
+        _log.info("%s, %.3f mAh (%.3f of them for recognising)", counts, totals["used_mah"], totals["marginal_mah"])
         if crew.learner:
             _log.info("%s, %d in %s", crew.learner.summary, len(crew.recogniser.place_map), self._config.map)
 
@@ -283,8 +278,7 @@ def _open_log(world: World) -> FlightLog:
 def open_links(
     settings: MavlinkConfig, world: World, navigator: Navigator, place_map: PlaceMap, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
-    """Open the link to the flight controller and the link to the ground station, which `stack` closes. Return both;
-    each is None if it is not configured."""
+    """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None

@@ -103,16 +103,13 @@ class FlightLog:
         self.close()
 
     def write(self, kind: str, **fields: Any) -> None:
-        """Append one line: `kind`, the time (UTC), `t_mono_s` (now, unless given) and the fields. Never raises OSError.
-
-        Dataclasses become objects, NaN and infinities null. The line is in the file on return.
-        """
+        """Append one line: `kind`, the time (UTC), `t_mono_s` (now, unless given) and the fields. Dataclasses become
+        objects, NaN and infinities null. The line is in the file on return. Never raises OSError."""
         if self.path is None:
             return
         if self._file is not None and not is_at(self._file, self._at):
             self._warn(f"The flight log {self._at} was deleted or moved in flight: it goes on in a new file.")
             self._let_go()
-            self._ours = None
         now_s, utc_s = self._clock(), self._utc_s()
         lines, is_start = _line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
         if is_start:
@@ -139,8 +136,7 @@ class FlightLog:
                 _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
 
     def sync_due(self, now_s: float) -> None:
-        """Sync lines to the disk if a second or more has passed since the last sync. `now_s` is the present time of
-        `clock`. Never raises OSError."""
+        """Sync lines to the disk if a second has passed since the last sync; `now_s` is the time. Never raises."""
         if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_EVERY_S:
             return
         try:
@@ -268,8 +264,8 @@ def _record_of(line: bytes) -> Line | None:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLines:
     """The lines of one flight; iterate over them as often as needed. They are read from the `files`, in order. `flight`
-    identifies the flight by its start line: (time in UTC, time on the monotonic clock), None without a start line.
-    `missing` is a sentence about files that are missing (None: none are)."""
+    identifies the flight by its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is
+    a sentence about files that are missing (None: none are)."""
 
     files: tuple[Path, ...]
     flight: tuple[object, object] | None
@@ -291,11 +287,9 @@ class FlightLines:
 
 
 def flight_of(path: str | Path) -> FlightLines:
-    """Find the lines of the last flight in a file of a log.
-
-    If the flight has several files, it is read from its start to the end of this file. Raises UsageError if there is no
-    such file, and EdgevprError if the file has no line of a flight.
-    """
+    """Find the lines of the last flight in a file of a log. If the flight has several files, it is read from its start
+    to the end of this file. Raises UsageError if there is no such file, and EdgevprError if it has no line of a
+    flight."""
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")

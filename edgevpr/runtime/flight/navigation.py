@@ -52,7 +52,7 @@ class PositionedMatch:
     places: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ComparedFix:
     """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
     the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
@@ -122,9 +122,7 @@ class Navigation:
             return None
         expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s)
         off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
-        return ComparedFix(
-            seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
-        )
+        return ComparedFix(seen, there.at_m, off_m, expected_m, covariance_m2)
 
     def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
         """Correct our position by a fix. `is_against`: it contradicts what was expected (see `Consistency`)."""
@@ -135,8 +133,7 @@ class Navigation:
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
-        frame was taken at `t_s`; `sd_m` is its standard deviation. Does nothing for a path of velocities (`RECKONED`),
-        which begins with a report of the autopilot."""
+        frame was taken at `t_s`; `sd_m` is its standard deviation. A path of velocities begins with a report only."""
         if self._drift is INERTIAL:
             sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)

@@ -97,12 +97,9 @@ def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_d
     low = right * math.sin(roll) + down * math.cos(roll)
     forward = ahead * math.cos(pitch) + low * math.sin(pitch)
     sideways = right * math.cos(roll) - down * math.sin(roll)
-    return np.array(
-        [
-            forward * math.sin(yaw) + sideways * math.cos(yaw),
-            forward * math.cos(yaw) - sideways * math.sin(yaw),
-        ]
-    )
+    east = forward * math.sin(yaw) + sideways * math.cos(yaw)
+    north = forward * math.cos(yaw) - sideways * math.sin(yaw)
+    return np.array([east, north])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

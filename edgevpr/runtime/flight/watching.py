@@ -164,7 +164,10 @@ class GpsWatch:
         if not vehicle.is_fresh_at(seen.t_s):
             return
         off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
-        self._weigh(seen, off_m, self._sd_m(seen, vehicle, vehicle.gps))
+        in_time_m = _TIME_SD_S * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
+        tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
+        sd_m = math.hypot(worst_sd(seen.covariance_m2), self._map_sd_m, vehicle.gps.sd_m, tilt_m, in_time_m)
+        self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
             self._autopilot.compare_gps(away_m, self.is_wrong)
@@ -193,12 +196,6 @@ class GpsWatch:
         ]
         self._against.append((seen, off_m))
         self.is_wrong = self.is_wrong or len(self._against) >= _GPS_IN_A_ROW
-
-    def _sd_m(self, seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> float:
-        speed_m_s = math.hypot(*vehicle.velocity_m_s) if vehicle.velocity_m_s else 0.0
-        of_fix_m = worst_sd(seen.covariance_m2)
-        tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
-        return math.hypot(of_fix_m, self._map_sd_m, gps.sd_m, tilt_m, _TIME_SD_S * speed_m_s)
 
 
 def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
