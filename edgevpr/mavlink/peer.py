@@ -11,19 +11,11 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
-from edgevpr.mavlink.vehicle import (
-    GPS_REPORTS,
-    GPS_SD_M,
-    GPS_UNKNOWN,
-    Attitude,
-    Attitudes,
-    Certainty,
-    Heights,
-    Readiness,
-)
+from edgevpr.mavlink.vehicle import GPS_GONE_AFTER_S, GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
-GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
+GPS_SD_M = 5.0  # of a receiver that does not say how good it is
+_GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
@@ -245,7 +237,7 @@ class Autopilot:
         time_usec, before = self._gps.get(name, (0, None))
         # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
         t_s = before.t_s if before and message.time_usec and message.time_usec == time_usec else now_s
-        sd_m = GPS_SD_M if message.h_acc in GPS_UNKNOWN else message.h_acc / 1e3
+        sd_m = GPS_SD_M if message.h_acc in _GPS_UNKNOWN else message.h_acc / 1e3
         self._gps[name] = message.time_usec, Receiver(message.lat / 1e7, message.lon / 1e7, sd_m, t_s)
 
     def _best_gps(self, now_s: float) -> Receiver | None:

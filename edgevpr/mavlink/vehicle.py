@@ -15,15 +15,11 @@ _NEAR_S = 0.3  # an attitude that is farther from the time of a frame is not use
 _RANGE_FRESH_S = 1.0
 _TERRAIN_FRESH_S = 2.5
 _BAD_SIGNAL = 1  # of DISTANCE_SENSOR.signal_quality; 0 is unknown, 100 the best
-GPS_SD_M = 5.0  # of a receiver that does not say how good it is
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
 _FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
-GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
-
-# ArduPilot refuses fixes until its GPS has had no fix for one second; a receiver reports at most twice a second.
-_GPS_COUNTS_S = 2.5
+GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 _ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ASK_ORIGIN_AGAIN_S = 10.0
 
@@ -34,8 +30,7 @@ FILTER_REPORTS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 
-@dataclass(frozen=True, slots=True)
-class Attitude:
+class Attitude(NamedTuple):
     """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`."""
 
     t_s: float
@@ -75,12 +70,7 @@ class Attitudes:
         def between(one_deg: float, other_deg: float) -> float:
             return one_deg + share * ((other_deg - one_deg + 180) % 360 - 180)
 
-        return Attitude(
-            t_s,
-            between(before.roll_deg, after.roll_deg),
-            between(before.pitch_deg, after.pitch_deg),
-            between(before.yaw_deg, after.yaw_deg),
-        )
+        return Attitude(t_s, *map(between, before[1:], after[1:]))
 
 
 class Heights:
@@ -174,7 +164,7 @@ class Readiness:
 
     def has_gps(self, now_s: float) -> bool:
         """Return True if a GPS receiver of the autopilot has lately reported a 3D fix."""
-        return now_s - self.gps_s <= _GPS_COUNTS_S
+        return now_s - self.gps_s <= GPS_GONE_AFTER_S
 
     def lacks_origin(self, now_s: float) -> bool:
         """Return True if the autopilot did not answer a request for its origin within two seconds."""

@@ -7,7 +7,8 @@ import pytest
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle
-from edgevpr.mavlink.vehicle import DRIFT_M_S, GPS_SD_M
+from edgevpr.mavlink.peer import GPS_SD_M
+from edgevpr.mavlink.vehicle import DRIFT_M_S
 from edgevpr.mavlink.wire import mavlink
 
 ABS, REL, CONST_POS = mavlink.EKF_POS_HORIZ_ABS, mavlink.EKF_POS_HORIZ_REL, mavlink.EKF_CONST_POS_MODE
