@@ -1,5 +1,4 @@
-"""Questions to an autopilot before the flight: the caller asks, and waits for each answer. No setting of the autopilot
-is changed. Used by `edgevpr check` and `doctor`."""
+"""Questions to an autopilot before the flight, for `edgevpr check` and `doctor`. No setting of it is changed."""
 
 import select
 import statistics
@@ -69,8 +68,7 @@ class Inquiry(AbstractContextManager["Inquiry"]):
             raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
 
     def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
-        """Wait up to `wait_s` seconds for the heartbeat of an autopilot and return it, or None if none came. From then
-        on the messages of all other autopilots are ignored."""
+        """Wait for the heartbeat of an autopilot (None: none came); from then on all others are ignored."""
         return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:

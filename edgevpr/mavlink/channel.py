@@ -163,8 +163,7 @@ class Interview:
                     self._parameters[message.param_id] = value
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
-        """Yield the requests to be sent at `now_s` to the autopilot `target_system`. When no answer is missing, or a
-        second after the fourth request, choose the channel instead."""
+        """Yield the requests due at `now_s`; when no answer is missing, or after four requests, choose the channel."""
         if self._is_over or now_s - self._ask_s < _ASK_EVERY_S:
             return
         missing = self._missing()

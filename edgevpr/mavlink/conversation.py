@@ -1,7 +1,6 @@
 """The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
 no port and no thread, and is used inside turns only. A turn is the time in which one thread, that of a link or of the
-flight, uses it alone, while its clock stands still. Turns are recorded on the tape, so that a flight can be replayed.
-"""
+flight, uses it alone, while its clock stands still. Turns are on the tape, so that a flight can be replayed."""
 
 import logging
 import math
@@ -43,10 +42,8 @@ class LinkSettings:
     - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
     - `max_fix_age_s`: a fix that has waited longer is never sent; `clock`: the monotonic clock of all time stamps.
     - `listener`: hears the reports of the vehicle, and gives the positions of a continuous channel.
-    - `tap`: is called with each packet written and each packet received, in the link's thread.
-    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never).
-    - `tape`: records, or plays back, all that is received and sent.
-    """
+    - `tap`: gets each packet written or received; `tape`: records, or plays back, all that is received and sent.
+    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never)."""
 
     component_id: int = 197
     system_id: int | None = None
@@ -62,8 +59,7 @@ class LinkSettings:
 class Conversation:
     """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
     `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, and the count of messages `sent`, by
-    name. `copy_message` is called with every queued message, `copy_text` with every text: for the link to the ground.
-    """
+    name. `copy_message` is called with every queued message, `copy_text` with every text: for the ground link."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -104,8 +100,7 @@ class Conversation:
             self.copy_message(message)
 
     def send_fix(self, fix: Fix) -> Sending:
-        """Queue a position fix. It is sent within `max_fix_age_s` seconds, and only while the autopilot is heard, or
-        never. The returned `Sending` will hold the outcome."""
+        """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is heard, or never."""
         return self.fixes.put(fix, self._clock())
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
@@ -300,8 +295,7 @@ class Turns:
 
     @contextmanager
     def taken(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn in the flight's thread. `what` is its name on the tape. Inside another turn of
-        the same thread this has no effect: it is part of that turn."""
+        """Context manager: take a turn, named `what` on the tape, in the flight's thread, or go on with its own."""
         with self._lock:
             if self._t_s is not None:
                 yield

@@ -34,12 +34,9 @@ class Wished(NamedTuple):
 
 
 class Requests:
-    """Answers the requests of all links, and keeps the wishes until the main loop of the flight takes them.
-
-    `offered` are the wishes that the flight can fulfil, none at first; others are refused. `results` counts commands by
-    the name of their result. `ignored` counts the other messages addressed to us that had no effect: an unknown kind,
-    or too many a second. `is_paused`: no fix may be sent, as soon as a pause has been accepted.
-    """
+    """Answers the requests of all links, and keeps the wishes until the main loop of the flight takes them. `offered`
+    are those that it can fulfil, none at first. `results` counts commands by the name of their result, `ignored` the
+    other messages to us, of an unknown kind or too many a second. While it `is_paused`, no fix may be sent."""
 
     def __init__(self) -> None:
         self.offered: Collection[Wish] = ()
@@ -92,11 +89,9 @@ class Requests:
 
 
 class Texts:
-    """The texts that wait to be sent, one in five seconds, warnings before notes (texts of severity INFO).
-
-    Of the texts of one `topic` the newest counts: it replaces a waiting one, and is dropped if it equals the last text
-    sent. But a note does not replace a waiting warning: it is sent after it.
-    """
+    """The texts that wait to be sent, one in five seconds, warnings before notes (texts of severity INFO). Of one
+    `topic` the newest counts: it replaces a waiting one, and is dropped if it equals the last one sent. But a note does
+    not replace a waiting warning: it is sent after it."""
 
     def __init__(self) -> None:
         self._waiting: dict[tuple[str, Severity], str] = {}  # the oldest first

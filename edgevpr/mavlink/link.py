@@ -1,5 +1,4 @@
-"""The link to the flight controller: its methods may be called from any thread, but only its own thread reads and
-writes the socket or serial port. Used by the flight."""
+"""The link to the flight controller: any thread may call it, but only its own touches the socket or serial port."""
 
 import logging
 import select

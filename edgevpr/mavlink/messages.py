@@ -39,8 +39,7 @@ class Severity(IntEnum):
 @dataclass(frozen=True, slots=True)
 class Fix:
     """A position fix: latitude and longitude of the vehicle at `t_frame_s`, when the frame was taken (monotonic clock),
-    and `accuracy_m`, the standard deviation of one axis. Raises ValueError for what is no position, accuracy or time.
-    """
+    and `accuracy_m`, the standard deviation of one axis. Raises ValueError for no position, accuracy or time."""
 
     lat_deg: float
     lon_deg: float
@@ -233,15 +232,11 @@ def source_set(number: int, target_system: int) -> Message:
 
 
 def computer_status(
-    t_mono_s: float,
-    core_shares: Sequence[float],
-    ram_used_bytes: int,
-    ram_total_bytes: int,
-    temperature_c: float | None = None,
+    t_mono_s: float, loads: Sequence[float], ram_used_bytes: int, ram_total_bytes: int, temperature_c: float | None
 ) -> Message:
     """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), used and total RAM
     (sent in MiB), and the temperature in degrees Celsius (None: unknown)."""
-    percents = [min(100, max(0, round(100 * share))) for share in core_shares[:8]]
+    percents = [min(100, max(0, round(100 * share))) for share in loads[:8]]
     temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
     return mavlink.MAVLink_onboard_computer_status_message(
         time_usec=round(t_mono_s * 1e6),

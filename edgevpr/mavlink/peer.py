@@ -40,11 +40,8 @@ class Speaker(NamedTuple):
 class Identity:
     """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
     id. A sender with another system id never takes its place; one with the same at another address does so once our
-    autopilot has been silent for 30 s.
-
-    `kept` is our autopilot (None: not heard yet). `has_moved`: the last message has made a sender at another address
-    our autopilot. `foreign_messages` counts the messages of others.
-    """
+    autopilot has been silent for 30 s. `kept` is our autopilot (None: not heard yet). `has_moved`: by the last message
+    it is at another address. `foreign_messages` counts the messages of others."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.kept: Speaker | None = None
@@ -55,8 +52,7 @@ class Identity:
         self.has_moved = False
 
     def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
-        """Return True if a message of this speaker comes from our autopilot. `beats`: the message is the heartbeat of
-        an autopilot, by which the speaker may become ours."""
+        """Return True if this speaker is our autopilot, which it may become by a message that `beats`: a heartbeat."""
         self.has_moved = False
         if beats and speaker != self.kept and self._is_next(speaker, now_s):
             if self.kept is None:

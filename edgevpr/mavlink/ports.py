@@ -208,13 +208,10 @@ def open_port(address: LinkAddress) -> Port:
 
 
 class Line:
-    """Writes packets to a port, one after another.
-
-    A fix counts as sent when all its bytes have left the operating system (over TCP: when the other end has confirmed
-    them). If that has not happened by the fix's `Sending.due_s`, `departed` raises ConnectionError; closing the port
-    then throws the bytes away. `tap` is called with each packet that the port has accepted in full. `unsent` are the
-    bytes of the last packet that the port has not accepted yet.
-    """
+    """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
+    system (over TCP: when the other end has confirmed them). If that has not happened by the fix's `Sending.due_s`,
+    `departed` raises ConnectionError; closing the port then throws the bytes away. `tap` is called with each packet
+    that the port has accepted in full; `unsent` are the bytes of the last packet that it has not accepted yet."""
 
     def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
         self.port, self._clock, self._tap = port, clock, tap
@@ -251,8 +248,7 @@ class Line:
             raise ConnectionError("the port takes no more bytes")
 
     def departed(self) -> list[Sending]:
-        """Return the fixes that have left the operating system since the last call, and mark them as sent. Raises
-        ConnectionError if none has left and the oldest one is past its `due_s`."""
+        """Return the fixes that have left since the last call, now sent. Raises ConnectionError if one is too late."""
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()

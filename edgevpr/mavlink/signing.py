@@ -188,9 +188,8 @@ def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = Fa
     beside the key); with `to_ask` (questions before the flight) it is only read. Raises ConfigError."""
     if key_path is None:
         return NOT_SIGNING
-    key = read_key(key_path)
-    stamps = TimeStamps(Path(state_path or f"{key_path}.time"), is_kept=not to_ask)
-    return Signing(key, stamps, TO_ASK if to_ask else TO_AUTOPILOT)
+    key, state = read_key(key_path), Path(state_path or f"{key_path}.time")
+    return Signing(key, TimeStamps(state, is_kept=not to_ask), TO_ASK if to_ask else TO_AUTOPILOT)
 
 
 def read_key(path: str) -> bytes:

@@ -23,12 +23,9 @@ _log = logging.getLogger(__name__)
 
 
 class Tlog(AbstractContextManager["Tlog"]):
-    """An open tlog. For each packet it holds the microseconds since 1970 (8 bytes, big endian), then the packet. Close
-    it, or use it as a context manager.
-
-    An existing file is appended to. A thread of its own writes once a second, so that no caller waits. A disk that is
-    full or too slow ends the log, but not the flight.
-    """
+    """An open tlog, a context manager. For each packet it holds the microseconds since 1970 (8 bytes, big endian), then
+    the packet. An existing file is appended to. A thread of its own writes once a second, so that no caller waits. A
+    disk that is full or too slow ends the log, but not the flight."""
 
     def __init__(self, path: str | Path) -> None:
         """Open the file. Raises EdgevprError if it cannot be opened."""

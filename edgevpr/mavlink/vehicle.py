@@ -58,8 +58,7 @@ class Attitudes:
             self._kept = (*kept, Attitude(now_s, *map(math.degrees, radians)))
 
     def at(self, t_s: float) -> Attitude | None:
-        """Return the attitude at `t_s`, interpolated between those received before and after. With only one of them
-        within 0.3 s, return that one; None with neither."""
+        """Return the attitude at `t_s`: between those before and after it, or the only one within 0.3 s, if any."""
         near = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _NEAR_S]
         before = next((attitude for attitude in reversed(near) if attitude.t_s <= t_s), None)
         after = next((attitude for attitude in near if attitude.t_s > t_s), None)
@@ -103,9 +102,8 @@ class Heights:
 
 
 class Certainty:
-    """Estimates how accurate the autopilot's own position is, as the standard deviation of one axis: that which its
-    position filter reports (PX4) or, without one, that of the last known position, which grows by DRIFT_M_S a second.
-    """
+    """Estimates how accurate the autopilot's own position is, as the standard deviation of one axis: what its filter
+    reports (PX4) or, without that, what it was when last known, growing by DRIFT_M_S a second."""
 
     def __init__(self) -> None:
         self._known: tuple[float, float] | None = None  # standard deviation, time
@@ -173,8 +171,7 @@ class Readiness:
         return self.lacked_origin or now_s - self.asked_s > _ORIGIN_WITHIN_S
 
     def asks_origin(self, now_s: float) -> bool:
-        """Return True if the origin is to be requested now, after a refused fix, and note the time: again and again,
-        since an autopilot that has restarted has lost its origin."""
+        """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
         if self.has_gps(now_s) or now_s - self.asked_s < _ASK_ORIGIN_AGAIN_S:
             return False
         self.lacked_origin, self.asked_s = self.lacks_origin(now_s), now_s

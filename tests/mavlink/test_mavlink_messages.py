@@ -79,7 +79,7 @@ def test_the_computer_tells_load_memory_and_temperature_and_marks_the_rest_as_un
     assert heard.temperature_board == 127
     assert (heard.uptime, heard.time_usec) == (60_000, 60_000_000)
     assert set(heard.storage_total) == {2**32 - 1}
-    heard = sent_and_received(messages.computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30))
+    heard = sent_and_received(messages.computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30, None))
     assert (heard.cpu_cores, set(heard.temperature_core)) == ([10] * 8, {127})
 
 
