@@ -85,8 +85,7 @@ def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
 
 
 def _picked(config: Config) -> str | None:
-    """Return the configured technique (None: that of the map). If a new map is to be learnt and no technique is
-    configured, choose one for the board."""
+    """Return the configured technique (None: that of the map), or for a map yet to be made the best for the board."""
     if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
         return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     return config.technique

@@ -156,8 +156,7 @@ class ToAutopilot:
             self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
-        """Send the fix of an accepted match, unless something is against it. Return (None, the sending) if it is sent,
-        else (a report that says why not, None)."""
+        """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
@@ -169,8 +168,7 @@ class ToAutopilot:
         return None, self._link.send_fix(advice.fix)
 
     def _say_held(self, objection: str | None) -> None:
-        """Count a fix that is held back because of `objection` (None: it is not). Report the first of a row, and the
-        first one after it that is not held back."""
+        """Count a fix that is held back because of `objection`, and report when a row of them begins and ends."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:

@@ -129,8 +129,7 @@ class Flight:
         self._opened.close()
 
     def run(self) -> int:
-        """Fly until the source has ended or a signal ends the flight, and write the last line of the log. Return 1 if
-        any frame failed, else 0."""
+        """Fly until the source has ended or a signal ends the flight. Return 1 if any frame failed, else 0."""
         with suppress(StopNow):
             while not (self._crew.stop.asked or self._crew.source.ended):
                 self._turn()
@@ -230,8 +229,7 @@ class Flight:
         )
 
     def _learn(self, event: Recognition) -> None:
-        """Add the frame of an event to the map as a new place, if `Learner` finds it worth remembering; later frames
-        may be recognised as that place."""
+        """Add the frame of an event to the map as a new place, if `Learner` finds it worth remembering."""
         learner = self._crew.learner
         if learner is None:
             return

@@ -194,8 +194,7 @@ class FlightLog:
         self._is_synced, self._synced_s = True, now_s
 
     def _note_trouble(self, error: OSError) -> None:
-        """Note that the file cannot be written. It is opened anew by the next line: the card may be another one when it
-        comes back."""
+        """Note that the file cannot be written. The next line opens it anew: the card may be another one."""
         if self.state is None:
             self.state = (
                 f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
@@ -325,8 +324,7 @@ def _flight_id(start: Line) -> tuple[object, object]:
 
 
 def _parts(starts: list[Line], flight: tuple[object, object]) -> list[int]:
-    """Return the numbers of the parts of a flight that begin with these start lines. Each part of a flight has one, and
-    all but that of the first part are marked as repeated."""
+    """Return the numbers of the parts of a flight that begin with these start lines: 1 unless it is repeated."""
     ours = [start for start in starts if _flight_id(start) == flight]
     numbers = [start.get("part") if start.get("repeated") else 1 for start in ours]
     return [number if isinstance(number, int) and number >= 1 else 1 for number in numbers]

@@ -122,8 +122,7 @@ class Governor:
         return now_s - self._since_s.setdefault(what, now_s)
 
     def _below(self, hot: bool) -> int | None:
-        """Return the index of the next lower setting (None: there is none). For a `hot` board it is one with a lower
-        rate: fewer candidates alone would cool it too slowly to see an effect."""
+        """Return the index of the next lower setting; for a `hot` board, one of a lower rate, which cools sooner."""
         below = range(self._at + 1, len(self._settings))
         slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
@@ -155,8 +154,7 @@ class Governor:
         )
 
     def _nothing_left(self, what: str, why: str) -> Change:
-        """Return a change between equal settings, which reports that a limit ("memory" or "load") is exceeded and no
-        setting can be lowered."""
+        """Return a change between equal settings: a limit ("memory" or "load") is exceeded, and nothing is lowered."""
         self._told.add(what)
         return Change(self.setting, self.setting, f"{why}, and nothing is left to lower")
 

@@ -157,8 +157,7 @@ class Navigation:
         )
 
     def path_drift_m_s(self) -> tuple[float, float]:
-        """Return the velocity (east, north) of the aircraft minus that of its path. For an autopilot that dead-reckons,
-        this is how fast its position error grows."""
+        """Return the velocity (east, north) of the aircraft minus that of its path."""
         _, off_m_s, _ = self._filter.errors(0.0)
         return float(off_m_s[0]), float(off_m_s[1])
 
@@ -233,8 +232,7 @@ def _differ(one: ComparedFix, other: ComparedFix) -> float:
 
 
 def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:
-    """Return True if two fixes are of different places, or if the aircraft has flown so far in between that the same
-    wrong position, found twice, would not agree."""
+    """Tell whether two fixes are of different places, or so far apart that one wrong position would not agree."""
     if set(one.seen.places).isdisjoint(other.seen.places):
         return True
     return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS

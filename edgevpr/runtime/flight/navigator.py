@@ -170,8 +170,7 @@ class Navigator(Listener):
             )
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
-        """Advise on a fix for an autopilot that has lately reported no position. It may have none and need ours, or its
-        report, with GPS, is still to come: the fix is sent after a few seconds without a report."""
+        """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
         if self._channel.is_continuous:
             return Advice(None, _UNHEARD)
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)

@@ -65,8 +65,7 @@ class Path:
         return step_s
 
     def accelerate(self, t_s: float, acceleration_m_s2: Doubles) -> float:
-        """Add a point at `t_s`, reached with this mean acceleration (2,) over the ground, and return the seconds since
-        the last point, as `fly` does."""
+        """Add a point, as `fly` does, that is reached with this mean acceleration (2,) over the ground."""
         last = self._points[-1]
         return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
 
@@ -170,13 +169,11 @@ class DriftFilter:
         self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
 
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Correct the state by a fix with a covariance (2, 2) that lay `off_m` (2,) metres beside the path `age_s`
-        seconds ago."""
+        """Correct the state by a fix of covariance (2, 2) that lay `off_m` (2,) metres from the path `age_s` ago."""
         self._correct(_seen(age_s), off_m, covariance_m2)
 
     def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Correct the state by a fix (as `hear_fix`) that is believed although it contradicts the state. The position
-        known so far is forgotten, and the error of velocity becomes more uncertain."""
+        """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
@@ -202,8 +199,7 @@ class DriftFilter:
         return off[:2], off[2:], look @ self._p @ look.T
 
     def _correct(self, look: Doubles, seen: Doubles, covariance: Doubles) -> None:
-        """Do a Kalman update: `look` (n, 8) is the measurement matrix, `seen` (n,) what was measured, with its
-        `covariance`."""
+        """Do a Kalman update with the measurement matrix `look` (n, 8) and what was `seen` (n,)."""
         gain = np.linalg.solve(look @ self._p @ look.T + covariance, look @ self._p).T
         self._x = self._x + gain @ (seen - look @ self._x)
         kept = np.eye(8) - gain @ look

@@ -17,8 +17,7 @@ _MODE = 0o660  # positions are private, but the flight's group may read them
 
 
 class StatusFile:
-    """Writes the status of a flight (a dict, see `Vitals._status`) to a file as JSON. Close it (it is a context
-    manager), which removes the file."""
+    """Writes the status of a flight (see `Vitals._status`) to a file, which is removed when it is closed."""
 
     def __init__(self, path: str | Path) -> None:
         """Check that the file `path` can be written; `tell` writes it. Raises EdgevprError if it cannot be made."""

@@ -201,8 +201,7 @@ def _recording(config: Config, stack: ExitStack) -> Recording | None:
 
 
 def _or_without(opened: Callable[[], T]) -> T | None:
-    """Return the result of `opened`. If that raises an EdgevprError in a systemd service, which may be restarted in the
-    air, log it and return None, so that the flight goes on without."""
+    """Return the result of `opened`; None, with a warning, if that fails in a service: it flies on without."""
     try:
         return opened()
     except EdgevprError as error:
