@@ -32,14 +32,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the `folder`
-    of the recording; the comparison of the `packets` of both; `why_ended`, the reason why the replay ended before the
-    flight did (None: it did not); and `guessed`, the number of answers that were not on the tape where they were asked
-    for (see `Playback`)."""
+    """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the comparison
+    of the `packets` of both; `why_ended`, the reason why the replay ended before the flight did (None: it did not); and
+    `guessed`, the number of answers that were not on the tape where they were asked for (see `Playback`)."""
 
     flown: list[Line]
     lines: list[Line]
-    folder: Path
     packets: Packets
     why_ended: str | None
     guessed: int
@@ -85,7 +83,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
             why_ended = str(end) or "the recording ends there"
         waiting("")
         lines = list(read_log(again_log)) if again_log else []
-        return Replayed(flown, lines, folder, playback.packets, why_ended, playback.guessed)
+        return Replayed(flown, lines, playback.packets, why_ended, playback.guessed)
 
 
 def _recorded(log: str | Path) -> tuple[list[Line], Path]:
