@@ -146,7 +146,11 @@ def test_a_configuration_that_cannot_be_read_is_the_only_finding(config_file, te
         ({"board": "rpi-zero-2"}, ["board", "map"], "rpi-zero-2w"),
         ({"battery": {"pack": "4x5200"}}, ["battery", "map"], "4x5200"),
         ({"technique": "cohog"}, ["map"], "hog, not cohog"),
-        ({"mapping": {"learn": True}, "mavlink": {"link": None}}, ["source"], "--"),
+        (
+            {"mapping": {"learn": True}, "mavlink": {"link": None}, "source": {"uri": "rtsp://127.0.0.1:9/camera"}},
+            ["source"],
+            "--link",
+        ),
         ({"source": {"uri": "/dev/video99"}}, ["source"], "/dev/video99"),
         ({"source": {"uri": "ftp://camera/x"}}, ["source"], "ftp://camera/x"),
         ({"source": {"uri": "udp://127.0.0.1"}}, ["source"], "udp://127.0.0.1"),
