@@ -33,8 +33,8 @@ def of_made(path: str, made: "MadeMap") -> Iterator[str]:
         yield f"  {result.already_here} images were in the map already"
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
-    if made.without_data is not None:
-        yield f"  left out: {made.without_data} for want of data, {result.says_nothing} for want of texture"
+    if result.without_data or result.says_nothing:
+        yield f"  left out: {result.without_data} for want of data, {result.says_nothing} for want of texture"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:

@@ -97,9 +97,8 @@ class MapOrder:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
-    those that have a position.
-    `result`: counts of the frames read. `refined`, `calibration`: results of refining and calibrating (None: not done).
-    `without_data`: number of places left out because the orthophoto has no data there (None: made from a flight)."""
+    those that have a position. `result`: counts of the frames read. `refined`, `calibration`: results of refining and
+    calibrating (None: not done)."""
 
     technique: str
     places: int
@@ -107,7 +106,6 @@ class MadeMap:
     result: MappingResult
     refined: "Refined | None"
     calibration: MapCalibration | None
-    without_data: int | None
 
 
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
@@ -135,6 +133,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
+            result.without_data = getattr(source, "without_data", 0)
         except EdgevprError:
             if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
                 remove(path)
@@ -154,7 +153,6 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             result=result,
             refined=refined,
             calibration=calibration,
-            without_data=getattr(source, "without_data", None),
         )
 
 

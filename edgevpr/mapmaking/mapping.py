@@ -90,7 +90,8 @@ def _frame_of(event: Recognition) -> Frame:
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
-    `not_memorable`: frames left out because they failed a salience criterion."""
+    `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
+    the orthophoto has no data there."""
 
     added: int = 0
     without_position: int = 0
@@ -98,6 +99,7 @@ class MappingResult:
     of_low_quality: int = 0
     says_nothing: int = 0
     not_memorable: int = 0
+    without_data: int = 0
 
 
 def build_map(

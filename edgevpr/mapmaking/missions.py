@@ -44,8 +44,7 @@ class Area:
         """The bounding box of polygons and paths: (south, west, north, east) in degrees."""
         points = [(way.lat_deg, way.lon_deg) for path in self.paths for way in path]
         points += [point for rings in self.polygons for ring in rings for point in ring]
-        lat_deg, lon_deg = zip(*points, strict=True)
-        return min(lat_deg), min(lon_deg), max(lat_deg), max(lon_deg)
+        return (*map(min, zip(*points, strict=True)), *map(max, zip(*points, strict=True)))
 
 
 def read_area(path: str | Path) -> Area:

@@ -4,28 +4,69 @@ recorded positions. `mapmaking.making` calls it.
 Each place gets a pose: the direction and the footprint of its picture, and a position with a covariance. Headings, lens
 and mounting of the camera need not be known. A place with ties (see `graph`) to too few others keeps its recorded
 position and gets no pose.
+
+Only pairs that may overlap are compared: places recorded near each other, and places mapped one after the other, since
+a recorded position may be far off. After the pose graph is solved, pairs that overlap by it follow. Landmarks (ORB
+points) are compared first, as they are most exact. If too few of them agree, and the pictures are found, the technique
+compares their regions as in flight, which gives a rough relative pose ("vote"). Landmarks are then compared again near
+that pose.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from edgevpr.core.arrays import Bools, Floats
-from edgevpr.core.contract import Technique
-from edgevpr.core.errors import PlaceError
+from edgevpr.core.arrays import Array, Bools, Complexes, Floats
+from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.errors import EdgevprError, PlaceError
 from edgevpr.core.geodesy import metres, moved
+from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Place, Pose, Position
-from edgevpr.mapmaking.graph import Solved, solve
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.mapmaking.graph import Solved, Ties, solve
 from edgevpr.mapmaking.mapping import Watch
-from edgevpr.mapmaking.tying import likely_pairs, looker, overlapping_pairs, tied, ties_of
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement
+from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 
 _LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
 _MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
 _AMISS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
+_NEAREST = 8  # each place is compared with so many places recorded nearest
+_BEFORE = 2  # and with so many places mapped just before
+_OVERLAPS = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
+_MOST_OVERLAPPING = 12  # pairs of one place, after the graph is solved
+# Chosen on aerial_caliterra and aerial_garfield28.
+_VOTE = 0.06  # share of regions that must agree to use a vote without landmarks
+_ASKED = 0.05  # share of regions that must agree to compare landmarks near the vote
+# Standard deviations (step, turn) along one axis: of landmarks, in which tilt and relief look like turns and scalings;
+# and of a vote, which has whole cells, turns of 15 degrees, and an uncertain scale if few regions agree.
+_OF_LANDMARKS, _OF_VOTE = (0.01, 0.05), (0.016, 0.09)
+_TRIED = 8  # hypotheses of rotation and height for a pair
+_KEPT = 512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
+_KEPT_PICTURES = 4  # descriptors that are cached
+
+
+class Tie(NamedTuple):
+    """Relative pose of two pictures, `query` to `place`. `step`: complex offset from the middle of the place's picture
+    to that of the query's (right + i up, in shares of the longest side of the place's picture). `turn`: complex,
+    natural logarithm of the scale + i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations
+    of the two along one axis."""
+
+    step: complex
+    turn: complex
+    step_sd: float
+    turn_sd: float
+
+
+Pair = tuple[int, int]  # the numbers of query and place, the later one first
+Look = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,14 +110,14 @@ def refine(
     recorded_at = [_recorded(place) for place in placed]
     east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
-    look = looker(place_map, technique, placed, images)
-    pairs = likely_pairs(recorded)
-    ties = tied(watch(pairs, len(pairs)), look)
-    solved = solve(recorded, ties_of(ties))
-    more = sorted(set(overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
+    look = _looker(place_map, technique, placed, images)
+    pairs = _likely_pairs(recorded)
+    ties = {pair: tie for pair in watch(pairs, len(pairs)) if (tie := look(*pair))}
+    solved = solve(recorded, _ties_of(ties))
+    more = sorted(set(_overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
     if more:
-        ties |= tied(watch(more, len(more)), look)
-        solved = solve(recorded, ties_of(ties))
+        ties |= {pair: tie for pair in watch(more, len(more)) if (tie := look(*pair))}
+        solved = solve(recorded, _ties_of(ties))
     sure = _is_sure(solved)
     _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
@@ -137,3 +178,111 @@ def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position]
 
 def _median(values: Floats) -> float | None:
     return float(np.median(values)) if len(values) else None
+
+
+def _likely_pairs(recorded: Complexes) -> list[Pair]:
+    """Return the pairs of places that may overlap. `recorded`: positions, complex (N,) metres, in the order mapped."""
+    count = len(recorded)
+    pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
+    return sorted(pairs | {(at, other) for at, other, _ in _near(recorded, _NEAREST)})
+
+
+def _overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
+    """Return the pairs of places that overlap according to a solved graph. `position` and `log` are those of
+    `graph.Solved`; only places where `of`, bool (N,), is True are considered."""
+    members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
+    near = _near(position[members], _MOST_OVERLAPPING)
+    return sorted(
+        {
+            (int(members[at]), int(members[other]))
+            for at, other, away_m in near
+            if away_m <= _OVERLAPS * min(footprint_m[at], footprint_m[other])
+        }
+    )
+
+
+def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
+    """Pair each of N places, at `position`, complex (N,) metres, with the `most` places nearest to it. Yields (number
+    of the later place, number of the earlier one, metres between them) for each pair; some pairs come twice."""
+    if len(position) > 1:
+        points = np.stack([position.real, position.imag], axis=1)
+        away_m, near = cKDTree(points).query(points, k=min(most + 1, len(points)))
+        for (at, nth), other in np.ndenumerate(near):
+            if other != at:
+                yield max(at, int(other)), min(at, int(other)), float(away_m[at, nth])
+
+
+def _ties_of(tie_of: dict[Pair, Tie]) -> Ties:
+    """Convert ties to the arrays that `graph.solve` takes."""
+    query, place = np.array(list(tie_of), np.intp).reshape(-1, 2).T
+    step, turn, step_sd, turn_sd = np.array(list(tie_of.values()), complex).reshape(-1, 4).T
+    return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
+
+
+def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], images: str | Path | None) -> Look:
+    """Return the function that compares two of `places`, given by their indices in this list, and returns their tie
+    (None: none is found). `images` is the folder of their pictures (None: they are not at hand, so only landmarks are
+    compared)."""
+    paths = {decoded_name(path.name): path for path in list_images(images)} if images else {}
+    coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
+
+    @lru_cache(_KEPT)
+    def landmarks(at: int) -> Landmarks | None:
+        try:
+            blob = place_map.landmarks_of(places[at].place_id)
+            return unpacked(blob) if blob else None
+        except (EdgevprError, ValueError):
+            return None
+
+    @lru_cache(_KEPT_PICTURES)
+    def descriptor(at: int) -> Descriptor | None:
+        if (path := paths.get(places[at].source_image)) is None:
+            return None
+        try:
+            found = technique.encode(read_image(path))
+        except EdgevprError:
+            return None
+        return found if place_map.is_of(places[at].place_id, found.coarse) else None
+
+    def by_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
+        one, other = landmarks(query), landmarks(place)
+        found = None if one is None or other is None else agreement(one, other, expected)
+        if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
+            return None
+        return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
+
+    def look(query: int, place: int) -> Tie | None:
+        if tie := by_landmarks(query, place, None, PROVEN):
+            return tie
+        asking, part = descriptor(query), coarse.get(places[place].place_id)
+        if asking is None or part is None:
+            return None
+        try:
+            fine, _ = place_map.fine_part(places[place].place_id)
+        except EdgevprError:
+            return None
+        match = technique.match(asking, fine, _likely(technique, asking, part))
+        if match.score < _ASKED:
+            return None
+        (dx, dy), cells = match.shift_cells or (0.0, 0.0), technique.spec.cells or 1
+        vote = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
+        tie = by_landmarks(query, place, vote, CONFIRMED)
+        return tie or (_tie(vote, _OF_VOTE) if match.score >= _VOTE else None)
+
+    return look
+
+
+def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
+    """Choose the hypotheses of rotation and height under which `Technique.match` should compare the query `asking` with
+    a place whose coarse part is `part`: the eight with the best scores of coarse parts, as numbers, the best first."""
+    _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
+    assert by_hypothesis is not None  # set by techniques for a camera that looks down
+    best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
+    likely: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
+    return likely
+
+
+def _tie(seen: Overlay, sds: tuple[float, float]) -> Tie:
+    dx, dy = seen.shift_share
+    turned = np.radians((seen.rotation_deg + 180) % 360 - 180)
+    return Tie(complex(dx, -dy), complex(np.log(seen.scale or 1.0), -turned), *sds)

@@ -275,6 +275,8 @@ def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
         place = learner.learn(recogniser.step(Frame(image=shot, name="new", t_mono_s=1.0, position=noisy)))
         far = Position(*moved(true.lat_deg, true.lon_deg, 90.0, 0.0))
         contradicted = learner.learn(recogniser.step(Frame(image=shot, name="far", t_mono_s=99.0, position=far)))
+    with PlaceMap.open(map_path) as place_map:
+        place, contradicted = place_map.places([place.place_id, contradicted.place_id])
     assert abs((place.pose.up_deg - 140 + 180) % 360 - 180) < 8
     assert place.pose.footprint_m == pytest.approx(FOOTPRINT_M * 90 / 80, rel=0.15)
     assert place.pose.recorded == Position(noisy.lat_deg, noisy.lon_deg)
@@ -282,5 +284,3 @@ def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
     assert off_m < np.hypot(6, 4)
     assert contradicted.pose is None, "the pictures and the position contradict each other"
     assert contradicted.position == far
-    with PlaceMap.open(map_path) as place_map:
-        assert [each.pose for each in place_map.places([place.place_id])] == [place.pose]
