@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from edgevpr.core.contract import nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
+from edgevpr.core.types import Candidate, Frame, Position, Vehicle
 from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expectation
@@ -40,8 +40,8 @@ class Hints:
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Return these hints, which were used, as fields of the flight log: `reach_m`, the radius of the area (None:
-        unknown), and `heading`, True if a heading is known."""
+        """Return these hints as fields of the flight log: the radius of the area (None: unknown), and if a heading is
+        known."""
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
@@ -154,10 +154,7 @@ def told_parts(text: str | None) -> tuple[str, ...]:
 
 
 def lacking(
-    known: Collection[str],
-    queries: Collection[GeoTag],
-    places: Collection[GeoTag] | Collection[Place],
-    sequence: int,
+    known: Collection[str], queries: Collection[GeoTag], places: Collection[GeoTag], sequence: int
 ) -> str | None:
     """Return a sentence on why no query can be asked with what is `known` (see `Told`); None if some can. `sequence` is
     the number of queries that are matched together."""

@@ -168,7 +168,6 @@ def _recogniser(
     technique: Technique,
     place_map: PlaceMap,
     index: PlaceIndex,
-    *,
     narrowed: bool,
     follows: bool,
 ) -> Recogniser:
