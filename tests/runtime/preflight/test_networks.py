@@ -75,7 +75,7 @@ def test_the_commands_list_and_verify_all_networks(models, capsys, monkeypatch):
     write_network(models, "mine")
     write_network(models, "wrong", fault="zeros")
     assert main(["models", "list"]) == 0
-    assert " MIT; made by a test\n" in capsys.readouterr().out
+    assert "source             made by a test\n" in capsys.readouterr().out
     assert main(["models", "verify"]) == 1
     said = capsys.readouterr().out
     assert "features           4, 10, 14\n" in said
