@@ -30,7 +30,7 @@ from edgevpr.runtime.flight.world import Stop, World
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
     """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the comparison
     of the `packets` of both; `why_ended`, the reason why the replay ended before the flight did (None: it did not); and
@@ -82,8 +82,13 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
         waiting("")
-        lines = list(read_log(again_log)) if again_log else []
-        return Replayed(flown, lines, playback.packets, why_ended, playback.guessed)
+        return Replayed(
+            flown=flown,
+            lines=list(read_log(again_log)) if again_log else [],
+            packets=playback.packets,
+            why_ended=why_ended,
+            guessed=playback.guessed,
+        )
 
 
 def _recorded(log: str | Path) -> tuple[list[Line], Path]:
