@@ -28,8 +28,7 @@ _ADVICE = {
 
 
 def beside(path: Path) -> list[Path]:
-    """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not: write-ahead log,
-    index of the log, rollback journal."""
+    """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not."""
     return [path.with_name(path.name + end) for end in _BESIDE]
 
 
@@ -131,24 +130,21 @@ def start_log(db: sqlite3.Connection) -> None:
 
 
 def settle(db: sqlite3.Connection) -> None:
-    """Merge SQLite's write-ahead log into the map file and remove the log. If another program has the map open, the log
-    stays, which does no harm."""
+    """Merge SQLite's log into the map file and remove it. If another program has the map open, it stays: no harm."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
 
 
 def settle_left_log(path: Path) -> None:
-    """Merge the write-ahead log that a program left, because it ended without closing the map, into the map file; do
-    nothing if file or folder may not be written."""
+    """Merge the log that a killed program left into the map file; do nothing if that may not be written."""
     if beside(path)[0].exists():
         with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
             settle(db)
 
 
 def is_of_one_row(error: sqlite3.Error) -> bool:
-    """Return True if an error may concern one row only, so that other rows can still be read: a damaged page, an
-    unreadable sector, or a value that is too large."""
+    """Return True if other rows may still be readable: a damaged page, a lost sector, or a value too large."""
     return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
 
 

@@ -42,11 +42,8 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
-    """Return the values of edgevpr_map by key, without mask and calibration, and check the columns of `places`.
-
-    `db` is the connection to the map file `path`. Raises MapError for a file that is not a place map or has an unknown
-    format version, and sqlite3.Error.
-    """
+    """Return the values of edgevpr_map by key, without mask and calibration, and check the columns of `places`. Raises
+    MapError for a file that is not a place map or has an unknown format version, and sqlite3.Error."""
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
     # A view or virtual table, which has no page of its own in the file, is refused: a query of it may never end.
     tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}

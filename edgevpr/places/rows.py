@@ -59,8 +59,7 @@ class Unreadable(ValueError):
 
 
 def content_of(columns: str, row: Values | None) -> Content:
-    """Return the values of a row by column name. `columns` are the names of its columns, with commas between them.
-    Raises Unreadable if `row` is None."""
+    """Return the values of a row by the names in `columns`, of the form "a, b". Raises Unreadable if it is None."""
     if row is None:
         raise Unreadable("its row is gone")
     return dict(zip(columns.split(", "), row, strict=True))
@@ -140,8 +139,7 @@ def place_of(place_id: int, content: Content) -> Place:
 def frame_content(
     frame: Frame, descriptor: Descriptor, spec: TechniqueSpec, salience: Salience | None, landmarks: bytes | None
 ) -> Content:
-    """Return the row of a new place, by columns, without its checksums. A time that is not a date and an altitude
-    outside the allowed range are stored as unknown (NULL)."""
+    """Return the row of a new place, by columns, without checksums. An impossible time or altitude becomes NULL."""
     position, scores = frame.position, salience.scores if salience else {}
     altitude = position.alt_m if position else None
     return {
@@ -189,10 +187,8 @@ def readable(name: str) -> str:
 
 def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
     """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
-
-    Where reading fails, at a damaged page, the next place is read by its id, and so on. Raises sqlite3.Error if the
-    file cannot be read at all.
-    """
+    Where reading fails, at a damaged page, the next place is read by its id. Raises sqlite3.Error if nothing can be
+    read."""
     last, highest, unreadable = -(2**63), -1, 0
     while unreadable < _MOST_UNREADABLE:
         try:
@@ -235,8 +231,7 @@ def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
 
 
 def _salience_of(values: Sequence[Any]) -> Salience | None:
-    """Make a Salience from the values of the columns `SALIENCE`; None if it is unknown. An invalid score becomes
-    None."""
+    """Make a Salience from the columns `SALIENCE`; None if it is unknown. An invalid score becomes None."""
     *scores, is_low = values
     if is_low is None:
         return None
@@ -273,8 +268,7 @@ def _blob_of(part: Array | None, spec: PartSpec | None) -> bytes | None:
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
 
 
-def crc32(blob: Any) -> int | None:
-    """Return the CRC-32 of a BLOB; None for None."""
+def crc32(blob: bytes | None) -> int | None:
     return None if blob is None else zlib.crc32(blob)
 
 
