@@ -80,7 +80,7 @@ class Governor:
 
     @property
     def held(self) -> str | None:
-        """What is lowered, in a few words; None if nothing is."""
+        """Lowered settings, in a few words; None if nothing is lowered."""
         now, asked = self.setting, self._settings[0]
         parts = (
             f"{now.rate_hz:g} of {asked.rate_hz:g} Hz" if now.rate_hz != asked.rate_hz else "",

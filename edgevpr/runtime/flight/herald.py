@@ -1,4 +1,4 @@
-"""What a flight tells people, and what they ask of it. The herald reports to the journal (the log of the process), to
+"""Talk of a flight with people. The herald reports to the journal (the log of the process), to
 the flight log and to the ground station; all observers report through it. `Commands` does what ground stations ask."""
 
 import logging

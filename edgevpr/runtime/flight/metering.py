@@ -15,7 +15,7 @@ from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.recognise.recognition import Recognition
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
     """One measurement for the governor. `cpu_share` (0..1) is the share of all cores that this process has used since
     the last measurement. `late_share` (0..1) is the share of that time that queries took, if other programs or the disk
@@ -97,8 +97,13 @@ class FlightMeter:
     def reading(self) -> LoadReading:
         """Return a measurement for the governor: the load since the last one, and the present memory and heat."""
         cpu_share, late_share = self.load.look()
-        heat = self.thermal
-        return LoadReading(cpu_share, late_share, self.rss_mb(), heat.temperature_c, heat.throttled)
+        return LoadReading(
+            cpu_share=cpu_share,
+            late_share=late_share,
+            rss_mb=self.rss_mb(),
+            temperature_c=self.thermal.temperature_c,
+            throttled=self.thermal.throttled,
+        )
 
     def _mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)

@@ -52,7 +52,7 @@ class PositionedMatch:
     places: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedFix:
     """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
     the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
@@ -122,7 +122,9 @@ class Navigation:
             return None
         expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s)
         off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
-        return ComparedFix(seen, there.at_m, off_m, expected_m, covariance_m2)
+        return ComparedFix(
+            seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
+        )
 
     def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
         """Correct our position by a fix. `is_against`: it contradicts what was expected (see `Consistency`)."""

@@ -23,7 +23,7 @@ LOG_ROOM_MB = 10  # some hours of queries
 
 @dataclass(frozen=True, slots=True)
 class FlightIntent:
-    """What a flight intends, for the checks of an autopilot: `sends_fixes` (False: a dry run), and `every_s`, the
+    """Intent of a flight, for the checks of an autopilot: `sends_fixes` (False: a dry run), and `every_s`, the
     seconds between two queries."""
 
     sends_fixes: bool
