@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
+    add_known,
     add_parameters,
     command,
     config_of,
@@ -52,12 +53,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
     parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
-    parser.add_argument(
-        "--known",
-        metavar="A,B",
-        help="of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m of queries and places, "
-        "else that of the map), reach (within 300 m of its position)",
-    )
+    add_known(parser)
     parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
     add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")

@@ -2,12 +2,15 @@
 
 import os
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
+    add_known,
     add_positions,
     add_recording,
     command,
@@ -21,6 +24,9 @@ from edgevpr.cli.shared import (
 from edgevpr.core.config import with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import aligned, progress, shown, waiting
+
+if TYPE_CHECKING:
+    from edgevpr.runtime.recognise.recogniser import Recogniser
 
 _HEADINGS = ("query", "place", "reference image", "score", "accepted", "error m")
 _MATCHING_KEYS = (
@@ -39,6 +45,7 @@ def add(commands: Any) -> None:
     match.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
     add_keys(match, *_MATCHING_KEYS)
     match.add_argument("--follow", action="store_true", help="the images are those of one flight, in order (cohog)")
+    add_known(match)
     add_json(match)
 
     run = command(commands, "run", run_flight, "recognise places in flight and tell the flight controller")
@@ -72,15 +79,18 @@ def run_match(args: Namespace) -> int:
     from edgevpr.core.geodesy import distance_m
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
+    from edgevpr.runtime.recognise.hints import told_parts
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.runtime.recognise.recognition import fields_of
     from edgevpr.techniques.card import weights_of
 
-    config = config_of(args, args.config, map=args.map)
-    recogniser = open_recogniser(config, load_board(config.board), follows=args.follow)
+    config, known = config_of(args, args.config, map=args.map), told_parts(args.known)
+    recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)
+    if known:
+        _require_known(args, known, recogniser)
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
     for frame in filter(None, progress(frames, source.total, "matching")):
         event = recogniser.step(frame)
@@ -88,6 +98,8 @@ def run_match(args: Namespace) -> int:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         fields = fields_of(event)
+        if known:
+            fields["hints"] = event.hints and event.hints.fields()
         here, there = frame.position, fields["located"] or fields["position"]
         if here and there:
             away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
@@ -95,10 +107,27 @@ def run_match(args: Namespace) -> int:
         found.append(fields)
     lines = aligned([_HEADINGS, *map(_matched, found)], left=3)
     lines.append(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
+    if known:
+        lines.append(f"Known of each query: {','.join(known)}.")
     if weights := weights_of(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
     return exit_code(unusable)
+
+
+def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
+    """Raise UsageError if no query of `match`, or no place of the map, has what is to be known of it."""
+    from edgevpr.frames.positions import read_track
+    from edgevpr.frames.source import tags_of
+    from edgevpr.runtime.recognise.hints import lacking
+
+    source, positions = Path(args.source), path_of(args.positions)
+    if source.is_dir():
+        queries = list(tags_of(source, positions).values())
+    else:
+        queries = list(read_track(positions).tags) if positions else []
+    if why := lacking(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
+        raise UsageError(why)
 
 
 def _matched(fields: dict[str, Any]) -> tuple[str, ...]:

@@ -67,6 +67,16 @@ def add_positions(parser: ArgumentParser) -> None:
     )
 
 
+def add_known(parser: ArgumentParser) -> None:
+    """Add the flag for what is known of recorded queries, which `hints.told_parts` reads."""
+    parser.add_argument(
+        "--known",
+        metavar="A,B",
+        help="of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m of queries and places, "
+        "else that of the map), reach (within 300 m of its position)",
+    )
+
+
 def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
     """Add --param, for parameters of a technique or a vehicle. It may be repeated. `text` is its help."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)

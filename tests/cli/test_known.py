@@ -1,4 +1,4 @@
-"""What is known of a query beside its picture: `eval` with --known."""
+"""What is known of a query beside its picture: `eval` and `match` with --known."""
 
 import json
 
@@ -7,6 +7,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
+from edgevpr.runtime.recognise.hints import TOLD_REACH_M
 
 pytestmark = pytest.mark.slow
 
@@ -71,6 +72,23 @@ def test_a_height_is_that_of_the_table_else_that_of_the_map(capsys, tmp_path):
     assert evaluated(capsys, low, "--known", "height")["accepted"] == 0
     tagged = make(tmp_path / "tagged", height_ratio=0.5, height_m=(50, 50, 50, 100, 100, None))
     assert evaluated(capsys, tagged, "--known", "height")["accepted"] == 4, "of one query no height is known"
+
+
+def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
+    folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
+    path = tmp_path / "m.gpkg"
+    build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
+    assert main([str(word) for word in build]) == 0
+    capsys.readouterr()
+    match = ("match", path, "--images", folder / "query")
+    without = run_json(capsys, *match)
+    assert all(each["accepted"] and "hints" not in each for each in without)
+    found = run_json(capsys, *match, "--known", "reach, heading")
+    assert [each["hints"]["heading"] for each in found] == [True] * 5 + [False]
+    assert {each["hints"]["reach_m"] for each in found} == {TOLD_REACH_M}
+    assert [each["accepted"] for each in found] == [True] * 3 + [False, False, True]
+    bare = make(tmp_path / "bare")
+    assert "yaw_deg" in refused(capsys, "match", path, "--images", bare / "query", "--known", "heading")
 
 
 @pytest.mark.parametrize(

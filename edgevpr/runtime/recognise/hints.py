@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from edgevpr.core.contract import nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.types import Candidate, Frame, Position, Vehicle
+from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expectation
@@ -154,7 +154,10 @@ def told_parts(text: str | None) -> tuple[str, ...]:
 
 
 def lacking(
-    known: Collection[str], queries: Collection[GeoTag], places: Collection[GeoTag], sequence: int
+    known: Collection[str],
+    queries: Collection[GeoTag],
+    places: Collection[GeoTag] | Collection[Place],
+    sequence: int,
 ) -> str | None:
     """Return a sentence on why no query can be asked with what is `known` (see `Told`); None if some can. `sequence` is
     the number of queries that are matched together."""

@@ -1,7 +1,7 @@
 """Makes a recogniser from a map, the technique it was made with, and its index in RAM. All programs start here."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.hints import Prior, Told
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import is_now, levelling_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
@@ -34,12 +34,20 @@ Settings = Mapping[str, int | float | str]  # parameters of a technique, by thei
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
-def open_recogniser(config: Config, board: Board, *, narrowed: bool = False, follows: bool = False) -> Recogniser:
+def open_recogniser(
+    config: Config,
+    board: Board,
+    *,
+    narrowed: bool = False,
+    known: Collection[str] = (),
+    follows: bool = False,
+) -> Recogniser:
     """Open the map, make its technique for the board, and load the index.
 
-    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map.
-    With `follows`, the queries are those of one flight, in order (see `follow`). Raises an EdgevprError that names what
-    does not fit together, such as a setting that the map was not built with.
+    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
+    but for what is `known` of recorded ones (see `Told`). With `follows`, the queries are those of one flight, in order
+    (see `follow`). Raises an EdgevprError that names what does not fit together, such as a setting that the map was not
+    built with.
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
@@ -49,7 +57,10 @@ def open_recogniser(config: Config, board: Board, *, narrowed: bool = False, fol
         technique = technique_of(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
-        recogniser = _recogniser(config, board, technique, place_map, index, narrowed=narrowed, follows=follows)
+        prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
+        if narrowed:
+            prior = _in_flight(config, technique)
+        recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
 
@@ -71,8 +82,8 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         index_positions(place_map)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        index, follows = growing.index, config.match.follow
-        recogniser = _recogniser(config, board, technique, place_map, index, narrowed=True, follows=follows)
+        prior, follows = _in_flight(config, technique), config.match.follow
+        recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
 
@@ -162,13 +173,19 @@ def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
+def _in_flight(config: Config, technique: Technique) -> Prior:
+    """Make what narrows the queries of a flight."""
+    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+
+
 def _recogniser(
     config: Config,
     board: Board,
     technique: Technique,
     place_map: PlaceMap,
     index: PlaceIndex,
-    narrowed: bool,
+    *,
+    prior: Prior | Told | None,
     follows: bool,
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
@@ -176,10 +193,7 @@ def _recogniser(
     matcher = Matcher(technique, index, rule, search_of(length))
     mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
-    prior = follower = None
-    # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
-    if narrowed and matcher.search is None:
-        prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_live)
+    follower = None
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and kinds_of(technique.spec):
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
@@ -191,10 +205,11 @@ def _recogniser(
         meter_of(config, board),
         WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=config.mavlink.min_accuracy_m),
         preparation=Preparation(levelling=levelling, mask=mask, gate=gate_of(config.salience, board.threads)),
-        prior=prior,
+        # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
+        prior=None if matcher.search else prior,
         follower=follower,
     )
-    if narrowed:
+    if isinstance(prior, Prior):
         place_map.wait_at_most(_WAIT_S)
     return recogniser
 
