@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--query", metavar="SOURCE", help=video)
     parser.add_argument("--ref", metavar="SOURCE", help="the same, of the places to be found")
     parser.add_argument("--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (all)")
-    parser.add_argument("--ground-truth", metavar="FILE", help="CSV (default: right is what is near, by the positions)")
+    parser.add_argument("--ground-truth", metavar="FILE", help="CSV, GT.npz, ground_truth_new.npy (else: what is near)")
     parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
     parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="measure stored similarities (.npy)")
@@ -126,8 +126,10 @@ def _measure_similarities(args: Namespace) -> int:
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
     queries, references = (names_in(folder) if folder else None for folder in (args.query, args.ref))
-    truth = truth_of(args.ground_truth, queries)
-    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
+    results = []
+    for file in args.similarity:
+        scores = read_similarities(file)
+        results.append(measure(Path(file).stem, scores, *truth_of(args.ground_truth, scores, queries, references)))
     _show("similarities", results, args.json)
     return 0
 

@@ -184,7 +184,7 @@ def map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check
 
-    found = check(args.map)
+    found = check(args.map, progress)
     show({**asdict(found), "is_whole": found.is_whole}, args.json, of_check(found))
     return 0 if found.is_whole else 1
 
@@ -193,12 +193,12 @@ def map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check, repair
 
-    found = check(args.map)
+    found = check(args.map, progress)
     show(found, False, of_check(found))
     if found.is_whole:
         print("nothing is damaged: the map is as it was")
         return 0
-    original = repair(args.map)
+    original = repair(args.map, progress)
     print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
     return 0
 
@@ -208,7 +208,7 @@ def map_merge(args: Namespace) -> int:
     from edgevpr.places.examine import merge
     from edgevpr.places.mapfiles import map_path
 
-    counts, were_calibrated = merge(args.maps, map_path(args.out))
+    counts, were_calibrated = merge(args.maps, map_path(args.out), progress)
     for path, (copied, already_here) in zip(args.maps, counts, strict=True):
         print(f"{path}: {copied} places copied, {already_here} there already")
     print(f"{args.out}: {sum(copied for copied, _ in counts)} places")
@@ -222,7 +222,7 @@ def map_shrink(args: Namespace) -> int:
     from edgevpr.places.examine import shrink
     from edgevpr.places.mapfiles import map_path
 
-    kept, places = shrink(args.map, map_path(args.out), args.places)
+    kept, places = shrink(args.map, map_path(args.out), args.places, progress)
     print(f"{args.out}: {kept} of {places} places")
     return 0
 

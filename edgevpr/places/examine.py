@@ -2,7 +2,7 @@
 
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,14 @@ class Examined(NamedTuple):
     place_id: int
     problem: str | None
     content: Content
+
+
+# Called with the places that are read, their number and a label; yields the places unchanged and shows the progress.
+Watch = Callable[[Iterable[Examined], int, str], Iterable[Examined]]
+
+
+def unwatched(places: Iterable[Examined], total: int, label: str) -> Iterable[Examined]:
+    return places
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +71,7 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
         yield Examined(place_id, problem, content)
 
 
-def merge(paths: Sequence[str], out: Path) -> tuple[list[tuple[int, int]], bool]:
+def merge(paths: Sequence[str], out: Path, watch: Watch = unwatched) -> tuple[list[tuple[int, int]], bool]:
     """Make the new map `out` of the places of several maps; if that fails, leave no file. Returns for each map (places
     copied, places that were there already) as numbers, and True if one of them was calibrated: `out` is not.
 
@@ -80,15 +88,15 @@ def merge(paths: Sequence[str], out: Path) -> tuple[list[tuple[int, int]], bool]
         with PlaceMap.create(unfinished, maps[0].spec) as merged:
             if len(masks) == 1:
                 merged.record_mask(*masks)
-            return [_absorb(merged, each) for each in maps], any(each.calibration is not None for each in maps)
+            return [_absorb(merged, each, watch) for each in maps], any(each.calibration is not None for each in maps)
 
 
-def _absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
+def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch) -> tuple[int, int]:
     """Copy what is new of `other` into `place_map`; return (copied, already there) as numbers."""
     copied = already_here = 0
     with place_map.transaction():
         here = place_map.ids_by("source_image, time")
-        for each in examine(other):
+        for each in watch(examine(other), len(other), f"copying {other.path.name}"):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
             part = rows.part_of(each.content, "coarse", other.spec.coarse)
@@ -101,10 +109,10 @@ def _absorb(place_map: PlaceMap, other: PlaceMap) -> tuple[int, int]:
     return copied, already_here
 
 
-def check(path: str | Path) -> MapCheck:
+def check(path: str | Path, watch: Watch = unwatched) -> MapCheck:
     """Read and check everything in the map file `path`. Raises MapError for a file that cannot be opened as a map."""
     with PlaceMap.open(path) as place_map:
-        problems = [(each.place_id, each.problem) for each in examine(place_map)]
+        problems = [(each.place_id, each.problem) for each in watch(examine(place_map), len(place_map), "checking")]
         try:
             found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
         except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -113,7 +121,7 @@ def check(path: str | Path) -> MapCheck:
     return MapCheck(str(path), len(problems) - len(damaged), damaged, () if found == ["ok"] else tuple(found))
 
 
-def repair(path: str | Path) -> Path:
+def repair(path: str | Path, watch: Watch = unwatched) -> Path:
     """Replace the map by a copy of its undamaged places; keep the original as `*.damaged` and return its path.
 
     The places keep their ids, and all get checksums. Mask hash and calibration are copied if they can be read. Raises
@@ -128,7 +136,7 @@ def repair(path: str | Path) -> Path:
     lock = mapfiles.lock(path)  # meanwhile no program can add places, which the copy would lack
     try:
         with PlaceMap.open(path) as damaged:
-            if not _copy(damaged, copy, examine(damaged)):
+            if not _copy(damaged, copy, watch(examine(damaged), len(damaged), "copying")):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
         for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
             if left.exists():  # else SQLite would apply the log of the damaged map to the copy
@@ -145,7 +153,7 @@ def repair(path: str | Path) -> Path:
     return original
 
 
-def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
+def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:
     """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
     `best_places`). Returns (number of places copied, number of readable places of the map).
 
@@ -154,12 +162,15 @@ def shrink(path: str | Path, out: Path, count: int) -> tuple[int, int]:
     no part of a file is then left.
     """
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        places = [rows.place_of(each.place_id, each.content) for each in examine(place_map) if not each.problem]
+        total = len(place_map)
+        whole = (each for each in watch(examine(place_map), total, "reading") if not each.problem)
+        places = [rows.place_of(each.place_id, each.content) for each in whole]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
         kept = {places[number].place_id for number in best.tolist()}
-        _copy(place_map, unfinished, (each for each in examine(place_map) if each.place_id in kept))
+        chosen = (each for each in watch(examine(place_map), total, "copying") if each.place_id in kept)
+        _copy(place_map, unfinished, chosen)
     return len(kept), len(places)
 
 

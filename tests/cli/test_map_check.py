@@ -65,6 +65,7 @@ def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, ca
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
     assert said.out.splitlines()[1:] == ["  SQLite      the file is sound"]
+    assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
     assert "nothing" in capsys.readouterr().out
     assert valley.read_bytes() == before
@@ -83,7 +84,9 @@ def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, caps
 
     assert main(["map", "repair", str(valley)]) == 0
     original = valley.with_name("valley.gpkg.damaged")
-    assert f"2 dropped; the original is {original}" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert f"2 dropped; the original is {original}" in said.out
+    assert "copying  6/6  100 %" in said.err
     assert original.read_bytes() == before
     with PlaceMap.open(original) as damaged, PlaceMap.open(valley) as repaired:
         kept = list(repaired.places())
@@ -126,7 +129,7 @@ def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
 def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
     damage(valley, "UPDATE places SET geom = 'text' WHERE place_id = 2")
     assert main(["match", str(valley), "--images", str(flight / "images"), "--json"]) == 0
-    accepted = [row["place"] for row in json.loads(capsys.readouterr().out) if row["accepted"]]
+    accepted = [row["place"]["number"] for row in json.loads(capsys.readouterr().out) if row["accepted"]]
     assert len(accepted) >= 4
     assert 2 not in accepted
 

@@ -1,6 +1,8 @@
 """Reads data sets in the layouts in which they are published. A layout is recognised by its files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own.
+* query/, ref/ and ground_truth_new.npy: VPR-Bench (see `numbered`).
+* GT.npz and two folders, that of the references first by name: VPR_Tutorial (see `numbered`).
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
   GSV-Cities and others in that form). References near the query are right (`Nearness`).
 * query/ and ref/ with positions (positions.csv or EXIF): references near the query are right.
@@ -22,9 +24,10 @@ from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import tags_of
 from edgevpr.lab.evaluate.dataset import Dataset, GroundTruth, Judged, joined, load_dataset
+from edgevpr.lab.evaluate.numbered import load_numbered
 
 Tags = dict[Path, GeoTag]  # of the pictures of a folder
-_FORMS = "query/, ref/ and ground_truth.csv; database/ and queries/; or query/ and ref/ with positions.csv"
+_FORMS = "query/, ref/ and ground_truth.csv, ground_truth_new.npy or positions.csv; GT.npz; or database/ and queries/"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +46,13 @@ def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
     query, ref = folder / "query", folder / "ref"
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
+    if (numbers := folder / "ground_truth_new.npy").is_file():
+        return load_numbered(query, ref, numbers)
+    if (matrices := folder / "GT.npz").is_file():
+        inner = sorted(path for path in folder.iterdir() if path.is_dir())
+        if len(inner) != 2:
+            raise UsageError(f"{folder} has not two folders beside GT.npz: use --query, --ref and --ground-truth.")
+        return load_numbered(inner[1], inner[0], matrices)
     for outer in (folder, folder / "test", folder / "images" / "test"):
         if (outer / "database").is_dir() and (outer / "queries").is_dir():
             return _of_utm(outer / "queries", outer / "database", rule)

@@ -14,6 +14,7 @@ from edgevpr.core.yamlfile import read_yaml
 from edgevpr.lab.evaluate.asking import MatchOptions, Progress
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
+from edgevpr.lab.evaluate.numbered import KINDS, load_numbered
 from edgevpr.lab.evaluate.videos import pictures_of
 from edgevpr.runtime.preflight.pick import camera_setting
 
@@ -21,7 +22,7 @@ from edgevpr.runtime.preflight.pick import camera_setting
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetPlan(Nearness):
     """A data set of a plan: either a `folder` of any known layout, or the folders or videos `query` and `ref`. The
-    right references are those in `ground_truth` (a CSV, only with `query` and `ref`) or in the folder's own ground
+    right references are those in `ground_truth` (a file, only with `query` and `ref`) or in the folder's own ground
     truth; if there is neither, those near the query. `rate_hz` pictures a second are taken from a video (None: every
     frame). `camera` is "nadir" (looks straight down), "forward" (looks ahead) or None (unknown)."""
 
@@ -38,7 +39,8 @@ class SetPlan(Nearness):
         if self.folder:
             return open_folder(self.folder, self)
         if self.ground_truth:
-            return load_dataset(self.query or "", self.ref or "", self.ground_truth)
+            load = load_numbered if Path(self.ground_truth).suffix in KINDS else load_dataset
+            return load(self.query or "", self.ref or "", self.ground_truth)
         pictures = partial(pictures_of, kept=videos, rate_hz=self.rate_hz, progress=progress)
         return of_positions(self.query or "", self.ref or "", self, pictures)
 

@@ -13,6 +13,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import counting_order
 from edgevpr.lab.evaluate.dataset import NOT_SCORED, GroundTruth, read_truth
 from edgevpr.lab.evaluate.metrics import Quality, counting, figures, first_right
+from edgevpr.lab.evaluate.numbered import KINDS, read_numbered
 
 
 def read_similarities(path: str | Path) -> Doubles:
@@ -29,15 +30,21 @@ def read_similarities(path: str | Path) -> Doubles:
     return np.asarray(scores, np.float64)
 
 
-def truth_of(path: str | Path, queries: Sequence[str] | None) -> GroundTruth:
-    """Read a ground truth (a CSV) with an entry for each of `queries`, the names of all query images (None: those that
-    it names). Raises UsageError if it names others."""
+def truth_of(
+    path: str | Path, scores: Doubles, queries: Sequence[str] | None, references: Sequence[str] | None
+) -> tuple[GroundTruth, Sequence[str] | None]:
+    """Read a ground truth with an entry for each row of `scores`, and return it with the names of the columns, for
+    `measure`. `queries` and `references` are the names of all images (None: those that a CSV names; elsewhere their
+    numbers). Raises UsageError if it names others."""
+    if Path(path).suffix in KINDS:
+        rows, columns = (list(map(str, range(count))) for count in scores.shape)
+        return read_numbered(path, queries or rows, references or columns), references or columns
     truth = read_truth(path)
     if not queries:
-        return truth
+        return truth, references
     if missing := sorted(truth.keys() - set(queries)):
         raise UsageError(f"{path} names the query `{missing[0]}`, which is not in --query.")
-    return {name: truth.get(name, NOT_SCORED) for name in queries}
+    return {name: truth.get(name, NOT_SCORED) for name in queries}, references
 
 
 def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:

@@ -1,15 +1,20 @@
 """Data sets of every layout that is known, and what is right in them."""
 
 import csv
+import pickle
+import shutil
 
 import cv2
+import numpy as np
 import pytest
 from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
+from edgevpr.lab.evaluate.evaluate import quietly
 from edgevpr.lab.evaluate.layouts import Nearness, open_folder
+from edgevpr.lab.evaluate.plan import SetPlan
 
 RULE = Nearness()
 
@@ -29,6 +34,76 @@ def positions(folder, rows):
 
 def right_of(dataset):
     return {query.path.name: (set(query.right), set(query.ignored)) for query in dataset.queries}
+
+
+def test_vpr_bench_has_numbers(tmp_path):
+    pictures(tmp_path / "query", ["0.jpg", "1.jpg", "10.jpg"])
+    pictures(tmp_path / "ref", ["2.jpg", "9.jpg", "11.jpg"])
+    truth = np.empty((2, 2), object)
+    truth[0], truth[1] = (0, [0, 1]), (2, [2])
+    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
+    dataset = open_folder(tmp_path, RULE)
+    assert right_of(dataset) == {"0.jpg": ({"2.jpg", "9.jpg"}, set()), "10.jpg": ({"11.jpg"}, set())}
+    truth[0] = (0, [-1])
+    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
+    assert list(right_of(open_folder(tmp_path, RULE))) == ["10.jpg"], "a query without a right reference is not scored"
+    truth[1] = (2, [3])
+    np.save(tmp_path / "ground_truth_new.npy", truth, allow_pickle=True)
+    with pytest.raises(UsageError, match="numbers more than 3 queries"):
+        open_folder(tmp_path, RULE)
+
+
+def test_a_file_of_numbers_that_would_run_a_program_is_refused(tmp_path):
+    pictures(tmp_path / "query", ["0.jpg"])
+    pictures(tmp_path / "ref", ["0.jpg"])
+
+    class Evil:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "ran"), "w"))
+
+    np.save(tmp_path / "ground_truth_new.npy", np.array([[0, Evil()]], object), allow_pickle=True)
+    with pytest.raises(UsageError, match="VPR-Bench"):
+        open_folder(tmp_path, RULE)
+    assert not (tmp_path / "ran").exists()
+    np.save(tmp_path / "ground_truth_new.npy", np.array([[0, [0]]], object), allow_pickle=True)
+    whole = (tmp_path / "ground_truth_new.npy").read_bytes()
+    head, end = whole[: whole.index(b"\n") + 1], whole.index(b"]\x94(")
+    # An array of objects that gives their addresses in memory: NumPy itself would go there.
+    addresses = whole[:end].replace(b"K?t", b"K\x00t") + b"C\x10" + 16 * b"A" + b"\x94t\x94b."
+    for content in (b"", b"rubbish", head + pickle.dumps([1]), head + pickle.dumps(None), whole[:-9], addresses):
+        (tmp_path / "ground_truth_new.npy").write_bytes(content)
+        with pytest.raises(UsageError, match="VPR-Bench"):
+            open_folder(tmp_path, RULE)
+
+
+def test_vpr_tutorial_has_matrices_and_what_is_soft_does_not_count(tmp_path):
+    pictures(tmp_path / "day", ["a.jpg", "b.jpg", "c.jpg"])
+    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
+    hard = np.array([[1, 0], [0, 1], [0, 0]])
+    soft = np.array([[1, 0], [1, 1], [0, 1]])
+    np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=soft)
+    assert right_of(open_folder(tmp_path, RULE)) == {"x.jpg": ({"a.jpg"}, {"b.jpg"}), "y.jpg": ({"b.jpg"}, {"c.jpg"})}
+    pictures(tmp_path / "snow", ["s.jpg"])
+    with pytest.raises(UsageError, match="has not two folders"):
+        open_folder(tmp_path, RULE)
+    chosen = {"query": str(tmp_path / "night"), "ref": str(tmp_path / "day"), "ground_truth": str(tmp_path / "GT.npz")}
+    assert set(right_of(SetPlan(**chosen).open(tmp_path, quietly))) == {"x.jpg", "y.jpg"}
+    shutil.rmtree(tmp_path / "snow")
+    np.savez(tmp_path / "GT.npz", GThard=hard.T, GTsoft=soft.T)
+    with pytest.raises(UsageError, match="first folder by name"):
+        open_folder(tmp_path, RULE)
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish", {"GThard": np.eye(2)}, {"GThard": [[None]], "GTsoft": [[None]]}])
+def test_matrices_that_are_none_are_said(tmp_path, content):
+    pictures(tmp_path / "day", ["a.jpg", "b.jpg"])
+    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
+    if isinstance(content, bytes):
+        (tmp_path / "GT.npz").write_bytes(content)
+    else:
+        np.savez(tmp_path / "GT.npz", **content)
+    with pytest.raises(UsageError, match="VPR_Tutorial"):
+        open_folder(tmp_path, RULE)
 
 
 @pytest.mark.parametrize("inside", ["", "images/test"])

@@ -76,6 +76,90 @@ def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, conten
     assert error.count("\n") == 1
 
 
+def scored(capsys, similarity, truth, *more):
+    assert main(["eval", "--json", "--similarity", str(similarity), "--ground-truth", str(truth), *map(str, more)]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["similarities"].values()
+    return found
+
+
+def test_a_ground_truth_of_numbers_scores_as_the_same_in_names(tmp_path, capsys):
+    """The first query has no right reference, and the best match of the third is soft only."""
+    rng, folders = np.random.default_rng(0), []
+    names = {"query": [f"{number}.jpg" for number in range(12)], "ref": [f"{number}.jpg" for number in range(9)]}
+    for folder, files in names.items():
+        (tmp_path / folder).mkdir()
+        folders += [f"--{folder}", tmp_path / folder]
+        for name in files:
+            (tmp_path / folder / name).touch()
+    hard = rng.random((9, 12)) < 0.4
+    hard[:, 0], hard[5, 2], hard[6, 2] = False, False, True
+    soft = hard | (rng.random(hard.shape) < 0.2)
+    soft[5, 2], scores = True, rng.random((12, 9)) + 0.5 * hard.T
+    scores[2, 5], scores[2, 6] = 4, 3
+    np.save(tmp_path / "scores.npy", scores)
+    np.savez(tmp_path / "GT.npz", GThard=hard, GTsoft=soft.astype(np.uint8))
+    np.save(tmp_path / "new.npy", rows_of(*((at, np.flatnonzero(hard[:, at])) for at in reversed(range(12)))))
+    recalls = []
+    for numbered, loose in (("GT.npz", soft), ("new.npy", hard)):
+        rows = ["query_file,ref_files,ref_files_loose,status"]
+        for at, query in enumerate(names["query"]):
+            right, ignored = (" ".join(np.array(names["ref"])[each[:, at]]) for each in (hard, loose))
+            rows.append(f"{query},{right},{ignored},{'ok' if right else 'unsure'}")
+        (tmp_path / "truth.csv").write_text("\n".join(rows))
+        expected = scored(capsys, tmp_path / "scores.npy", tmp_path / "truth.csv", *folders)
+        assert expected["queries"] == 11
+        assert scored(capsys, tmp_path / "scores.npy", tmp_path / numbered) == expected, "no image and no name"
+        assert scored(capsys, tmp_path / "scores.npy", tmp_path / numbered, *folders) == expected
+        recalls.append(expected["recall_at_1"])
+    assert recalls[0] > recalls[1], "what is soft counts neither way"
+
+
+def rows_of(*rows):
+    found = np.empty((len(rows), 2), object)
+    for number, row in enumerate(rows):
+        found[number] = row
+    return found
+
+
+EYE = np.eye(3, dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("GT.npz", {"GThard": EYE[:2], "GTsoft": EYE[:2]}, "there are 3 references"),
+        ("GT.npz", {"GThard": EYE}, "GTsoft is not a file in the archive"),
+        ("GT.npz", {"GThard": EYE, "GTsoft": EYE[:2]}, "GThard is (3, 3), GTsoft (2, 3)"),
+        ("GT.npz", {"GThard": np.array([[None]]), "GTsoft": EYE}, "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", {"GThard": EYE & False, "GTsoft": EYE}, "scores none of its queries"),
+        ("GT.npz", b"rubbish", "is no GT.npz of VPR_Tutorial"),
+        ("GT.npz", None, "cannot be read (No such file"),
+        ("new.npy", rows_of((0, [3])), "numbers more than 3 queries and 3 references"),
+        ("new.npy", rows_of((3, [0])), "numbers more than 3 queries and 3 references"),
+        ("new.npy", rows_of((0, [-2])), "it names image -2"),
+        ("new.npy", rows_of((0, np.array([0.5]))), "'float' object cannot be interpreted"),
+        ("new.npy", rows_of((0, ["a"])), "is no ground_truth_new.npy of VPR-Bench"),
+        ("new.npy", rows_of(([0, 1], [1])), "is no ground_truth_new.npy of VPR-Bench"),
+        ("new.npy", np.eye(2), "is no ground_truth_new.npy of VPR-Bench"),
+        ("new.npy", b"", "is no ground_truth_new.npy of VPR-Bench"),
+        ("new.npy", None, "cannot be read (No such file"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_said_in_a_sentence(name, content, said, tmp_path, capsys):
+    np.save(tmp_path / "scores.npy", SCORES)
+    path = tmp_path / name
+    if isinstance(content, dict):
+        np.savez(path, **content)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content, allow_pickle=True)
+    assert main(["eval", "--similarity", str(tmp_path / "scores.npy"), "--ground-truth", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
 def test_a_query_of_the_ground_truth_that_is_not_in_the_folder_is_said(tmp_path, truth, capsys):
     np.save(tmp_path / "a.npy", SCORES)
     for folder, names in (("query", ["q1.jpg", "q2", "q3"]), ("ref", ["r1", "r2", "r10"])):
