@@ -116,7 +116,8 @@ def read_xmp(path: str | Path) -> GeoTag:
     values = {name.decode(): text for name, text in reversed(_XMP.findall(head))}  # the first of a name counts
     height_m = _number(values, "drone-dji:RelativeAltitude", *ALT_M)
     for name in ("drone-dji:Gimbal{}Degree", "drone-parrot:Camera{}Degree"):
-        if angles := _yaw_pitch_roll(values, name):
+        # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
+        if (angles := _yaw_pitch_roll(values, name)) and any(angles):
             heading_deg, roll_deg, pitch_deg = _from_straight_down(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
     # In the tags of Pix4D, 0 is straight down; a camera without an IMU writes zeros, which are ignored.

@@ -57,12 +57,18 @@ def test_a_photograph_of_dji(read, tmp_path):
         ((120, -90, 0), (120, 0, 0)),
         ((-60, -90, 180), (120, 0, 0)),  # half a turn of the roll is half a turn of the picture
         ((100, -90, 20), (120, 0, 0)),
-        ((0, 0, 0), (0, 0, 90)),  # it looks ahead
+        ((30, -0.5, 0), (30, 0, 89.5)),  # it looks ahead
     ],
 )
 def test_a_gimbal_that_looks_down_turns_by_its_roll(read, told, meant):
     found = read(packet(gimbal(*told)))
     assert (found.heading_deg, found.roll_deg, found.pitch_deg) == pytest.approx(meant, abs=1e-6)
+
+
+def test_a_gimbal_of_zeros_tells_nothing_and_nose_and_height_count(read):
+    """A small DJI drone writes so of a camera that looks straight down."""
+    nose = 'drone-dji:RelativeAltitude="+39.80" drone-dji:FlightYawDegree="-60.5" drone-dji:FlightPitchDegree="-3.1" '
+    assert read(packet(nose + gimbal("+0.00", "+0.00", "+0.00"))) == GeoTag(heading_deg=299.5, height_m=39.8)
 
 
 def test_a_gimbal_tilted_to_its_side_is_the_same_told_either_way(read):
