@@ -65,28 +65,33 @@ class AlongTrack(Motion):
 
 
 def read_track(csv_path: str | Path) -> list[TrueState]:
-    """Read the rows of a positions.csv with position and time, sorted by time. Raises UsageError if there are none."""
+    """Read the rows of a positions.csv with position and time, sorted by time. Without roll and pitch the vehicle flies
+    level, without a heading along its way. Raises UsageError if there are no such rows."""
     track = []
     for tag in read_positions(csv_path).values():
         if tag.position and tag.t_utc_s is not None:
-            angles = (math.nan if each is None else each for each in (tag.roll_deg, tag.pitch_deg, tag.heading_deg))
-            roll_deg, pitch_deg, heading_deg = angles
             track.append(
                 TrueState(
                     lat_deg=tag.position.lat_deg,
                     lon_deg=tag.position.lon_deg,
                     alt_m=tag.position.alt_m or 0.0,
                     height_m=math.nan if tag.height_m is None else tag.height_m,
-                    roll_deg=roll_deg,
-                    pitch_deg=pitch_deg,
-                    heading_deg=heading_deg,
+                    roll_deg=tag.roll_deg or 0.0,
+                    pitch_deg=tag.pitch_deg or 0.0,
+                    heading_deg=math.nan if tag.heading_deg is None else tag.heading_deg,
                     t_s=tag.t_utc_s,
                 )
             )
     if not track:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
-    start_s = min(state.t_s for state in track)
-    return sorted((replace(state, t_s=state.t_s - start_s) for state in track), key=lambda state: state.t_s)
+    track.sort(key=lambda state: state.t_s)
+    start_s, course_deg = track[0].t_s, math.nan
+    for number, (state, ahead) in enumerate(zip(track, [*track[1:], track[-1]], strict=True)):
+        if way_m := from_to(state.lat_deg, state.lon_deg, ahead.lat_deg, ahead.lon_deg):
+            course_deg = math.degrees(math.atan2(way_m.real, way_m.imag)) % 360
+        heading_deg = course_deg if math.isnan(state.heading_deg) else state.heading_deg
+        track[number] = replace(state, t_s=state.t_s - start_s, heading_deg=heading_deg)
+    return track
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:

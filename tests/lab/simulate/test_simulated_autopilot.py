@@ -138,6 +138,16 @@ def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
     assert (position.relative_alt, position.hdg) == (80_500, 30_000)
 
 
+def test_it_flies_level_along_its_way_where_the_track_knows_no_attitude(tmp_path):
+    csv = tmp_path / "positions.csv"
+    csv.write_text("file,lat,lon,roll_deg,time\nb.jpg,50.0,8.001,,10\na.jpg,50.0,8.0,,0\n")
+    assert [(each.roll_deg, each.pitch_deg) for each in read_track(csv)] == [(0.0, 0.0)] * 2
+    controller = FlightController("px4-copter", AlongTrack(read_track(csv)), gps=True)
+    said = {message.get_type(): message for message in controller.advance(1.0)}
+    assert (said["ATTITUDE"].roll, said["ATTITUDE"].pitch) == (0, 0)
+    assert said["GLOBAL_POSITION_INT"].hdg == pytest.approx(9000, abs=1), "east"
+
+
 def test_a_track_without_times_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
     with pytest.raises(UsageError, match="lon and"):
