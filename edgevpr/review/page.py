@@ -42,6 +42,7 @@ _LONG_S = 5.0
 _NEAR_S = 5.0  # of two moments that are closer in time only the first is shown
 _OF_A_KIND, _MOST = 2, 6  # moments at most, of one kind and in all
 _NUMBER = re.compile(r"\d+(\.\d+)?")
+_UNSENT = re.compile(r"^not sent( yet)?: ")  # so some reasons begin, and the outcome before them says it already
 _COLOURS = {
     FixOutcome.TAKEN: "taken",
     FixOutcome.REFUSED: "refused",
@@ -104,7 +105,7 @@ def page_of(flight: LoggedFlight, ground: Ground, frames: Album, references: Alb
         section("Why matches were refused", _counts(refusals)),
         section(
             "Why fixes were not sent, or not taken",
-            _counts(f"{fix.outcome.value}: {fix.why}" for fix in fixes if fix.why),
+            _counts(f"{fix.outcome.value}: {_UNSENT.sub('', fix.why)}" for fix in fixes if fix.why),
         ),
         section("What was said", _remarks(flight)),
         section("How it was set", _settings(flight)),

@@ -123,6 +123,16 @@ def test_the_worst_moments_are_those_that_could_be_dangerous(tmp_path):
     assert "20 queries" in why[2][0]
 
 
+def test_why_a_fix_was_not_sent_is_said_once(tmp_path):
+    whys = "not sent: paused by the ground", "not sent yet: nothing is heard of the vehicle", "dry run: no fix is sent"
+    fixes = [query(why)["fix"] | {"sent": False, "why": why} for why in whys]
+    content = page(write_log(tmp_path / "log", *(("query", query(each["why"], fix=each)) for each in fixes)))
+    said = re.findall(r"<td>(fix not sent[^<]*)<", content)
+    assert sorted(said) == [
+        f"fix not sent: {why.removeprefix('not sent: ').removeprefix('not sent yet: ')}" for why in sorted(whys)
+    ]
+
+
 def test_positions_that_cross_the_date_line_stay_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
     lines = [("query", query("a", **each)) for each in at]
