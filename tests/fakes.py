@@ -68,6 +68,8 @@ class FakeSource:
     """A camera or stream (`is_live`), or a recording, of the pictures given, as many frames as there are. Reading one
     is `work`. A picture may be a Frame, of which all is kept but the time."""
 
+    step_s = None
+
     def __init__(
         self,
         pictures: Iterable[np.ndarray | Frame | Exception],

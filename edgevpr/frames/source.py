@@ -5,13 +5,15 @@ base class of those that end, `FolderSource` a folder of images."""
 import os
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import SOURCES
-from edgevpr.core.errors import ImageError, SourceError, UsageError
+from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
@@ -32,7 +34,8 @@ class Source:
     `dropped`: number of pictures not read in time; None for a recording, which drops none.
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
     `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
-    `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s")."""
+    `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
+    `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them."""
 
     is_live: bool
     ended: bool
@@ -42,6 +45,7 @@ class Source:
     latency_s: float | None
     condition: Condition
     state: str
+    step_s: float | None = None
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame (of a live source the newest), or None if there is none within `timeout_s` seconds.
@@ -83,12 +87,20 @@ def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
 class FolderSource(RecordingSource):
     """Gives each image of a folder once, in counting order of the names (2 before 10), with the position, attitude and
     time of its line in the table `positions` (None: positions.csv in or beside the folder), or if it has no line, with
-    those of its EXIF data. `clock`: the monotonic clock in seconds, for the frames' times."""
+    those of its EXIF data. `clock`: the monotonic clock in seconds, for the frames' times. `steps_s`: the seconds
+    between two images, in this order, if they are to be flown by them."""
 
     def __init__(
-        self, folder: Path, positions: Path | None, clock: Callable[[], float], only: Collection[str] | None = None
+        self,
+        folder: Path,
+        positions: Path | None,
+        clock: Callable[[], float],
+        only: Collection[str] | None = None,
+        *,
+        steps_s: Sequence[float] = (),
     ) -> None:
         super().__init__(only)
+        self._steps_s = iter(steps_s)
         paths = {decoded_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         csv_path = positions or find_positions(folder)
         self._tags = read_positions(csv_path) if csv_path else {}
@@ -104,6 +116,7 @@ class FolderSource(RecordingSource):
         if self.ended:
             return None
         name, path = self._unread.pop()
+        self.step_s = next(self._steps_s, None)
         if not self._unread:
             self.end()
         try:
@@ -122,6 +135,19 @@ def tags_of(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
     return {path: tags.get(decoded_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
+def recorded_steps(uri: str | None, positions: Path | None = None) -> list[float]:
+    """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty:
+    `uri` is no folder, an image has no time, one is older than the image before it, or all have the same time; or the
+    folder or the table cannot be used, which `open_source` says."""
+    times: list[float | None] = []
+    if uri is not None and Path(uri).is_dir():
+        with suppress(EdgevprError):
+            times = [tag.t_utc_s for tag in tags_of(Path(uri), positions).values()]
+    steps_s = [there - here for here, there in pairwise(times) if here is not None and there is not None]
+    in_order = len(steps_s) == len(times) - 1 and min(steps_s, default=-1) >= 0
+    return steps_s if in_order and any(steps_s) else []
+
+
 def open_source(
     uri: str,
     *,
@@ -130,6 +156,7 @@ def open_source(
     live: bool,
     clock: Callable[[], float] = time.monotonic,
     only: Collection[str] | None = None,
+    steps_s: Sequence[float] = (),
 ) -> Source:
     """Open the source that `uri` names: a path, device or address.
 
@@ -137,14 +164,15 @@ def open_source(
     `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
     video the table that `positions.read_track` reads (None: frames have no positions).
     `live`: allow cameras and streams, which never end. A stream that is not there yet is opened as soon as it is.
-    `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all).
+    `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
+    for a folder that is flown by its recorded times, the `recorded_steps` (empty: it is not).
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
         raise UsageError(f"{positions} can only place the pictures of a recording, and {uri} is none: leave it out.")
     if path.is_dir():
-        return FolderSource(path, positions, clock, only)
+        return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
     if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")

@@ -40,7 +40,7 @@ class RecordedSource(Source):
         try:
             frame = self._source.read(timeout_s)
         except ImageError as error:
-            self._tape.note("frame", {"problem": str(error)})
+            self._tape.note("frame", {"problem": str(error)} | self._step())
             raise
         if frame is None:
             self._tape.note("frame", None)
@@ -48,8 +48,12 @@ class RecordedSource(Source):
         jpeg = as_jpeg(frame.image)
         known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNPACKED}
         position = frame.position and asdict(frame.position)
-        self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position})
+        self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position} | self._step())
         return replace(frame, image=decoded(jpeg))
+
+    def _step(self) -> dict[str, float]:
+        self.step_s = self._source.step_s
+        return {} if self.step_s is None else {"step_s": self.step_s}
 
     def close(self) -> None:
         self._source.close()
@@ -73,6 +77,7 @@ class ReplayedSource(Source):
         known: Any = self._tape.read("frame", lambda: None)
         if known is None:
             return None
+        self.step_s = known.pop("step_s", None)
         if problem := known.get("problem"):
             raise ImageError(problem)
         number, position = known.pop("number"), known.pop("position")

@@ -11,7 +11,7 @@ from films import cut_in_half, film, overwrite_in_the_middle
 
 from edgevpr.core.errors import ImageError, SourceError, UsageError
 from edgevpr.core.types import Position
-from edgevpr.frames.source import open_source
+from edgevpr.frames.source import open_source, recorded_steps
 
 RATE_HZ = 10
 SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s
@@ -105,6 +105,30 @@ def test_positions_come_from_the_csv_and_for_images_it_does_not_name_from_exif(f
     assert (in_csv.roll_deg, in_csv.height_m) == (-7.0, 80.0)
     assert not_in_csv.position == Position(50.5, 14.25)
     assert without.position is None
+
+
+@pytest.mark.parametrize(
+    ("times", "steps_s"),
+    [
+        (("10", "10.5", "10.5", "70"), [0.5, 0.0, 59.5]),
+        (("10", "", "11", "12"), []),
+        (("10", "11", "10", "12"), []),
+        (("10", "10", "10", "10"), []),
+    ],
+)
+def test_a_folder_tells_the_steps_of_its_times_where_all_have_one_in_order(folder, times, steps_s):
+    rows = [f"{number}.jpg,50,8,{time}" for number, time in enumerate(times)]
+    (folder / "positions.csv").write_text("\n".join(["file,lat,lon,time", *rows]))
+    for number in range(len(times)):
+        write_picture(folder / f"{number}.jpg")
+    assert recorded_steps(str(folder)) == steps_s
+    source = open_source(str(folder), live=True, steps_s=steps_s)
+    told = [source.step_s for _ in times if source.read(1.0)]
+    assert told == [*steps_s, *[None] * (len(times) - len(steps_s))]
+
+
+def test_what_is_no_folder_has_no_steps(video):
+    assert recorded_steps(None) == recorded_steps(str(video)) == recorded_steps("rtsp://127.0.0.1/x") == []
 
 
 def test_positions_named_by_the_user_count_before_those_that_lie_there(folder, tmp_path):

@@ -4,7 +4,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -32,7 +32,7 @@ from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.flightlog import flight_of
 
 _SEED = 1
-_RATE_HZ = 5.0
+_INTERVAL_S = 0.2  # of the later flight, which is flown by the times of its pictures
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
 RIGHT_M = 55.0
@@ -84,7 +84,7 @@ def run_demo(folder: str | Path) -> str:
     for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
         old.unlink(missing_ok=True)
     scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
-    mapping, later = mapping_flight(_SEED), later_flight(_SEED)
+    mapping, later = mapping_flight(_SEED), replace(later_flight(_SEED), interval_s=_INTERVAL_S)
     for name, flight, label in (
         ("flight-1", mapping, "flight 1, to map     "),
         ("flight-2", later, "flight 2, hours later"),
@@ -124,7 +124,7 @@ def _fly(folder: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
     build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
-    fly = ("--link", f"udpout:{address}", "--log", log_path, "--rate-hz", _RATE_HZ)
+    fly = ("--link", f"udpout:{address}", "--log", log_path)
     # The flight controller is started first: it listens long before the map is built.
     command = _command("simulate", "autopilot", "--link", f"udpin:{address}")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as autopilot:

@@ -4,13 +4,15 @@ flight depends on. `flight` does this before it opens the links and the source o
 import logging
 import platform
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, replace
 from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from edgevpr import __version__
-from edgevpr.core.config import Config
+from edgevpr.core.config import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Config
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import FIX_MAX_AGE_S
@@ -94,6 +96,16 @@ def _picked(config: Config) -> str | None:
 def rate_hz(config: Config, recogniser: Recogniser) -> float:
     """Return the queries per second: the configured rate, or else that of the board's profile."""
     return config.source.rate_hz or recogniser.meter.board.rate_hz
+
+
+def at_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
+    """Return the configuration of a flight over pictures that come `steps_s` apart (empty: not by their times): with
+    the rate at which most of them come."""
+    if not steps_s:
+        return config
+    usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
+    usual_hz = min(max(usual_hz, LOWEST_RATE_HZ), HIGHEST_RATE_HZ)
+    return replace(config, source=replace(config.source, rate_hz=usual_hz))
 
 
 def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:

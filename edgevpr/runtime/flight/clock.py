@@ -29,18 +29,20 @@ def taped(clock: Clock, tape: Tape) -> Clock:
 
 
 class Pace:
-    """Decides when to take the next frame: `rate_hz` frames per second, evenly spaced. After a delay, missed frames are
-    not made up for."""
+    """Decides when to take the next frame: `rate_hz` frames per second, evenly spaced or by the steps of a recording.
+    After a delay, missed frames are not made up for."""
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:
         self._clock = clock
         self._due_s = clock.mono_s()
-        self.rate_hz = rate_hz
+        self.rate_hz = self._asked_hz = rate_hz
 
     def wait_s(self) -> float:
         """Return the seconds until the next frame is due; 0 or less: it is due."""
         return self._due_s - self._clock.mono_s()
 
-    def taken(self) -> None:
-        """Note that a frame has been taken, and set the time at which the next one is due."""
-        self._due_s = max(self._due_s + 1 / self.rate_hz, self._clock.mono_s())
+    def taken(self, step_s: float | None = None) -> None:
+        """Note that a frame has been taken, and set the time at which the next one is due: after `step_s` (None: by the
+        rate), or later by as much as the rate has been lowered since the start."""
+        wait_s = 1 / self.rate_hz if step_s is None else step_s * self._asked_hz / self.rate_hz
+        self._due_s = max(self._due_s + wait_s, self._clock.mono_s())

@@ -15,13 +15,14 @@ from typing import Any
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Frame
+from edgevpr.frames.source import recorded_steps
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import look_ahead, open_map, rate_hz, say_start
+from edgevpr.runtime.flight.aboard import at_recorded_rate, look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -44,7 +45,9 @@ def fly(config: Config, positions: Path | None = None) -> int:
     """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions
     of the frames, if the source is a recording (None: there is none). Raises an EdgevprError, one sentence, if the
     flight cannot start."""
-    with in_the_air(config, positions) as world:
+    steps_s = recorded_steps(config.source.uri, positions)
+    config = at_recorded_rate(config, steps_s)
+    with in_the_air(config, positions, steps_s) as world:
         try:
             with closing(Flight.open(config, world)) as flight:
                 return flight.run()
@@ -176,7 +179,7 @@ class Flight:
             meter.load.busy(reading.cost)
         if frame is None:
             return
-        self._pace.taken()
+        self._pace.taken(source.step_s)
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
         recogniser, link = self._crew.recogniser, self._crew.link

@@ -1,6 +1,9 @@
 """Reporting of how a flight goes, once a second: to systemd (with its watchdog), to the autopilot, and to the status
 file. The loop of `flight` uses it."""
 
+import logging
+import math
+import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -17,15 +20,18 @@ from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW,
 from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
-_HEALTH_S = 1.0
+_HEALTH_S, _MINUTE_S = 1.0, 60.0
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
+
+_log = logging.getLogger(__name__)
 
 
 class Vitals:
     """Pings the watchdog of systemd, and reports once a second how the flight goes to systemd and to the status file,
-    and the state of this computer to the autopilot. It reports once, through the herald, when the camera is lost,
-    frozen, damaged or shows nothing, when nothing can be recognised any more, and when each of these is over. `remarks`
-    returns sentences for the status; those that are None are left out."""
+    and the state of this computer to the autopilot; once a minute also to the terminal, if it was started on one. It
+    reports once, through the herald, when the camera is lost, frozen, damaged or shows nothing, when nothing can be
+    recognised any more, and when each of these is over. `remarks` returns sentences for the status; those that are None
+    are left out."""
 
     def __init__(
         self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Callable[[], Sequence[str | None]]
@@ -33,6 +39,7 @@ class Vitals:
         self._crew, self._tally, self._pace, self._commands, self._remarks = crew, tally, pace, commands, remarks
         self._watchdog_s = systemd.watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = crew.clock.mono_s()
+        self._minute_due_s = self._health_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
         self._source_trouble: str | None = None
         self._has_log = True
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
@@ -70,6 +77,9 @@ class Vitals:
         health, load = self._health(), crew.meter.machine_load()
         status = self._status(health, load)
         systemd.notify(STATUS=status["summary"])
+        if status["t_mono_s"] >= self._minute_due_s:
+            self._minute_due_s += _MINUTE_S
+            _log.info("%s", _so_far(status))
         if crew.status:
             crew.status.tell(status)
         if crew.autopilot:
@@ -146,6 +156,17 @@ class Vitals:
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
+
+
+def _so_far(status: dict[str, Any]) -> str:
+    """Return in one line how the flight of a status goes, for who has started it by hand."""
+    match, fixes = status["match"], [status["link"]["fixes"]] if status["link"] else []
+    last = "no place found yet"
+    if match:
+        ago_s = status["t_mono_s"] - match["t_frame_s"]
+        last = f"last place {match['place']} ({match['reference_image']}), {ago_s:.0f} s ago"
+    counts = f"{status['queries']} queries, {status['accepted']} accepted"
+    return "; ".join((f"{status['elapsed_s'] / 60:.0f} min: {counts}", last, *fixes))
 
 
 def _seen(event: Recognition) -> dict[str, Any]:

@@ -5,7 +5,7 @@ recording's tape. The code of the flight is the same."""
 import ctypes
 import logging
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -142,10 +142,11 @@ class Crew:
 
 
 @contextmanager
-def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]:
+def in_the_air(config: Config, positions: Path | None = None, steps_s: Sequence[float] = ()) -> Iterator[World]:
     """Open all inputs and outputs of a real flight, yield them, and close them at the end; meanwhile SIGTERM and SIGINT
     end the flight. `positions` is a file with the positions of the frames, if the source is a recording (None: there is
-    none). Raises an EdgevprError if something cannot be opened."""
+    none), and `steps_s` the seconds between them, if it is flown by its times. Raises an EdgevprError if something
+    cannot be opened."""
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
@@ -168,7 +169,11 @@ def in_the_air(config: Config, positions: Path | None = None) -> Iterator[World]
         tlog = _or_without(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
 
         def opened_source(step_s: float) -> Source:
-            source = open_source(uri, step_s=step_s, positions=positions, live=True)
+            source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
+            if steps_s:
+                _log.info("%d pictures come by their own times, in %.0f s", source.total, sum(steps_s))
+            elif Path(uri).is_dir():
+                _log.info("pictures come at %.3g a second: not all have a time, in their order", 1 / step_s)
             return RecordedSource(source, recording, recording.keep) if recording else source
 
         world = World(

@@ -41,7 +41,8 @@ def test_a_command_that_fails_is_named_and_nothing_is_left_running(small, tmp_pa
     started = []
     popen = demo.subprocess.Popen
     monkeypatch.setattr(demo.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
-    monkeypatch.setattr(demo, "_RATE_HZ", "often")
+    command = demo._command
+    monkeypatch.setattr(demo, "_command", lambda *words: command(*words, *(["--often"] if words[0] == "run" else [])))
     with pytest.raises(EdgevprError, match=r"`edgevpr run.* 2"):
         demo.run_demo(tmp_path / "out")
     assert len(started) == 3, "flight controller, map, flight"

@@ -5,7 +5,9 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
 from pictures import textured
 
+from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
+from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.world import Stop, StopNow
 
@@ -96,6 +98,47 @@ def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
     clock.now_s += 0.5
     pace.taken()
     assert pace.wait_s() == pytest.approx(1.0)
+
+
+def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lowered(clock):
+    pace = Pace(2.0, clock.clock)
+    pace.taken(3.0)
+    assert pace.wait_s() == pytest.approx(3.0)
+    clock.now_s += 3.0
+    pace.rate_hz = 1.0
+    pace.taken(0.25)
+    assert pace.wait_s() == pytest.approx(0.5)
+
+
+def test_a_flight_over_pictures_with_times_takes_them_at_their_times(recording, tmp_path, clock):
+    class Timed(FakeSource):
+        def read(self, timeout_s):
+            self.step_s = next(steps, None)
+            return super().read(timeout_s)
+
+    steps = iter((0.5, 0.0, 7.0))
+    lines = flight(recording, tmp_path, clock).fly(Timed([PICTURE] * 4, clock, is_live=False))
+    taken = [line["t_frame_s"] for line in of_kind(lines, "query")]
+    assert [each - taken[0] for each in taken] == pytest.approx([0.0, 0.5, 0.5, 7.5])
+
+
+def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
+    config = load_config(None, {"source.rate_hz": 1.0})
+    assert at_recorded_rate(config, [0.5, 0.0, 0.5, 60.0]).source.rate_hz == 2.0
+    assert at_recorded_rate(config, [1e-6, 1e-6]).source.rate_hz == 60.0
+    assert at_recorded_rate(config, []) is config
+
+
+def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(recording, tmp_path, clock, monkeypatch, caplog):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with caplog.at_level("INFO"):
+        flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
+    said = [each for each in caplog.messages if " min: " in each]
+    assert [each.partition(" queries")[0] for each in said] == ["1 min: 31", "2 min: 61"]
+    caplog.clear()
+    monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
+    flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
+    assert not [each for each in caplog.messages if " min: " in each]
 
 
 def test_a_source_without_a_frame_leaves_the_loop_turning(recording, tmp_path, clock):

@@ -119,6 +119,19 @@ def test_a_flight_goes_on_when_its_terminal_closes_and_a_signal_that_ends_it_is_
     assert again.why_ended is None
 
 
+def test_a_flight_by_the_times_of_its_pictures_is_the_same(fly, recording, tmp_path):
+    rows = []
+    for number in range(6):
+        picture = f"{number:02d}.png"
+        shutil.copy(recording / "blind" / "images" / picture, tmp_path / picture)
+        rows.append(f"{picture},,,{1000 + 0.1 * number:.1f}")
+    (tmp_path / "positions.csv").write_text("\n".join(["file,lat,lon,time", *rows]))
+    ended(fly("--rate-hz", "0.02", pictures=tmp_path))
+    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert again.lines[0]["decided"]["rate_hz"] == pytest.approx(10)
+    assert len(of_kind(again.lines, "query")) == 6
+
+
 def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
     with autopilot() as link:
