@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+import textwrap
 import time
 from argparse import Namespace
 from typing import Any
@@ -33,21 +34,30 @@ def run_top(args: Namespace) -> int:
     if args.once or not sys.stdout.isatty():
         found = read_status(args.file)
         if found is None or found[1] > _GONE_S:
-            raise EdgevprError(f"No flight tells its status at {args.file}: start one, or name its file with --file.")
+            raise EdgevprError(" ".join(_no_flight(args.file)))
         print("\n".join(lines_of(found[0])))
         return 0
     try:
         while True:
             found = read_status(args.file)
-            lines = lines_of(found[0]) if found else [f"no flight tells its status at {args.file}"]
+            lines = lines_of(found[0]) if found else list(_no_flight(args.file))
             if found and found[1] > _SILENT_S:
                 lines.insert(0, f"the flight has said nothing for {found[1]:.0f} s")
             columns, height = shutil.get_terminal_size()
             sys.__stdout__.write(_CLEAR)  # type: ignore[union-attr]  # past the guard, which lets no escapes through
-            print("\n".join(line[: columns - 1] for line in lines[: height - 1]), flush=True)
+            rows = lines if found else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
+            print("\n".join(row[: columns - 1] for row in rows[: height - 1]), flush=True)
             time.sleep(_LOOK_S)
     except KeyboardInterrupt:
         return 0
+
+
+def _no_flight(file: str) -> tuple[str, str]:
+    """Return what to say, in two lines, where no flight tells its status in `file`."""
+    return (
+        f"No flight tells its status at {file}:",
+        "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and name that PATH with --file.",
+    )
 
 
 def lines_of(status: dict[str, Any]) -> list[str]:
