@@ -15,7 +15,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from edgevpr.cli.main import command_line
+from edgevpr.cli.main import EXIT_CODES, command_line
 from edgevpr.core.config import Config, Key, keys_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -115,6 +115,8 @@ def details(key: Key, default: str) -> str:
 def commands() -> str:
     """Return the page of the command line: every command with its usage and its flags."""
     lines = ["# Command line", "", "Made from the program's own help. `--debug` shows the traceback of an error.", ""]
+    lines += ["## Exit codes", "", "| code | meaning |", "|---|---|"]
+    lines += [*(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()), ""]
     for parser in parsers(command_line()):
         lines += [f"## {parser.prog}", "", parser.description or "", ""]
         lines += ["```text", re.sub(r"^usage: ", "", parser.format_usage()).rstrip(), "```", ""]

@@ -156,7 +156,7 @@ def run_check(args: Namespace) -> int:
     findings = check(args.config, offline=args.offline, say=waiting)
     for line in lines(findings):
         print(shown(line))
-    return 0 if all(finding.ok for finding in findings) else 1
+    return max(finding.exit_code for finding in findings)
 
 
 def service_print(args: Namespace) -> int:
@@ -205,4 +205,4 @@ def run_doctor(args: Namespace) -> int:
     found = [asdict(finding) for finding in findings]
     known = {"link": str(address), "ok": is_fine, "findings": found, "reading": reading and asdict(reading)}
     show(known, args.json, lines(findings))
-    return 0 if is_fine else 1
+    return max(finding.exit_code for finding in findings)

@@ -14,6 +14,15 @@ from edgevpr.cli.screen import LineFormatter, guarded_output
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
 
+EXIT_CODES = {
+    0: "Done, and nothing is wrong.",
+    1: "Something is wrong that is no matter of the request, and may go well later. It was found (by `check`, "
+    "`doctor`, `map check`, `replay`) or left out (an image, a technique), or a map, pictures, a link or a disk cannot "
+    "be used.",
+    2: "The request is wrong: the words of the command, the configuration, or a table or a log that it names. Nothing "
+    "was begun, and trying again does not help: systemd starts the service no more. `check` ends so where `run` does.",
+    130: "Stopped by Ctrl-C. What is ended so (`run`, `top`, `simulate autopilot`) ends with 0 or 1.",
+}
 _GROUPS = (maps, flying, top, review, profile, evaluation, simulation, networks)
 
 
@@ -29,8 +38,7 @@ def program() -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command `argv` (None: that of `sys.argv`) and return its exit code: 0 done, 1 something outside the
-    program is wrong, 2 the request is wrong, 130 stopped by Ctrl-C."""
+    """Run the command `argv` (None: that of `sys.argv`) and return its exit code, one of `EXIT_CODES`."""
     with guarded_output():
         return _run(sys.argv[1:] if argv is None else argv)
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 from pictures import textured
 
-from edgevpr.cli.main import main
+from edgevpr.cli.main import EXIT_CODES, main
 from edgevpr.core.types import StageCost
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
@@ -205,7 +206,6 @@ def test_what_the_world_gets_wrong_is_a_sentence_and_exit_code_1(capsys, flight,
         (["match", flight / "positions.csv", "--images", query], "not a place map"),
         (["match", valley, "--images", tmp_path / "nowhere"], "There is nothing at"),
         (["match", valley, "--images", query, "--technique", "hog"], "technique is cohog, not hog"),
-        (["match", valley, "--images", query, "--param", "gt=0.7"], "gt is 0.4, not 0.7"),
         (["map", "build", valley, "--images", query, "--technique", "cohog"], "is there already"),
         (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
@@ -250,6 +250,43 @@ def test_what_the_user_gets_wrong_is_a_sentence_and_exit_code_2(capsys, flight, 
     with pytest.raises(SystemExit) as exit_code:
         main(["mpa"])
     assert exit_code.value.code == 2
+
+
+@pytest.mark.slow
+def test_commands_end_with_the_exit_codes_that_are_told_and_check_as_run_does(capsys, flight, valley, tmp_path):
+    good = {"map": str(valley), "source": {"uri": str(flight / "query"), "rate_hz": 60}, "log": {"path": None}}
+    table = [
+        (0, {}),
+        (1, {"map": str(tmp_path / "no.gpkg")}),
+        (1, {"source": {"uri": str(tmp_path / "nowhere")}}),
+        (1, {"log": {"path": str(tmp_path / "no" / "x.jsonl")}}),
+        (1, {"technique": "hog"}),
+        (2, {"map": None}),
+        (2, {"source": {"uri": None}}),
+        (2, {"board": "rpi5"}),
+        (2, {"battery": {"pack": "lots"}}),
+        (2, {"mavlink": {"link": "udp:1"}}),
+        (2, {"mavlink": {"link": "udpin:127.0.0.1:0", "signing_key": str(tmp_path / "no.key")}}),
+        (2, {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg"), "source": {"uri": "/dev/video0"}}),
+        (2, {"mach": {}}),
+    ]
+    path = tmp_path / "c.yaml"
+    for code, change in table:
+        path.write_text(yaml.safe_dump(good | change))
+        ends = [main([*command, "--config", str(path)]) for command in (["check", "--offline"], ["run"])]
+        assert ends == [code, code], (change, capsys.readouterr().err)
+    words = [
+        (0, ["map", "check", valley]),
+        (1, ["map", "check", tmp_path / "no.gpkg"]),
+        (1, ["top", "--once", "--file", tmp_path / "no.json"]),
+        (2, ["report", tmp_path / "no.jsonl", "--out", tmp_path / "r.html"]),
+        (2, ["replay", tmp_path / "no.jsonl"]),
+        (2, ["doctor"]),
+        (2, ["simulate", "autopilot", "--link", "udp:1"]),
+    ]
+    for code, argv in words:
+        assert main([str(word) for word in argv]) == code, argv
+    assert {code for code, _ in table + words} < set(EXIT_CODES)
 
 
 def test_debug_shows_the_traceback(capsys, caplog, tmp_path):

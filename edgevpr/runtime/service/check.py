@@ -11,7 +11,7 @@ from edgevpr.core.config import Config, load_config
 from edgevpr.core.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import Source, open_source
+from edgevpr.frames.source import Source, open_source, recorded_steps
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
@@ -19,6 +19,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
+from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
@@ -43,7 +44,8 @@ def check(
     try:
         config = load_config(config_path)
     except EdgevprError as error:
-        return [wrong("configuration", str(error))]
+        return [wrong("configuration", str(error), exit_code=error.exit_code)]
+    config = at_recorded_rate(config, recorded_steps(config.source.uri))
     findings = [
         fine("configuration", str(config_path)),
         looked_at("board", lambda: _board(config)),
@@ -88,7 +90,7 @@ def _map(config: Config) -> str:
             sure = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
     t_query_s = found.t_query_s or 0.0
     if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
-        raise UsageError(
+        raise EdgevprError(
             f"No fix would ever be sent ({too_late(t_query_s)}): use a faster board, fewer places or candidates, "
             f"or a technique that costs less; {found.reason}."
         )

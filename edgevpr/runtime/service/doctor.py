@@ -84,7 +84,11 @@ def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: 
         also = f"System {systems} is on this link too: name the one to fly with."
         yield wrong("vehicles", also, f"mavlink: {{system_id: {reading.system_id}}}")
     if reading.firmware not in RULES:
-        yield wrong("firmware", "It is neither ArduPilot nor PX4: edgevpr sends no fixes to it.")
+        dry = "it is neither ArduPilot nor PX4; a dry run sends it no fix"
+        fixes = (
+            "It is neither ArduPilot nor PX4: a flight would send it fixes by command 43003, untried with it: fly dry."
+        )
+        yield judged("firmware", not intent.sends_fixes, dry, fixes, "mavlink: {send_fixes: false}")
     elif reading.answers:
         yield _firmware(reading)
         yield from RULES[reading.firmware].findings(reading, intent)

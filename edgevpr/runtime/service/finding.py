@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edgevpr.core.config import Config, LogConfig
-from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.tlog import SPARED_BYTES
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 
 LOG_ROOM_MB = 10  # some hours of queries
+_NOBODYS_GROUPS = ("root", "tty")  # devices of these are held by a login shell, or kept from all users: none is to join
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,25 +31,27 @@ class FlightIntent:
     every_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """Result of one check. `what`: name of what was checked. `message`: a description of it or, if it is not `ok`, one
-    sentence that says what is wrong. `changes`: the exact changes that put it right, such as `GPS2_TYPE=14`."""
+    sentence that says what is wrong. `changes`: the exact changes that put it right, such as `GPS2_TYPE=14`.
+    `exit_code`: that of a command with such a result, and of a flight that would end by it."""
 
     what: str
     ok: bool
     message: str
     changes: tuple[str, ...] = ()
+    exit_code: int = 0
 
 
 def fine(what: str, message: str) -> Finding:
     """Return a finding with nothing to change."""
-    return Finding(what, True, message)
+    return Finding(what=what, ok=True, message=message)
 
 
-def wrong(what: str, message: str, *changes: str) -> Finding:
+def wrong(what: str, message: str, *changes: str, exit_code: int = 1) -> Finding:
     """Return a finding with something wrong, which `changes` put right."""
-    return Finding(what, False, message, changes)
+    return Finding(what=what, ok=False, message=message, changes=changes, exit_code=exit_code)
 
 
 def judged(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
@@ -61,7 +64,7 @@ def looked_at(what: str, look: Callable[[], str]) -> Finding:
     try:
         return fine(what, look())
     except EdgevprError as error:
-        return wrong(what, str(error))
+        return wrong(what, str(error), exit_code=error.exit_code)
     except OSError as error:
         return wrong(what, f"{error.filename}: {error.strerror}: check the path and its permissions.")
 
@@ -85,8 +88,8 @@ def board_findings(config: Config, address: LinkAddress | None, root: Path = Pat
 
 
 def device(what: str, path: str, root: Path = Path("/")) -> Finding:
-    """Check that a device file exists, that this user may use it, and that it is not the kernel's console. `what` names
-    the check in the finding."""
+    """Check that a device file exists, that this user may use it, and that no console or other program holds it, if it
+    is a serial port. `what` names the check in the finding."""
     file = root / path.lstrip("/")
     try:
         status = file.stat()
@@ -98,15 +101,17 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name
     mode = f"group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
-    if not os.access(file, os.R_OK | os.W_OK):
-        user = getpass.getuser()
-        denied = f"{path} may not be used by {user} ({mode}): log in again after the change."
-        return wrong(what, denied, f"sudo usermod --append --groups {group} {user}")
-    if console := _console_on(file.resolve(), root):
+    may_use, user = os.access(file, os.R_OK | os.W_OK), getpass.getuser()
+    held, changes = _held(file.resolve(), root) if what == "serial" else (None, ())
+    if held:
+        return wrong(what, f"{path} ({mode}) is not free for the link: {held}.", *changes)
+    denied = f"{path} may not be used by {user} ({mode})"
+    if not may_use and group in _NOBODYS_GROUPS:
+        why = ": a login shell on it is the usual reason" if changes else ""
+        return wrong(what, f"{denied}{why}.", *(changes or ("install the udev rules 99-edgevpr.rules of edgevpr",)))
+    if not may_use:
         return wrong(
-            what,
-            f"{path} is the console of the kernel, which writes into the link.",
-            f"remove console={console} from the kernel's command line (cmdline.txt), and reboot",
+            what, f"{denied}: log in again after the change.", f"sudo usermod --append --groups {group} {user}"
         )
     return fine(what, f"{path}, {mode}")
 
@@ -127,12 +132,12 @@ def _room(file: str, key: str, needed_mb: float) -> str:
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        raise UsageError(f"{path} is no file in a folder that is there: correct `log: {{{key}: ...}}`.")
+        raise EdgevprError(f"{path} is no file in a folder that is there: correct `log: {{{key}: ...}}`.")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise UsageError(f"{path} may not be written by this user: change its permissions or `log: {{{key}: ...}}`.")
+        raise EdgevprError(f"{path} may not be written by this user: change its permissions or `log: {{{key}: ...}}`.")
     free_mb = shutil.disk_usage(path.parent).free / 1e6
     if free_mb < needed_mb:
-        raise UsageError(f"{path}: only {free_mb:.1f} MB are free there, {needed_mb:g} are needed: make room.")
+        raise EdgevprError(f"{path}: only {free_mb:.1f} MB are free there, {needed_mb:g} are needed: make room.")
     return str(path)
 
 
@@ -149,8 +154,44 @@ def _memory(needed_mb: float, root: Path) -> Finding:
     return fine("memory", limit)
 
 
-def _console_on(device_file: Path, root: Path) -> str | None:
-    """Return the name of a device as the kernel's console, e.g. "ttyS0"; None if the kernel has no console on it."""
-    words = (machine.text(root / "proc/cmdline") or "").split()
+def _held(port: Path, root: Path) -> tuple[str | None, tuple[str, ...]]:
+    """Return what holds the serial port (None: nothing is found), and the changes that free it from it; if nothing is
+    found, those that free it from a login shell."""
+    console = _console_on(port, root)
+    program, is_login = _program_on(port, root)
+    held = [f"console={console} makes it the console of the kernel, which writes into the link"] if console else []
+    held += [f"{program} {'lets people log in on it' if is_login else 'has it open'}"] if program else []
+    if program and not (console or is_login):
+        return held[0], (f"stop {program}",)
+    if "Raspberry Pi" in (machine.model(root) or ""):
+        change = "sudo raspi-config, Interface Options, Serial Port: login shell no, hardware yes; then reboot"
+        return " and ".join(held) or None, (change,)
+    changes = [f"remove console={console} from the kernel's command line (cmdline.txt), and reboot"] if console else []
+    return " and ".join(held) or None, (*changes, f"sudo systemctl disable --now serial-getty@{console or port.name}")
+
+
+def _console_on(port: Path, root: Path) -> str | None:
+    """Return the name of a port as the kernel's console, now or after the next start, e.g. "ttyS0"; None if the kernel
+    has no console on it."""
+    lines = (machine.text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
+    words = " ".join(lines).split()
     consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
-    return next((console for console in consoles if (root / "dev" / console).resolve() == device_file), None)
+    return next((console for console in consoles if (root / "dev" / console).resolve() == port), None)
+
+
+def _program_on(port: Path, root: Path) -> tuple[str | None, bool]:
+    """Return the program that uses a port, as "NAME (process PID)", None if none is seen; and whether the port is its
+    terminal, as it is of a getty and a login shell. Open files are seen of this user's programs only, or by root."""
+    device = port.stat().st_rdev
+    major, minor = os.major(device), os.minor(device)
+    terminal = str(minor & 0xFF | major << 8 | (minor & ~0xFF) << 12)  # the number that proc(5) calls tty_nr
+    others = [each for each in (root / "proc").glob("[0-9]*") if each.name != str(os.getpid())]
+    for process in sorted(others, key=lambda each: int(each.name)):
+        start, _, stat_fields = (machine.text(process / "stat") or "").rpartition(")")
+        named = f"{start.partition('(')[2]} (process {process.name})"
+        if stat_fields.split()[4:5] == [terminal]:
+            return named, True
+        with suppress(OSError):
+            if any(each.resolve() == port for each in (process / "fd").iterdir()):
+                return named, False
+    return None, False

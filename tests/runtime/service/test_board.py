@@ -91,15 +91,40 @@ def test_a_device_that_is_absent_or_none_is_wrong(root, tmp_path):
     assert not device("serial", "/dev/ttyS0", root).ok
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may open everything")
-def test_a_device_that_may_not_be_used_names_its_group():
-    controller, port = os.openpty()
-    os.chmod(os.ttyname(port), 0)
-    finding = device("serial", os.ttyname(port))
-    group = grp.getgrgid(os.fstat(port).st_gid).gr_name
-    assert finding.changes[0].startswith(f"sudo usermod --append --groups {group} ")
-    os.close(controller)
-    os.close(port)
+@pytest.mark.parametrize(("gid", "advised"), [(0, False), (grp.getgrnam("tty").gr_gid, False), (5000, True)])
+def test_a_device_that_may_not_be_used_names_its_group_unless_that_is_of_consoles(root, monkeypatch, gid, advised):
+    (root / "dev/ttyAMA0").symlink_to("/dev/null")
+    null, status = os.stat("/dev/null"), Path.stat
+    owned = os.stat_result([*null[:5], gid, *null[6:]], {"st_rdev": null.st_rdev})
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(Path, "stat", lambda path, **how: owned if path.name == "ttyAMA0" else status(path, **how))
+    finding = device("serial", "/dev/ttyAMA0", root)
+    assert (finding.ok, len(finding.changes)) == (False, 1)
+    assert finding.changes[0].startswith(
+        "sudo usermod --append --groups 5000 " if advised else "sudo systemctl disable --now serial-getty@"
+    )
+    assert ("usermod" in device("camera", "/dev/ttyAMA0", root).changes[0]) is advised
+
+
+def test_whoever_holds_a_serial_port_is_named_and_how_to_free_it(root):
+    (root / "dev/ttyAMA0").symlink_to("/dev/null")
+    for number in ("812", "99"):
+        (root / f"proc/{number}/fd").mkdir(parents=True)
+        (root / f"proc/{number}/stat").write_text(f"{number} (a getty) S 1 {number} {number} 0 -1 4194304")
+    assert device("serial", "/dev/ttyAMA0", root).ok
+    (root / "proc/99/fd/7").symlink_to("/dev/null")
+    open_in = device("serial", "/dev/ttyAMA0", root)
+    assert (open_in.ok, open_in.changes) == (False, ("stop a getty (process 99)",))
+    (root / "proc/99/stat").write_text("99 (ag) S 1 99 99 259 99 4194304")  # 259: major number 1, minor number 3
+    login = device("serial", "/dev/ttyAMA0", root)
+    assert "ag (process 99) lets people log in" in login.message
+    assert login.changes == ("sudo systemctl disable --now serial-getty@null",)
+    (root / "boot/firmware").mkdir(parents=True)
+    (root / "boot/firmware/cmdline.txt").write_text("console=ttyAMA0,115200 console=tty1")
+    assert len(device("serial", "/dev/ttyAMA0", root).changes) == 2
+    (root / "proc/device-tree").mkdir()
+    (root / "proc/device-tree/model").write_text("Raspberry Pi 4 Model B Rev 1.4\0")
+    assert device("serial", "/dev/ttyAMA0", root).changes[0].startswith("sudo raspi-config, Interface Options")
 
 
 def test_room_for_the_log_is_looked_at(root, tmp_path, monkeypatch):

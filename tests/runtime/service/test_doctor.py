@@ -182,7 +182,7 @@ def test_the_velocity_of_odometry_must_not_be_fused():
     [
         ({"version": (4, 4, 4), "version_text": "4.4.4"}, "firmware", ("ArduPilot 4.5 or later",)),
         ({"version": None, "version_text": None}, "firmware", ()),
-        ({"firmware": "other"}, "firmware", ()),
+        ({"firmware": "other"}, "firmware", ("mavlink: {send_fixes: false}",)),
         ({"says_version_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
         ({"bad_bytes": 5000}, "link", ()),
         ({"other_systems": (2, 3)}, "vehicles", ("mavlink: {system_id: 1}",)),
@@ -401,7 +401,7 @@ def test_the_command_prints_json(link, capsys, tmp_path):
     result = json.loads(capsys.readouterr().out)
     assert (result["link"], result["reading"]["system_id"], result["reading"]["vehicle"]) == (link, 42, "plane")
     assert result["ok"] == all(each["ok"] for each in result["findings"])
-    assert {"what", "ok", "message", "changes"} == set(result["findings"][0])
+    assert {"what", "ok", "message", "changes", "exit_code"} == set(result["findings"][0])
 
 
 @pytest.mark.network
