@@ -147,12 +147,12 @@ def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> R
     flags = ("--footprint-m", f"{footprint_m:g}", "--spacing-m", f"{spacing_m:g}")
     built = base.edgevpr("map", "build", path, "--orthophoto", tif, *flags)
     matches = base.edgevpr("match", path, "--images", folder / "query")
-    known = [match for match in matches if match["query"] in truth and match["position"]]
+    known = [match for match in matches if match["query"] in truth and match["place"]]
 
     def off_m(match: Row, where: str) -> float:
         return float(distance_m(*truth[match["query"]], match[where]["lat_deg"], match[where]["lon_deg"]))
 
-    errors_m = [off_m(match, "located") for match in known if match["accepted"]]
+    errors_m = [off_m(match, "position") for match in known if match["accepted"]]
     median_m, p90_m = np.percentile(errors_m, (50, 90)).tolist()
     return {
         "set": folder.name,
@@ -161,7 +161,7 @@ def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> R
         "spacing_m": spacing_m,
         "places": built["places"],
         "queries": len(known),
-        "right": sum(off_m(match, "position") < footprint_m / 2 for match in known),
+        "right": sum(off_m(match, "place") < footprint_m / 2 for match in known),
         "accepted": len(errors_m),
         "accepted_wrong": sum(error_m > footprint_m / 4 for error_m in errors_m),
         "error": {"median_m": round(median_m, 1), "p90_m": round(p90_m, 1)},

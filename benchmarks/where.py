@@ -141,9 +141,8 @@ def _errors(of: Set, matches: dict[str, list[Row]], places: dict[str, Place]) ->
     errors: dict[str, dict[str, list[complex]]] = {}
     variances: dict[str, list[tuple[float, float]]] = {}
     for how, each in ((how, each) for how, found in matches.items() for each in found):
-        name, located = each["query"], each["located"]
-        is_laid = how == "before" or places[each["reference_image"]].pose is not None
-        if not each["accepted"] or located is None or not is_laid:
+        name, fix = each["query"], each["position"]
+        if fix is None or (how == "after" and places[each["place"]["image"]].pose is None):
             continue
         truths = {"GPS": of.tags.get(name)}
         if name in of.mosaic:
@@ -154,10 +153,10 @@ def _errors(of: Set, matches: dict[str, list[Row]], places: dict[str, Place]) ->
         if name in of.truth and len(near) >= _NEAREST:
             truths["pairs"] = of.truth[name] + np.mean([here[ref] - of.truth[ref] for ref in near[:_NEAREST]])
         for truth, at in truths.items():
-            fix = of.to_metres(located["lat_deg"], located["lon_deg"])
-            errors.setdefault(truth, {}).setdefault(how, []).append(fix - at)
+            here_m = of.to_metres(fix["lat_deg"], fix["lon_deg"])
+            errors.setdefault(truth, {}).setdefault(how, []).append(here_m - at)
             if how == "after":
-                var_east_m2, _, var_north_m2 = located["covariance_m2"]
+                var_east_m2, _, var_north_m2 = fix["covariance_m2"]
                 variances.setdefault(truth, []).append((var_east_m2, var_north_m2))
     return errors, variances
 
@@ -179,7 +178,7 @@ def generated(work: Path, what: str, lens: tuple[str, ...]) -> Row:
             for match in base.edgevpr("match", path, "--images", asked, *lens):
                 queries += how == "after"
                 if match["accepted"]:
-                    here, where = true[match["query"]], match["located"]
+                    here, where = true[match["query"]], match["position"]
                     off_m = offset_m(here.lat_deg, here.lon_deg, where["lat_deg"], where["lon_deg"])
                     errors[how].append(complex(*off_m))
                     if how == "after":

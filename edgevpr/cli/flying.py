@@ -23,12 +23,11 @@ from edgevpr.cli.shared import (
 )
 from edgevpr.core.config import with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import aligned, progress, shown, waiting
+from edgevpr.core.text import progress, shown, waiting
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_HEADINGS = ("query", "place", "reference image", "score", "accepted", "error m")
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
     "match.matching", "match.form", "match.candidates", "match.sequence",
@@ -76,12 +75,11 @@ def add(commands: Any) -> None:
 
 def run_match(args: Namespace) -> int:
     """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
-    from edgevpr.core.geodesy import distance_m
+    from edgevpr.cli.matched import match_of, of_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.hints import told_parts
     from edgevpr.runtime.recognise.opening import open_recogniser
-    from edgevpr.runtime.recognise.recognition import fields_of
     from edgevpr.techniques.card import weights_of
 
     config, known = config_of(args, args.config, map=args.map), told_parts(args.known)
@@ -97,16 +95,10 @@ def run_match(args: Namespace) -> int:
         if event.failed:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
-        fields = fields_of(event)
+        found.append(match_of(event))
         if known:
-            fields["hints"] = event.hints and event.hints.fields()
-        here, there = frame.position, fields["located"] or fields["position"]
-        if here and there:
-            away_m = distance_m(here.lat_deg, here.lon_deg, there["lat_deg"], there["lon_deg"])
-            fields["error_m"] = round(float(away_m), 2)
-        found.append(fields)
-    lines = aligned([_HEADINGS, *map(_matched, found)], left=3)
-    lines.append(f"{len(found)} queries, {sum(each['accepted'] for each in found)} accepted")
+            found[-1]["hints"] = event.hints and event.hints.fields()
+    lines = list(of_matches(found))
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
     if weights := weights_of(recogniser.technique.spec):
@@ -128,16 +120,6 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
         queries = list(read_track(positions).tags) if positions else []
     if why := lacking(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
         raise UsageError(why)
-
-
-def _matched(fields: dict[str, Any]) -> tuple[str, ...]:
-    """Return the row of a query in the table of `match`."""
-    accepted, off_m = "yes" if fields["accepted"] else "no", fields.get("error_m")
-    error = "-" if off_m is None else f"{off_m:.1f}"
-    if fields["place"] is None:
-        return shown(fields["query"]), "-", f"({fields['reason'].partition(':')[0]})", "-", accepted, error
-    image = shown(fields["reference_image"])
-    return shown(fields["query"]), str(fields["place"]), image, f"{fields['score']:.3f}", accepted, error
 
 
 def run_flight(args: Namespace) -> int:

@@ -67,14 +67,17 @@ def test_map_info_tells_what_is_inside(capsys, valley):
 def test_match_finds_every_place_and_says_what_it_cost(capsys, flight, valley):
     found = run_json(capsys, "match", valley, "--images", flight / "query", "--json")
     assert [each["query"] for each in found] == [f"{n}.png" for n in range(6)]
-    assert [each["reference_image"] for each in found] == [f"{n}.png" for n in range(6)]
+    assert [each["place"]["image"] for each in found] == [f"{n}.png" for n in range(6)]
     for each in found:
         assert each["accepted"] is True
         assert 0 < each["score"] <= 1
-        assert each["error_m"] == 0
         assert each["costs"]["t_encode_s"] > 0
         assert each["costs"]["used_mah"] > 0
-    assert found[2]["position"] == {"lat_deg": 50.002, "lon_deg": 8.0, "alt_m": 100.0}
+    place, fix = found[2]["place"], found[2]["position"]
+    assert place == {"number": 3, "image": "2.png", "lat_deg": 50.002, "lon_deg": 8.0, "alt_m": 100.0}
+    assert (fix["lat_deg"], fix["lon_deg"], fix["of_place"]) == (50.002, 8.0, True), "ahead, nothing else is known"
+    assert fix["accuracy_m"] == pytest.approx(111, abs=1), "the distance between places"
+    assert found[2]["from_gps_tag_m"] == 0
     assert main(["match", str(valley), "--images", str(flight / "query")]) == 0
     assert "6 queries, 6 accepted" in capsys.readouterr().out
 
@@ -89,7 +92,7 @@ def test_more_precision_accepts_no_more(capsys, flight, valley):
 
     assert accepted("0.999999") <= accepted("0.99") <= accepted("0.5")
     found = run_json(capsys, "match", valley, "--images", flight / "query", "--min-score", "0.9999", "--json")
-    assert not any(each["accepted"] for each in found)
+    assert not any(each["accepted"] or each["position"] or each["from_gps_tag_m"] for each in found)
 
 
 @pytest.mark.slow

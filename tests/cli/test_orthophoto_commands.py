@@ -59,8 +59,13 @@ def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, 
     taken = read_positions(flight / "positions.csv")
     off_m = []
     for query in found:
-        at, named = taken[query["query"]].position, query["position"]
+        at, named, fix = taken[query["query"]].position, query["place"], query["position"]
         off_m.append(distance_m(at.lat_deg, at.lon_deg, named["lat_deg"], named["lon_deg"]))
+        if fix:
+            away_m = distance_m(at.lat_deg, at.lon_deg, fix["lat_deg"], fix["lon_deg"])
+            assert away_m == pytest.approx(query["from_gps_tag_m"], abs=0.01)
+            assert away_m < 3, "places are 20 m apart: it is the fix, and not the place"
+            assert not fix["of_place"]
     assert sum(query["accepted"] for query in found) >= 6
     assert np.median(off_m) < 25
     assert max(off_m) < 50

@@ -57,7 +57,7 @@ def evaluated(capsys, flight, *argv):
 
 
 def places_of(found):
-    return [int(each["reference_image"].removesuffix(".png")) for each in found]
+    return [int(each["place"]["image"].removesuffix(".png")) for each in found]
 
 
 def test_match_follows_the_flight_and_accepts_nothing_before_the_sequence_is_full(capsys, flight, maps):

@@ -71,7 +71,7 @@ class Recognition:
 
 
 def fields_of(event: Recognition) -> dict[str, Any]:
-    """Return the event as a dict for the flight log (kind "query") and for `edgevpr match --json`.
+    """Return the event as a dict for the flight log (kind "query"). `edgevpr match --json` is made of it too.
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null

@@ -1,0 +1,108 @@
+"""Result of `edgevpr match`: the value of a query, for JSON, and the table with its summary, for people."""
+
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.core.text import aligned, nines, shown
+
+if TYPE_CHECKING:
+    from edgevpr.runtime.recognise.recognition import Recognition
+
+_NAME_COLUMNS, _REASON_COLUMNS = 17, 48  # with them a row has about 120 columns
+_FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
+_NUMBER = re.compile(r"\d+(\.\d+)?%?")
+_UNSURE = re.compile(r"confidence \d|\S+ sure by the flight")  # such reasons begin with figures that the table has
+
+
+def match_of(event: "Recognition") -> dict[str, Any]:
+    """Return what `match --json` says of a query: the fields of its event, but `position` is the fix (null: none), and
+    the best place is one object (null: none was found). `of_place`: the fix is the place's own position, since nothing
+    is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
+    """
+    from edgevpr.core.geodesy import distance_m
+    from edgevpr.runtime.recognise.recognition import fields_of
+
+    fields = fields_of(event)
+    number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
+    accuracy_m, fix = fields.pop("accuracy_m"), fields.pop("located")
+    tag, from_tag_m = event.frame and event.frame.position, None
+    if fix:
+        fix |= {"accuracy_m": accuracy_m, "of_place": not fix["places"]}
+        if tag:
+            from_tag_m = round(float(distance_m(tag.lat_deg, tag.lon_deg, fix["lat_deg"], fix["lon_deg"])), 2)
+    nowhere = dict.fromkeys(("lat_deg", "lon_deg", "alt_m"))
+    first = {
+        "query": fields.pop("query"),
+        "accepted": fields.pop("accepted"),
+        "reason": fields.pop("reason"),
+        "position": fix,
+        "from_gps_tag_m": from_tag_m,
+        "place": None if number is None else {"number": number, "image": image, **(at or nowhere)},
+    }
+    # The log rounds it to six digits, which make 1 of what is nearly sure.
+    sure = {} if event.confidence is None else {"confidence": event.confidence}
+    return first | fields | sure
+
+
+def of_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield the table of the queries `found` (see `match_of`), and its summary."""
+    sure = "confidence" if any("confidence" in each for each in found) else "score"
+    rows = aligned([("query", "accepted", sure, "place, picture"), *(_found(each, sure) for each in found)], left=4)
+    fixes = [each for each in found if each["position"]]
+    headings = _FIX_HEADINGS if any(each["from_gps_tag_m"] is not None for each in fixes) else _FIX_HEADINGS[:3]
+    heading, *where = aligned([headings, *map(_fix, fixes)], left=0) if fixes else [""]
+    width, at = max(map(len, rows)), iter(where)
+    yield f"{rows[0]:<{width}}  {heading}".rstrip()
+    for row, each in zip(rows[1:], found, strict=True):
+        yield f"{row:<{width}}  {next(at) if each['position'] else _why(each)}".rstrip()
+    yield from _summary(found, fixes)
+
+
+def _found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
+    """Return the left part of a row: the query, and the place that was found."""
+    place, by = match["place"], match.get(sure)
+    certain = "-" if by is None else nines(by) if sure == "confidence" else f"{by:.3f}"
+    named = f"{place['number']} {_short(place['image'])}" if place else "-"
+    return _short(match["query"]), "yes" if match["accepted"] else "no", certain, named
+
+
+def _fix(match: dict[str, Any]) -> tuple[str, ...]:
+    """Return the right part of a row with a fix; a star marks one that is the place's own position."""
+    fix, away_m = match["position"], match["from_gps_tag_m"]
+    accuracy = f"{fix['accuracy_m']:.1f}{'*' if fix['of_place'] else ' '}"
+    return f"{fix['lat_deg']:.6f}", f"{fix['lon_deg']:.6f}", accuracy, "-" if away_m is None else f"{away_m:.1f}"
+
+
+def _why(match: dict[str, Any]) -> str:
+    """Return the right part of a row without a fix: the reason in a few words."""
+    words = "its place has no position" if match["accepted"] else shown(_few(match["reason"]))
+    return textwrap.shorten(words, _REASON_COLUMNS, placeholder=" ...")
+
+
+def _few(reason: str) -> str:
+    """Return the first few words of a reason; "not sure enough" for one that says only how sure it is."""
+    return "not sure enough" if _UNSURE.match(reason) else re.split(r"[:;,] ", reason)[0]
+
+
+def _short(name: str) -> str:
+    """Return the name of a picture for the table; of a long one only the end, which tells it from others."""
+    name = shown(name)
+    return name if len(name) <= _NAME_COLUMNS else f"...{name[3 - _NAME_COLUMNS :]}"
+
+
+def _summary(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
+    refused = Counter(_NUMBER.sub("..", shown(_few(each["reason"]))) for each in found if not each["accepted"])
+    why = "; refused: " + ", ".join(f"{count} {reason}" for reason, count in refused.most_common()) if refused else ""
+    yield f"{len(found)} queries, {len(found) - refused.total()} accepted{why}"
+    if not fixes:
+        return
+    said = f"± m: 1 sigma of the fix, {median(each['position']['accuracy_m'] for each in fixes):.1f} m in the median"
+    if away_m := [each["from_gps_tag_m"] for each in fixes if each["from_gps_tag_m"] is not None]:
+        said += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
+    yield said
+    if of_place := sum(each["position"]["of_place"] for each in fixes):
+        yield f"*: {of_place} positions are those of the places: how far the query was from its place is not known"
