@@ -181,7 +181,7 @@ _OPENERS: dict[str, Callable[[str, int], Port]] = {
 _ADVICE = {  # by error, and whether the link is a serial one
     (errno.EADDRINUSE, False): "the port is in use by another program: stop that one, or take another port",
     (errno.EWOULDBLOCK, True): "the device is in use by another program: stop that one",
-    (errno.EACCES, True): "this user may not open it: `edgevpr doctor` says what to change (often its group, `dialout`)",
+    (errno.EACCES, True): "this user may not open it: `edgevpr doctor` says what to change (mostly group `dialout`)",
     (errno.EACCES, False): "the system does not permit it: take a port above 1023 and the address of one host",
 }
 
