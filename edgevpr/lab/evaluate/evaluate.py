@@ -29,6 +29,7 @@ from edgevpr.places.sequence import length_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, stage_energy_j
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
 from edgevpr.runtime.recognise.hints import told_parts
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.salience_gate import Gate
@@ -43,7 +44,7 @@ class TechniqueResult(metrics.Quality):
     `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of `QueryAnswer`;
     a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all references,
     `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1 (5.1).
-    `descriptor_bytes` is the RAM of a place, `fine_bytes` the size of its fine part on disk. Charges are for all
+    `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as `profile` says them. Charges are for all
     queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how many
     queries were matched together. `known`: that of `MatchOptions`. `weights`: origin of the network's weights (None: no
     network). `pcu`: filled in by `compare`, since it depends on all techniques compared.
@@ -104,7 +105,7 @@ def answered(
     prior, tags = known_of(options.known, dataset, technique.spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), own_meter()
     frames = progress(all_frames(source), source.total, f"{technique.spec.name}: references")
-    with mapped(frames, technique, meter, dataset.ref_dir) as (place_map, index):
+    with mapped(frames, technique, meter, dataset.ref_dir, progress) as (place_map, index):
         walk = Walk(technique, place_map, index, meter, options=options, gate=gate, prior=prior)
         walk.warm_up(dataset.queries[0].path)
         return list(answers(walk, dataset, progress, tags))
@@ -117,30 +118,43 @@ def own_meter() -> QueryMeter:
 
 @contextmanager
 def mapped(
-    frames: Iterable[Frame], technique: Technique, meter: QueryMeter, images: Path | None = None
+    frames: Iterable[Frame],
+    technique: Technique,
+    meter: QueryMeter,
+    images: Path | None = None,
+    progress: Progress[Any] = quietly,
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
     """Context manager: make a temporary map as `make_map` does; gives the map, open to read, and an index with all its
     places."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
-        make_map(path, frames, technique, images, meter)
+        make_map(path, frames, technique, images, meter, progress)
         with opened(path, technique) as both:
             yield both
 
 
 def make_map(
-    path: Path, frames: Iterable[Frame], technique: Technique, images: Path | None, meter: QueryMeter | None = None
+    path: Path,
+    frames: Iterable[Frame],
+    technique: Technique,
+    images: Path | None,
+    meter: QueryMeter | None = None,
+    progress: Progress[Any] = quietly,
 ) -> None:
     """Map `frames` in the new file `path`, then refine and calibrate the map as `map build` does. `images` is the
     folder that the frames come from (None: the map is not calibrated); `meter` None: that of `own_meter`."""
     meter = meter or own_meter()
+
+    def shown(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+        return progress(items, total, f"{technique.spec.name}: {label}")
+
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter)
         with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
-            refine_map(place_map, technique, images, quietly)
+            refine_map(place_map, technique, images, shown)
         if images:
             with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
-                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), quietly)
+                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), shown)
 
 
 @contextmanager
@@ -206,8 +220,8 @@ def summary(
         t_encode_s=t_encode_s,
         t_match_s=t_match_s,
         t_match_per_ref_s=t_match_s / references,
-        descriptor_bytes=technique.spec.row.nbytes,
-        fine_bytes=technique.spec.fine.nbytes if technique.spec.fine else 0,
+        descriptor_bytes=ram_bytes(technique.spec, length_of(technique.spec, options.sequence)),
+        fine_bytes=disk_bytes(technique.spec),
         u_encode=u_encode,
         u_match=u_match,
         ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),

@@ -5,8 +5,8 @@ import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -29,11 +29,18 @@ from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.evaluate import TechniqueResult, answered, compare, from_json, summary
 from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 from edgevpr.lab.evaluate.provenance import key_of, machine, stamp, today, versions
+from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE
 from edgevpr.techniques import create
 
+_LOOK_S = 1.0  # progress of the workers is looked at so often
+_CALIBRATED_BY = 60  # pictures, or twice as many ahead
 CURVE_TO = 25  # the largest K of the curve of recall@K
 # Matrix products are small here: more threads make them slower. And a result must not depend on the number of workers.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+# In a worker: for each row, how many pictures it has got done. Only the worker of a row writes its count, so that they
+# need no lock, which a worker that is killed might hold.
+_counts: list[Any] = []
 
 Failures = dict[tuple[str, str], str]  # by the names of set and row: a sentence on why it was not measured
 
@@ -49,6 +56,14 @@ class RowOnSet:
     settings: dict[str, str]
     dataset: Dataset
     path: Path
+
+    @property
+    def pictures(self) -> int:
+        """About how many pictures it takes: the references, those to refine and calibrate by, and the queries."""
+        references = len(self.dataset.references)
+        again = min(references, _CALIBRATED_BY) if self.row.technique == WITH_CONFIDENCE else 0
+        refined = references if again and self.settings.get("camera") == "nadir" else 0
+        return references + refined + again + len(self.dataset.queries)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +108,15 @@ def measure(plan: EvaluationPlan, folder: Path, workers: int, progress: Progress
     rows = list(_rows_on_sets(plan, sets, folder / "measured", failed))
     if left := [row for row in rows if not row.path.exists()]:
         (folder / "measured").mkdir(parents=True, exist_ok=True)
-        with _pool(min(workers, len(left))) as pool:
-            jobs = {pool.submit(_measured, row, workers): row for row in left}
-            for job in progress(as_completed(jobs), len(jobs), "rows"):
+        counts = multiprocessing.RawArray("L", len(left))
+        with _pool(min(workers, len(left)), counts) as pool:
+            jobs = [pool.submit(_measured, row, workers, at) for at, row in enumerate(left)]
+            pictures = [row.pictures for row in left]
+            for _ in progress(_done(jobs, pictures, counts), sum(pictures), f"{len(left)} rows: pictures"):
+                pass
+            for job, row in zip(jobs, left, strict=True):
                 if why := job.result():
-                    failed[jobs[job].set_name, jobs[job].label] = why
+                    failed[row.set_name, row.label] = why
     found = {
         name: _kept([row for row in rows if row.set_name == name and (name, row.label) not in failed]) for name in sets
     }
@@ -128,10 +147,10 @@ def _rows_on_sets(plan: EvaluationPlan, sets: dict[str, Dataset], folder: Path, 
 
 
 @contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+def _pool(workers: int, counts: Any) -> Iterator[ProcessPoolExecutor]:
     """Context manager: a pool of workers that die with this process and are killed at once if it is interrupted."""
     os.environ.update(_ENVIRONMENT)
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (os.getpid(), counts))
     try:
         yield pool
         pool.shutdown()
@@ -145,17 +164,37 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(parent_pid: int) -> None:
+def _done(jobs: Sequence[Future[Any]], pictures: Sequence[int], counts: Any) -> Iterator[None]:
+    """Yield once for each of the `pictures` of every job that is done, as its worker counts them, until all jobs are
+    done. What a job has left out counts as done with the job."""
+    told, running = 0, set(jobs)
+    while running:
+        running = wait(running, timeout=_LOOK_S).not_done
+        done = [of if job.done() else min(count, of) for job, of, count in zip(jobs, pictures, counts, strict=True)]
+        yield from [None] * (sum(done) - told)
+        told = sum(done)
+
+
+def _begin(parent_pid: int, counts: Any) -> None:
+    _counts.append(counts)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent process is to act on Ctrl-C
     end_with_parent(parent_pid)
 
 
-def _measured(row: RowOnSet, workers: int) -> str | None:
-    """In a worker: measure a row on a set and write its file. Return what went wrong, None if nothing. Even an
+def _measured(row: RowOnSet, workers: int, at: int) -> str | None:
+    """In a worker: measure the row `at` on a set and write its file. Return what went wrong, None if nothing. Even an
     unexpected exception, such as one of a library, ends one row only."""
+
+    def counted(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
+        before = _counts[0][at]
+        pictures = len(row.dataset.references) if label.endswith("refining") else total  # there the items are pairs
+        for done, item in enumerate(items, start=1):
+            yield item
+            _counts[0][at] = before + pictures * done // max(total, done)
+
     try:
         technique = create(row.row.technique, row.settings)
-        answers = answered(technique, row.dataset, row.row)
+        answers = answered(technique, row.dataset, row.row, counted)
         content = {
             "result": asdict(summary(technique, len(row.dataset.references), answers, row.row)),
             "answers": [asdict(answer) for answer in answers],

@@ -7,8 +7,6 @@ from edgevpr import techniques
 from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError, ModelError
-from edgevpr.places.index import bytes_per_place
-from edgevpr.places.sequence import bytes_beside_place
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight.choose import (
     Demand,
@@ -21,7 +19,7 @@ from edgevpr.runtime.preflight.choose import (
     options,
     preferred,
 )
-from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
+from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import counted_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -98,7 +96,7 @@ def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
     spec, costs = technique.spec, _costs_on(technique, board)
     costs = replace(
         costs,
-        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(recogniser.sequence),
+        ram_bytes_per_place=ram_bytes(spec, recogniser.sequence),
         candidates=recogniser.candidates if spec.fine else costs.candidates,
     )
     demand = Demand(

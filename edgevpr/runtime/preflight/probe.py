@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.contract import Technique
+from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
@@ -74,6 +74,16 @@ class TechniqueCosts:
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
 
+def ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
+    """Return the bytes of RAM that a place takes in a flight that matches `sequence` queries together."""
+    return bytes_per_place(spec) + bytes_beside_place(sequence)
+
+
+def disk_bytes(spec: TechniqueSpec) -> int:
+    """Return the bytes that a place takes in the map file, with the most landmarks that it may have."""
+    return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MOST_LANDMARK_BYTES if spec.cells else 0)
+
+
 def noise(count: int) -> list[Image]:
     """Return `count` random pictures, uint8 (480, 640). Every region has structure, so that matching costs the most it
     can."""
@@ -118,14 +128,13 @@ def probe(
         compare_once = _beyond(compare, one_more * candidates) + verify
     else:
         one_more, compare_once = compare * (1 / candidates) if spec.fine else scan, NO_COST
-    fine_bytes = spec.fine.nbytes if spec.fine else 0
     return TechniqueCosts(
         encode=_least([steps.encode for steps in [*small, *large]]),
         match_per_place=one_more,
         compare_once=compare_once,
         in_full=spec.in_full or 1,
-        ram_bytes_per_place=bytes_per_place(spec) + bytes_beside_place(bench.sequence),
-        disk_bytes_per_place=spec.coarse.nbytes + fine_bytes + (MOST_LANDMARK_BYTES if spec.cells else 0),
+        ram_bytes_per_place=ram_bytes(spec, bench.sequence),
+        disk_bytes_per_place=disk_bytes(spec),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
         candidates=candidates if spec.fine else None,
         scan_per_place=scan if spec.fine else NO_COST,

@@ -13,6 +13,8 @@ from edgevpr.core.text import markdown, progress
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate, from_json
 from edgevpr.lab.evaluate.tables import results_text
+from edgevpr.runtime.preflight.probe import probe
+from edgevpr.techniques import create
 
 HOG = {"w1": 64}
 COHOG = {"w1": 208}
@@ -55,8 +57,8 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert 0 < result.u_encode <= 1
     assert result.ah_total > 0
     assert "4S5200" in result.ah_assumes
-    sizes = {"hog": (7 * 7 * 36 * 2, 0), "cohog": (144, 144 * 32)}
-    assert (result.descriptor_bytes, result.fine_bytes) == sizes[name]
+    sizes = {"hog": 7 * 7 * 36 * 2 + 26, "cohog": 144 + 26}  # with number, position and heading
+    assert result.descriptor_bytes == sizes[name]
 
 
 def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
@@ -91,6 +93,12 @@ def test_progress_is_shown_for_references_and_queries(folder):
     assert "hog: queries  8/8  100 %" in out.getvalue()
 
 
+@pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir"})])
+def test_a_place_takes_as_many_bytes_as_profile_says(folder, name, settings):
+    result, costs = evaluate(name, load(folder), settings), probe(create(name, settings))
+    assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)
+
+
 def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
     printed = results_text(compare([evaluate("hog", load(folder), HOG)]))
     *tables, notes = printed.split("\n\n")
@@ -100,7 +108,7 @@ def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
         assert len(head) == len(row) <= 120
     found, _, paid = tables
     assert found.splitlines()[1].split()[:2] == ["hog", "0.875"]
-    assert "3528" in paid  # 7 x 7 blocks of 36 values, 2 bytes each
+    assert "3554" in paid  # 7 x 7 blocks of 36 values, 2 bytes each, and 26 for number, position and heading
     assert "8 references" in notes
     assert "t_e,max" in notes
 
