@@ -128,7 +128,8 @@ def map_build(args: Namespace) -> int:
     )
     unusable: list[ImageError] = []
     made = make_map(order, config, lambda error: leave_out(error, unusable), progress)
-    more: dict[str, Any] = {"refined": asdict(made.refined)} if made.refined else {}
+    more: dict[str, Any] = {"covered": asdict(made.covered)} if made.covered else {}
+    more |= {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
     show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made))

@@ -55,6 +55,7 @@ def of_refined(path: str, refined: "Refined") -> Iterator[str]:
     if refined.footprint_m:
         moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
         yield f"  position    {moved}; as recorded they scatter by {refined.recorded_sd_m:.1f} m"
+        yield f"  footprint   a picture shows {refined.footprint_m:.0f} m of ground along its longest side (median)"
     if refined.surveyed:
         yield f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:

@@ -8,9 +8,11 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from difflib import get_close_matches
 from itertools import zip_longest
+from threading import Event, Thread
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
@@ -20,6 +22,7 @@ _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 # Passwords and keys in the query part of an address, such as ?token=abc, which cameras use too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _COLUMNS, _TERMINAL_COLUMNS = 120, 79
+_SILENT_S = 5.0  # a line is written after so long a silence
 _SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
 
 
@@ -117,10 +120,11 @@ def progress(
 ) -> Iterator[T]:
     """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and an
     estimate of the remaining time. On a terminal the line, which `label` begins, is redrawn; elsewhere a new line is
-    written for every tenth of the work (of unknown total: for every 100 items)."""
+    written for every tenth of the work (of unknown total: for every 100 items), and if the last one is 5 s old."""
     stream = stream or sys.stderr
     terminal = stream.isatty()
     last_step, width, began_s = None, 0, clock()
+    last_s = began_s
     for done, item in enumerate(iterable, start=1):
         yield item
         if total:
@@ -129,14 +133,33 @@ def progress(
             text = f"{label}  {done}/{total}  {percent} %" + _time_left(clock() - began_s, done, total)
         else:
             step, text = done // (1 if terminal else 100), f"{label}  {done}"
-        if step != last_step:
-            last_step = step
+        if step != last_step or clock() - last_s >= _SILENT_S:
+            last_step, last_s = step, clock()
             # The cursor goes back to the start of the line, so that an error message is written over it.
             stream.write(f"{text:<{width}}\r" if terminal else f"{text}\n")
             width = len(text)
             stream.flush()
     if terminal and last_step is not None:
         stream.write("\n")
+
+
+@contextmanager
+def at_work(text: str, stream: TextIO | None = None) -> Iterator[None]:
+    """Write `text` and the seconds so far to `stream` (None: stderr) every 5 s until the body of `with` has ended."""
+    stream, ended, began_s = stream or sys.stderr, Event(), time.monotonic()
+
+    def tell() -> None:
+        while not ended.wait(_SILENT_S):
+            stream.write(f"{text}, {time.monotonic() - began_s:.0f} s so far\n")
+            stream.flush()
+
+    teller = Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        teller.join()
 
 
 def _time_left(passed_s: float, done: int, total: int) -> str:

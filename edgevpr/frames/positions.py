@@ -137,6 +137,14 @@ def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Pos
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
+def count_at_zero(csv_path: str | Path) -> int:
+    """Count the rows of a table of positions that lie at exactly (0, 0). Raises UsageError as `read_positions` does."""
+    return sum(
+        all(_number_in(row, name, *_NUMBERS[name], where) == 0 for name in ("lat", "lon"))
+        for where, row in _rows_of(csv_path, ("lat", "lon"))
+    )
+
+
 def _number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
     """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError for text that is
     no number within `low`..`high`."""

@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import splu
 
 from edgevpr.core.arrays import Complexes, Floats
+from edgevpr.core.text import at_work
 
 _ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
 _MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that ends them, as a share of a footprint
@@ -74,6 +75,7 @@ class Solved:
     ties_count: np.ndarray
 
 
+@at_work("refining: solving where all pictures lie")
 def solve(recorded: np.ndarray, ties: Ties) -> Solved:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
     north in metres. One standard deviation is estimated for all of them."""

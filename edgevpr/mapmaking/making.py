@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
-from edgevpr.frames.mask import mask_of
+from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.mapping import Gaps, MappingResult, build_map
+from edgevpr.mapmaking.beforehand import require_ahead, say_what_will_lack
+from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, covered_by
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import info_of
@@ -97,13 +99,14 @@ class MapOrder:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
-    those that have a position. `result`: counts of the frames read. `refined`, `calibration`: results of refining and
-    calibrating (None: not done)."""
+    those that have a position. `result`: counts of the frames read. `covered`: the ground of all places, as recorded
+    (None: too few positions). `refined`, `calibration`: results of refining and calibrating (None: not done)."""
 
     technique: str
     places: int
     with_position: int
     result: MappingResult
+    covered: Covered | None
     refined: "Refined | None"
     calibration: MapCalibration | None
 
@@ -115,15 +118,18 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     is_new = not (order.append and path.exists())
     mask = None if isinstance(pictures, Cuttings) else mask_of(config.source.mask)
     if is_new:
-        source, technique = _opened(order, config, None)
+        source, technique = _opened(order, config, None, mask)
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256 if mask else None)
     else:
         place_map = PlaceMap.open_for_adding(path)
-        source, technique = _opened(order, config, place_map)
+        source, technique = _opened(order, config, place_map, mask)
         say_other_mask(place_map, mask)
     with place_map:
         try:
+            if isinstance(pictures, FlownPictures):
+                places = len(place_map) if order.calibrate and kinds_of(technique.spec) else None
+                say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, source.total, places)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 technique,
@@ -138,6 +144,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
                 remove(path)
             raise
+        if covered := covered_by(place_map):
+            _log.info("%s", covered)
         refined, calibration = None, None
         if order.refine and technique.spec.cells is not None and isinstance(pictures, FlownPictures):
             images = pictures.source if Path(pictures.source).is_dir() else None
@@ -151,6 +159,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             places=len(place_map),
             with_position=info_of(place_map).with_position,
             result=result,
+            covered=covered,
             refined=refined,
             calibration=calibration,
         )
@@ -166,7 +175,14 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
         )
     with _needing_scipy():
         from edgevpr.mapmaking.refine import refine
-    return refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
+    refined = refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
+    if refined.is_mirrored:
+        _log.warning(
+            "lat and lon may be swapped, or the sign of one lost (south and west are negative): the pictures fit the "
+            "mirror image of their positions, so no place of %s is refined: check the columns, and make the map again",
+            place_map.path,
+        )
+    return refined
 
 
 def calibrate_map(
@@ -191,17 +207,21 @@ def calibrate_map(
     )
 
 
-def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None) -> tuple[Source, Technique]:
+def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None, mask: Mask | None) -> tuple[Source, Technique]:
     """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
-    map yet), else the best for the board."""
+    map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so."""
     is_cut, camera, here = isinstance(order.pictures, Cuttings), config.source.camera, load_board("this")
     if is_cut and camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     camera = "nadir" if is_cut else camera
     source = order.pictures.open()
     name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS if is_cut else None)
+    asks_camera = camera is None and place_map is None and "camera" not in order.parameters
+    if isinstance(order.pictures, FlownPictures) and asks_camera and (not name or camera_setting(name, "nadir")):
+        require_ahead(order.pictures.source, mask)
     if name is None or is_cut:
-        name = name or picked_technique(order.board, source.total or 1, camera)
+        with at_work("choosing a technique"):
+            name = name or picked_technique(order.board, source.total or 1, camera)
         settings = order.parameters | camera_setting(name, camera)
     else:  # a technique that knows no camera refuses one that was asked for
         settings = order.parameters | ({"camera": camera} if camera else {})

@@ -13,7 +13,7 @@ import numpy as np
 
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, ModelError
-from edgevpr.core.geodesy import distance_m
+from edgevpr.core.geodesy import distance_m, metres, moved
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.places.index import empty_index
 from edgevpr.places.mapfile import PlaceMap
@@ -84,6 +84,45 @@ class Gaps:
 def _frame_of(event: Recognition) -> Frame:
     assert event.frame is not None  # always set when frames are processed
     return event.frame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Covered:
+    """Ground covered by the places with a position, in the order mapped. `north_south_m`, `east_west_m`: its extent.
+    `lat_deg`, `lon_deg`: its middle. `track_m`: length of the way from place to place; `step_m`: median step of it."""
+
+    north_south_m: float
+    east_west_m: float
+    lat_deg: float
+    lon_deg: float
+    track_m: float
+    step_m: float
+
+    def __str__(self) -> str:
+        lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
+        high, wide, track, step = (f"{each / 1000:.1f} km" if each >= 1000 else f"{each:.0f} m" for each in lengths_m)
+        where = f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
+        return f"{where}; the track is {track} long, {step} from picture to picture (median)"
+
+
+def covered_by(place_map: PlaceMap) -> Covered | None:
+    """Measure the ground that a map covers; None with fewer than two positions."""
+    points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.outlines()]).reshape(-1, 2)
+    lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T
+    if len(lat_deg) < 2:
+        return None
+    east_m, north_m = metres(lat_deg, lon_deg)
+    steps_m = distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
+    middle_m = [float(each.max() + each.min()) / 2 for each in (east_m, north_m)]
+    middle = moved(float(lat_deg[0]), float(lon_deg[0]), *middle_m)
+    return Covered(
+        north_south_m=float(np.ptp(north_m)),
+        east_west_m=float(np.ptp(east_m)),
+        lat_deg=middle[0],
+        lon_deg=middle[1],
+        track_m=float(steps_m.sum()),
+        step_m=float(np.median(steps_m)),
+    )
 
 
 @dataclass(slots=True, kw_only=True)

@@ -14,7 +14,7 @@ that pose.
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +37,11 @@ from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 
 _LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
 _MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
+# Positions that miss the shape of the ties by more than this share of their spread are held against mirror images, and
+# one that misses by so much less is the right one. As recorded, sets miss by .01 to .36, and their mirror images by 1.3
+# times as much or more, also with 20 m of noise; with lat and lon exchanged, by .18 to 1.0, and mirrored by .7 or less.
+_MISSES, _MIRRORED = 0.15, 0.75
+_MIRROR_ASKS = 300  # places that the mirror image is fitted to
 _AMISS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
 _NEAREST = 8  # each place is compared with so many places recorded nearest
 _BEFORE = 2  # and with so many places mapped just before
@@ -76,7 +81,8 @@ class Refined:
     `ties`: number of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along
     one axis. `moved_m`, `position_sd_m`, `footprint_m`: medians of the places' moves, of the standard deviations of
     refined positions, and of footprints (None: no place).
-    `contradictory`: places whose recorded position the pictures contradict: (number, image, metres between the two)."""
+    `contradictory`: places whose recorded position the pictures contradict: (number, image, metres between the two).
+    `is_mirrored`: the ties fit the mirror image of the recorded positions and not these; then nothing is refined."""
 
     places: int
     without_position: int
@@ -88,6 +94,7 @@ class Refined:
     position_sd_m: float | None = None
     footprint_m: float | None = None
     contradictory: tuple[tuple[int, str, float], ...] = ()
+    is_mirrored: bool = False
 
 
 def refine(
@@ -118,7 +125,8 @@ def refine(
     if more:
         ties |= {pair: tie for pair in watch(more, len(more)) if (tie := look(*pair))}
         solved = solve(recorded, _ties_of(ties))
-    sure = _is_sure(solved)
+    is_mirrored = _is_mirrored(recorded_at, recorded, _ties_of(ties), solved)
+    sure = _is_sure(solved) & (not is_mirrored)
     _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
     amiss = sure & ~solved.recorded_counts & (off_m > _AMISS * solved.recorded_sd_m)
@@ -133,6 +141,7 @@ def refine(
         contradictory=tuple(
             (placed[at].place_id, placed[at].source_image, float(off_m[at])) for at in np.flatnonzero(amiss).tolist()
         ),
+        is_mirrored=is_mirrored,
     )
 
 
@@ -148,6 +157,36 @@ def _is_sure(solved: Solved) -> Bools:
     members = np.bincount(solved.component)[solved.component]
     is_sure: Bools = (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
     return is_sure
+
+
+def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, solved: Solved) -> bool:
+    """Tell whether the ties fit a mirror image of the recorded positions much better than these, as when lat and lon
+    are exchanged or a sign is lost. Places on one straight line cannot tell, and neither can groups of few places."""
+    some = slice(_MIRROR_ASKS)
+    misses = _misses(recorded, solved, some)
+    if misses < _MISSES:
+        return False
+    within = (ties.query < _MIRROR_ASKS) & (ties.place < _MIRROR_ASKS)
+    fewer = Ties(**{each.name: getattr(ties, each.name)[within] for each in fields(Ties)})
+    lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in recorded_at[some]]).T
+    mirrored = [recorded[some].conj()]
+    if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
+        east_m, north_m = metres(lon_deg, lat_deg)
+        mirrored.append(east_m + 1j * north_m)
+    return any(_misses(each, solve(each, fewer), some) < _MIRRORED * misses for each in mirrored)
+
+
+def _misses(recorded: Complexes, solved: Solved, some: slice) -> float:
+    """Return by how much the recorded positions of `some` places miss the solved ones (median), as a share of the
+    spread of the recorded ones. Only groups of enough places, connected by ties, count; 0 if there is none."""
+    component, here = solved.component[some], recorded[some]
+    members = np.bincount(component)
+    counts = members[component] >= _LEAST_GROUP
+    if not counts.any():
+        return 0.0
+    middle = (np.bincount(component, here.real) + 1j * np.bincount(component, here.imag)) / np.maximum(members, 1)
+    off_m, spread_m = abs(solved.position[some] - here)[counts], abs(here - middle[component])[counts]
+    return float(np.median(off_m) / max(np.median(spread_m), 1e-9))
 
 
 def _readable(place_map: PlaceMap) -> Iterator[Place]:

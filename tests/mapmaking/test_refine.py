@@ -87,7 +87,7 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
         before_m, _ = errors_m(place_map, poses)
     assert main(["map", "refine", str(map_path), "--json"]) == 0
     refined = json.loads(capsys.readouterr().out)
-    assert refined["refined"] == len(poses)
+    assert (refined["refined"], refined["is_mirrored"]) == (len(poses), False)
     ((place_id, image, off_m),) = refined["contradictory"]
     assert (place_id, image) == (10, "009.jpg")
     assert off_m == pytest.approx(GLITCH_M, abs=25)
@@ -105,6 +105,18 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
     with PlaceMap.open(map_path) as place_map:
         assert len(recorded) == len(place_map)
         assert refined["moved_m"] > 1
+
+
+@pytest.mark.parametrize("wrong", [lambda lat, lon: (lon, lat), lambda lat, lon: (lat, -lon)])
+def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wrong):
+    east_deg = 120.0  # the flight is moved to where its longitude could be a latitude
+    with PlaceMap.open_for_adding(map_path) as place_map, place_map.transaction():
+        for place in list(place_map.places()):
+            lat_deg, lon_deg = wrong(place.position.lat_deg, place.position.lon_deg - east_deg)
+            place_map.lay(place.place_id, Position(lat_deg, lon_deg), None)
+    assert main(["map", "refine", str(map_path), "--json"]) == 0
+    refined = json.loads(capsys.readouterr().out)
+    assert (refined["refined"], refined["is_mirrored"]) == (0, True)
 
 
 def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
