@@ -205,6 +205,8 @@ def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
     found = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
     assert found.weights == pytest.approx(start.weights, abs=0.01)
     assert found.bias < start.bias - 1
+    held = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6, pull_of_bias=1e6)
+    assert held.bias == pytest.approx(start.bias, abs=0.01)
 
 
 def test_the_part_that_shows_ground_moves_with_the_picture():
