@@ -37,7 +37,6 @@ class Row:
     kind: str
     right: bool
     near: bool
-    found: str
     score: float
     evidence: dict[str, float]
     veto: str | None = None
@@ -88,7 +87,6 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                     kind="own" if other == name else "foreign",
                     right=kind == "right",
                     near=kind == "beside",
-                    found=found,
                     score=event.best.match.score,
                     evidence=dict(event.evidence),
                     veto=event.reason if refused else None,
@@ -103,7 +101,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
         for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):
             if answer.evidence is not None:
                 told = {"kind": answer.way, "right": answer.right, "evidence": dict(answer.evidence)}
-                yield Row(map=name, set=name, query=str(answer.place_id), near=False, found="", score=0.0, **told)
+                yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **told)
 
 
 def kind_of_match(found: str, query: ScoredQuery | None, references: Sequence[str], index: PlaceIndex) -> str:

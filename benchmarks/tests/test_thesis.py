@@ -15,9 +15,3 @@ def test_pcu_of_a_table_row_is_that_of_its_printed_numbers():
     assert thesis_values.printed_pcu("CoHOG")[0] == pytest.approx(0.84 * math.log10(0.83 / 0.02 + 9))
     assert thesis_values.printed_pcu("AMOSNet")[2] is None  # it was trained on that set
     assert thesis_values.printed_pcu("Cross-Region-BoW")[1] == pytest.approx(0.81)  # the slowest: its precision
-
-
-def test_a_number_has_three_digits_and_no_exponent():
-    assert [thesis_values.three(each) for each in (None, 0.12345, 12.345, 1234.5, 159_999)] == [
-        "-", "0.123", "12.3", "1,230", "160,000",
-    ]  # fmt: skip
