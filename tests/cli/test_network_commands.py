@@ -63,7 +63,7 @@ def test_one_map_serves_all_forms(capsys, flight):
         capsys.readouterr()
         assert main(["match", str(path), "--images", str(flight / "query"), "--form", form, "--json"]) == 0
         found = json.loads(capsys.readouterr().out)
-        assert [each["reference_image"] for each in found] == [each["query"] for each in found]
+        assert [each["place"]["image"] for each in found] == [each["query"] for each in found]
     assert path.read_bytes() == content
     assert main(["match", str(path), "--images", str(flight / "query")]) == 0
     assert "Weights of tiny" in capsys.readouterr().out
@@ -110,8 +110,9 @@ def test_eval_measures_each_form_in_a_row_of_its_own(capsys, flight):
     code, found, _ = evaluated(capsys, flight, *flags)
     assert code == 0
     assert list(found) == ["tiny", "tiny 1bit", "hog", "hog 1bit", "cohog"]
-    assert found["tiny"]["descriptor_bytes"] == 32
-    assert found["tiny 1bit"]["descriptor_bytes"] == 8
+    beside = 26  # bytes of a place's number, position and heading
+    assert found["tiny"]["descriptor_bytes"] == 32 + beside
+    assert found["tiny 1bit"]["descriptor_bytes"] == 8 + beside
     assert found["tiny"]["weights"] == found["tiny 1bit"]["weights"] == "tiny: A tiny network (MIT; made by a test)"
     assert found["hog"]["weights"] is None
 

@@ -159,13 +159,13 @@ def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
     events = json.loads(capsys.readouterr().out)
     for event, pose in zip(events, asked, strict=True):
         assert event["accepted"], event["reason"]
-        where = event["located"]
+        where = event["position"]
         true = to_position(pose)
         off_m = np.subtract(offset_m(true.lat_deg, true.lon_deg, where["lat_deg"], where["lon_deg"]), common)
         assert np.hypot(*off_m) < 4
         assert abs((where["heading_deg"] - pose.heading_deg + 180) % 360 - 180) < 8
         assert where["height_ratio"] == pytest.approx(86 / 80, abs=0.08)
-        assert event["accuracy_m"] < 12, event
+        assert where["accuracy_m"] < 12, event
 
 
 def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
