@@ -137,7 +137,7 @@ def test_everything_is_made_and_made_again(installed_root):
 
 
 def test_the_first_configuration_is_one(installed):
-    assert main(["check", "--offline", "--config", str(installed / "etc/edgevpr/config.yaml")]) == 2  # no map is named yet
+    assert main(["check", "--offline", "--config", str(installed / "etc/edgevpr/config.yaml")]) == 2  # no map
 
 
 def test_a_dry_run_says_what_the_run_says_and_writes_nothing(installed_root, system, packages):
