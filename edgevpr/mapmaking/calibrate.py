@@ -12,7 +12,6 @@ which place it is (`Model.of_place`), and only as far as the results demand. The
 ground of the map stays as shipped: pictures of foreign ground agree by chance to much the same degree in every map.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
@@ -43,7 +42,6 @@ from edgevpr.runtime.recognise.evidence import (
     FEWEST_PLACES,
     MapCalibration,
     calibration_text,
-    kind_of,
     kinds_of,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
@@ -191,13 +189,12 @@ def _as_mapped(
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Choose the one of `kinds` of evidence that most answers have, fit its confidence model to them, and count the
-    answers that it accepts at the `precision` asked for."""
-    counts = Counter(kind_of(answer.evidence) for answer in answers if answer.evidence)
-    kind = max(kinds, key=lambda kind: counts[kind])
-    of_kind = [answer for answer in answers if answer.evidence and kind_of(answer.evidence) == kind]
-    model = adapted(prior(kind), kind, of_kind, f"{len(of_kind)} answers of the map itself")
-    sure = Sureness({each: prior(each) for each in kinds} | {kind: model}, precision)
+    """Fit the models of all `kinds` of evidence to the answers, and count those that are accepted at the `precision`
+    asked for. A best place that was not worth a look at its landmarks has none that agree."""
+    known = [replace(each, evidence={"landmarks": 0.0, **each.evidence}) for each in answers if each.evidence]
+    made_of = f"{len(known)} answers of the map itself"
+    models = {kind: adapted(prior(kind), kind, known, made_of) for kind in kinds}
+    sure = Sureness(models, precision)
     accepted = [
         answer
         for answer in answers
@@ -209,7 +206,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
         seen = answer.evidence if answer.right and not answer.refused else None
         of_place.setdefault(answer.place_id, []).append(sure.confidence(seen) if seen else 0.0)
     return MapCalibration(
-        models={kind: model},
+        models=models,
         made=date.today().isoformat(),
         asked=len(there),
         precision=precision,
