@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
-from edgevpr.core.arrays import Complexes, Floats
+from edgevpr.core.arrays import Array, Complexes, Floats
 from edgevpr.core.text import at_work
 
 _ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
@@ -36,7 +36,6 @@ _LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions: the least, and 
 _GONE = 0.1  # a tie or position with a smaller weight counts as contradicting the others
 _MEDIAN_OF_FOUR = 1.832  # median length of a vector of four standard normal numbers
 _NOTHING = 1e-6  # added to the diagonal, so that places without ties can be solved
-_AT_ONCE = 256  # columns of the inverse that are computed together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +145,7 @@ class _Graph:
             by_recorded = _agree(abs(self.position - self._recorded) / sd_m) / sd_m**2
             jacobian, rest = self._linear(*map(np.sqrt, (by_step, by_turn, by_recorded)))
             normal = (jacobian.conj().T @ jacobian).tocsc()
-            move = splu(normal + _NOTHING * identity(2 * count)).solve(-(jacobian.conj().T @ rest))
+            move = _factored(normal).solve(-(jacobian.conj().T @ rest))
             # A long move is shortened: far from the solution the logs are not linear.
             share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
             self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
@@ -223,14 +222,56 @@ def _scatter(residuals: np.ndarray) -> float:
     return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
 
 
-def _inverse_diagonal(normal: csc_matrix) -> np.ndarray:
-    """Return the diagonal of the inverse of a Hermitian matrix (M, M), float (M,)."""
-    size = normal.shape[0]
-    solver = splu(normal + _NOTHING * identity(size))
-    found = np.empty(size)
-    for start in range(0, size, _AT_ONCE):
-        some = np.arange(start, min(start + _AT_ONCE, size))
-        units = np.zeros((size, len(some)), complex)
-        units[some, some - start] = 1
-        found[some] = solver.solve(units)[some, some - start].real
-    return found
+def _factored(normal: csc_matrix) -> SuperLU:
+    """Factor a Hermitian positive definite matrix (M, M) as L D L^H, its rows and columns in an order that keeps L
+    sparse. The factor `U` is D L^H."""
+    filled = normal + _NOTHING * identity(normal.shape[0])
+    return splu(filled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _inverse_diagonal(normal: csc_matrix) -> Floats:
+    """Return the diagonal of the inverse of a Hermitian positive definite matrix (M, M), float (M,).
+
+    Only entries of the inverse where L has entries are computed, from the last column to the first (Takahashi, Fagan
+    and Chen 1973). A column needs the block of the inverse over its rows. That is a part of the block of the column's
+    parent, which is the column with the number of its first row.
+    """
+    factored = _factored(normal)
+    lower, pivots = factored.L.tocsc(), factored.U.diagonal().real
+    lower.sort_indices()
+    below = _rows_below(lower)
+    waiting = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # children of a column
+    blocks: dict[int, Complexes] = {}
+    found = np.empty(len(below))
+    for column in reversed(range(len(below))):
+        rows, given = below[column], slice(lower.indptr[column] + 1, lower.indptr[column + 1])
+        block = np.empty((len(rows) + 1, len(rows) + 1), complex)
+        block[0, 0] = 1 / pivots[column]
+        if len(rows):
+            parent = int(rows[0])
+            inside = np.searchsorted(np.append(parent, below[parent]), rows)
+            block[1:, 1:] = blocks[parent][np.ix_(inside, inside)]
+            factors = np.zeros(len(rows), complex)
+            factors[np.searchsorted(rows, lower.indices[given])] = lower.data[given]
+            block[1:, 0] = -block[1:, 1:] @ factors
+            block[0, 1:] = block[1:, 0].conj()
+            block[0, 0] -= np.vdot(factors, block[1:, 0])
+            waiting[parent] -= 1
+            if not waiting[parent]:
+                del blocks[parent]
+        if waiting[column]:
+            blocks[column] = block
+        found[column] = block[0, 0].real
+    in_order: Floats = found[factored.perm_c]
+    return in_order
+
+
+def _rows_below(lower: csc_matrix) -> list[Array]:
+    """Return the numbers of the rows below the diagonal where a column of the factor L (M, M) may have entries: M
+    arrays, int (R,), ascending. An entry that is zero by chance, and so not stored, counts."""
+    starts, ends = lower.indptr[:-1] + 1, lower.indptr[1:]
+    below = [lower.indices[start:end] for start, end in zip(starts, ends, strict=True)]
+    for rows in below:
+        if len(rows):
+            below[rows[0]] = np.union1d(below[rows[0]], rows[1:])
+    return below

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix, identity
 
-from edgevpr.mapmaking.graph import Ties, solve
+from edgevpr.mapmaking.graph import Ties, _inverse_diagonal, solve
 
 FOOTPRINT_M, SPACING_M = 60.0, 15.0
 STEP_SD, TURN_SD, RECORDED_SD_M = 0.01, 0.03, 8.0
@@ -111,3 +112,15 @@ def test_places_without_ties_stay_where_they_were_recorded():
     np.testing.assert_allclose(solved.position[len(position) :], recorded[len(position) :], atol=0.01)
     assert (solved.log_var[len(position) :] > 1).all()
     assert len(np.unique(solved.component)) == 1 + len(position)
+
+
+def test_variances_are_those_of_the_whole_inverse_also_where_entries_cancel():
+    rng = np.random.default_rng(1)
+    for _ in range(400):  # with so few different values, entries of the factor are zero by chance in one of 400
+        places, ties = int(rng.integers(5, 60)), int(rng.integers(60, 200))
+        values, columns = rng.choice([-1, 0, 0, 1, 1j, -1], (2, ties)), rng.integers(0, places, (2, ties))
+        rows = np.tile(np.arange(ties), (2, 1))
+        jacobian = coo_matrix((values.ravel().astype(complex), (rows.ravel(), columns.ravel())), (ties, places)).tocsc()
+        normal = (jacobian.conj().T @ jacobian + identity(places)).tocsc()
+        expected = np.linalg.inv(normal.toarray()).diagonal().real
+        np.testing.assert_allclose(_inverse_diagonal(normal), expected, rtol=1e-4)
