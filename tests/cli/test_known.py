@@ -48,7 +48,7 @@ def run_json(capsys, *argv):
 
 
 def evaluated(capsys, folder, *argv):
-    flags = ("--data", folder, "--techniques", "cohog", "--camera", "nadir")
+    flags = ("--data", folder, "--techniques", "cohog", "--camera", "nadir", "--param", "cohog.w1=256")
     return run_json(capsys, "eval", *flags, *argv)["techniques"]["cohog"]
 
 

@@ -149,7 +149,7 @@ def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     monkeypatch.setattr(calibrating, "asked_of", lambda technique: PLACES)
-    down = create("cohog", {"camera": "nadir", "w1": 256})
+    down = create("cohog", {"camera": "nadir", "w1": 208})
     tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
 
     def levelling():

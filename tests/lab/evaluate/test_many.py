@@ -144,17 +144,33 @@ def is_running(pid):
 
 def begun(folder, out):
     """A run of two workers that has written one result and is at work on another."""
-    process = command(folder, out, "--param", "cohog.w1=208", "--exact", "--workers", "2")
+    process = command(folder, out, *LONG_FLAGS)
     while not results_in(out):
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.005)
     return process
 
 
+LONG_FLAGS = ["--param", "cohog.w1=208", "--exact", "--workers", "2"]
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    return make_set(tmp_path_factory.mktemp("sets") / "long", places=24)
+
+
+@pytest.fixture(scope="module")
+def whole(long, tmp_path_factory):
+    """The results on the long set of a run that nobody stopped."""
+    out = tmp_path_factory.mktemp("whole")
+    assert main(arguments(long, out, *LONG_FLAGS)) == 0
+    return json.loads((out / "results.json").read_text())
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
-    folder, out = make_set(tmp_path / "long", places=24), tmp_path / "out"
-    process = begun(folder, out)
+def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, long, whole, how):
+    out = tmp_path / "out"
+    process = begun(long, out)
     workers = workers_of(process.pid)
     process.send_signal(how)
     said = process.communicate()[1].decode()
@@ -164,16 +180,13 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, how):
     assert "Traceback" not in said
     assert not (out / "results.json").exists()
     kept = results_in(out)
-    flags = ["--param", "cohog.w1=208", "--exact", "--workers", "2"]
-    assert main(arguments(folder, out, *flags)) == 0
+    assert main(arguments(long, out, *LONG_FLAGS)) == 0
     assert kept.items() <= results_in(out).items()
-    assert main(arguments(folder, tmp_path / "whole", *flags)) == 0
-    results = [json.loads((each / "results.json").read_text()) for each in (out, tmp_path / "whole")]
-    assert without_costs(results[0]) == without_costs(results[1])
+    assert without_costs(json.loads((out / "results.json").read_text())) == without_costs(whole)
 
 
-def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path):
-    process = begun(make_set(tmp_path / "long", places=24), tmp_path / "out")
+def test_a_worker_that_was_killed_ends_the_run_with_a_sentence(tmp_path, long):
+    process = begun(long, tmp_path / "out")
     for pid in workers_of(process.pid):
         os.kill(pid, signal.SIGKILL)
     said = process.communicate()[1].decode()
