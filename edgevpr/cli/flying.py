@@ -109,7 +109,7 @@ def run_match(args: Namespace) -> int:
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
     """Raise UsageError if no query of `match`, or no place of the map, has what is to be known of it."""
-    from edgevpr.frames.positions import read_track
+    from edgevpr.frames.positions import find_track, read_track
     from edgevpr.frames.source import tags_of
     from edgevpr.runtime.recognise.hints import lacking
 
@@ -117,7 +117,8 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     if source.is_dir():
         queries = list(tags_of(source, positions).values())
     else:
-        queries = list(read_track(positions).tags) if positions else []
+        table = positions or find_track(source)
+        queries = list(read_track(table).tags) if table else []
     if why := lacking(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
         raise UsageError(why)
 

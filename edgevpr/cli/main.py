@@ -9,8 +9,9 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import evaluation, flying, maps, networks, profile, review, simulation, top
+from edgevpr.cli import evaluation, flying, maps, networks, positions, profile, review, simulation, top
 from edgevpr.cli.screen import LineFormatter, guarded_output
+from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
 
@@ -23,11 +24,15 @@ EXIT_CODES = {
     "was begun, and trying again does not help: systemd starts the service no more. `check` ends so where `run` does.",
     130: "Stopped by Ctrl-C. What is ended so (`run`, `top`, `simulate autopilot`) ends with 0 or 1.",
 }
-_GROUPS = (maps, flying, top, review, profile, evaluation, simulation, networks)
+_GROUPS = (positions, maps, flying, top, review, profile, evaluation, simulation, networks)
 
 
 def program() -> None:
     """Run the command in `sys.argv`, and end the process with its exit code."""
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks how a line may go on
+        import argcomplete
+
+        argcomplete.autocomplete(command_line())
     code = main()
     if threading.active_count() > 1:
         # A capture thread hangs in a stream that does not answer. In a normal exit FFmpeg would abort Python.
@@ -44,12 +49,15 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    args = command_line().parse_args(argv)
+    args, unknown = command_line().parse_known_args(argv)
+    if unknown:
+        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     # Set before NumPy is imported: matrix products are small here, and more threads only make them slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter("edgevpr: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if args.debug else logging.INFO, handlers=[handler])
+    logging.getLogger("edgevpr").setLevel(logging.WARNING if args.quiet else logging.NOTSET)
     try:
         code: int = args.run(args)
         return code
@@ -80,11 +88,12 @@ def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code
 @cache  # making it takes two thirds of the time of a short command, and one process may run many
 def command_line() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = argparse.ArgumentParser(
-        prog="edgevpr", description="Visual place recognition for the companion computer of a small drone."
-    )
+    parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")
     parser.add_argument("--version", action="version", version=f"edgevpr {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser.add_argument(
+        "-q", "--quiet", action="store_true", help="show no progress, and of what happens only warnings"
+    )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for group in _GROUPS:
         group.add(commands)

@@ -1,29 +1,47 @@
 """Parts that the commands share: flags, the configuration made from them, and the printing of results and errors."""
 
 import json
+import re
 import sys
-from argparse import SUPPRESS, ArgumentParser, Namespace
+from argparse import SUPPRESS, ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from textwrap import wrap
+from typing import Any, NoReturn, TextIO, TypeVar
 
+from edgevpr.cli.examples import shown_examples
 from edgevpr.core.config import Config, keys_of, load_config
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import shown
+from edgevpr.core.text import meant, shown
 
 T = TypeVar("T")
 _KEY = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
+_HELP_COLUMNS = 78
 _UNITS = {
     "s": " s", "ms": " ms", "m": " m", "mb": " MB", "bytes": " bytes", "c": " °C", "deg": "°", "mah": " mAh", "w": " W"
 }  # fmt: skip
+
+
+class Parser(ArgumentParser):
+    """Parser of a command; where a word is wrong, its error names the one that may be meant."""
+
+    def error(self, message: str) -> NoReturn:
+        wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)|unrecognized arguments: (\S+)", message)
+        if wrong:
+            known = re.findall(r"[\w-]+", wrong[2]) if wrong[2] else list(self._option_string_actions)
+            hint = meant(wrong[1] or wrong[3].partition("=")[0], known, "")
+            message = f"{message}; {hint}" if hint else message
+        super().error(message)
 
 
 def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
     """Add a command that calls `run` with the parsed arguments, and return its parser. `text` is its help; `run`
     returns the exit code."""
     parser = _parser(commands, name, text)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, parser=parser)
+    parser.epilog = shown_examples(parser.prog.partition(" ")[2])
+    parser.formatter_class = RawDescriptionHelpFormatter
     return parser
 
 
@@ -33,9 +51,11 @@ def group(commands: Any, name: str, text: str) -> Any:
 
 
 def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
-    parser: ArgumentParser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    description = "\n".join(wrap(text[0].upper() + text[1:] + ".", _HELP_COLUMNS))
+    parser: ArgumentParser = commands.add_parser(name, help=text, description=description)
     # Accepted after the command too, where users type it.
     parser.add_argument("--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
+    parser.add_argument("-q", "--quiet", action="store_true", default=SUPPRESS, help=SUPPRESS)
     return parser
 
 
@@ -63,7 +83,7 @@ def add_positions(parser: ArgumentParser) -> None:
         "--positions",
         metavar="CSV",
         help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images); of a video "
-        "time,lat,lon[,...], in seconds from its first frame",
+        "time,lat,lon[,...], in seconds from its first frame; `edgevpr positions` makes both",
     )
 
 

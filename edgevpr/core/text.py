@@ -1,6 +1,7 @@
 """Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, and progress."""
 
 import json
+import logging
 import math
 import os
 import re
@@ -111,6 +112,11 @@ def _plain(value: Any) -> Any:
     return without_passwords(str(value))
 
 
+def is_quiet() -> bool:
+    """Return True if edgevpr is to log warnings only: then no progress is shown either."""
+    return logging.getLogger("edgevpr").level > logging.INFO
+
+
 def progress(
     iterable: Iterable[T],
     total: int,
@@ -121,6 +127,9 @@ def progress(
     """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and an
     estimate of the remaining time. On a terminal the line, which `label` begins, is redrawn; elsewhere a new line is
     written for every tenth of the work (of unknown total: for every 100 items), and if the last one is 5 s old."""
+    if is_quiet():
+        yield from iterable
+        return
     stream = stream or sys.stderr
     terminal = stream.isatty()
     last_step, width, began_s = None, 0, clock()
@@ -153,6 +162,8 @@ def at_work(text: str, stream: TextIO | None = None) -> Iterator[None]:
             stream.write(f"{text}, {time.monotonic() - began_s:.0f} s so far\n")
             stream.flush()
 
+    if is_quiet():
+        ended.set()
     teller = Thread(target=tell, daemon=True)
     teller.start()
     try:

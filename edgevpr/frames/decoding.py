@@ -31,13 +31,14 @@ _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up f
 
 
 def open_pictures(
-    uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None
+    uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None, form: str | None = None
 ) -> "WholePictures | None":
     """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). Returns None if it cannot be opened or has no pictures."""
+    for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). Returns None if it cannot be
+    opened or has no pictures."""
     with av.logging.Capture() as said:
         try:
-            container = av.open(uri, options=options, timeout=timeouts_s)
+            container = av.open(uri, format=form, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError):
             return None
     if container.streams.video:

@@ -118,7 +118,7 @@ def read_xmp(path: str | Path) -> GeoTag:
     for name in ("drone-dji:Gimbal{}Degree", "drone-parrot:Camera{}Degree"):
         # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
         if (angles := _yaw_pitch_roll(values, name)) and any(angles):
-            heading_deg, roll_deg, pitch_deg = _from_straight_down(*angles)
+            heading_deg, roll_deg, pitch_deg = from_straight_down(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
     # In the tags of Pix4D, 0 is straight down; a camera without an IMU writes zeros, which are ignored.
     if (angles := _yaw_pitch_roll(values, "Camera:{}")) and any(angles):
@@ -139,7 +139,7 @@ def _number(values: Mapping[str, bytes], name: str, low: float = -360.0, high: f
     return None
 
 
-def _from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+def from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
     where roll and pitch are the camera's deviation from straight down. All in degrees."""
     # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down

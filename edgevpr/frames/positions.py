@@ -4,7 +4,7 @@ certain seconds. The sources of frames read them; `where` in this module is "FIL
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.files import read_file
+from edgevpr.core.files import read_file, write_whole
 from edgevpr.core.types import Position
 
 ALT_M = (-1000.0, 100_000.0)  # plausible altitudes
@@ -29,6 +29,7 @@ _NUMBERS = {
     "height_m": ALT_M,
     "rel_alt": ALT_M,
 }
+_WRITTEN = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
 _NEEDED_COLUMNS, _TRACK_COLUMNS = ("file", "lat", "lon"), ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
@@ -58,6 +59,12 @@ def find_positions(folder: str | Path) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
+def find_track(video: str | Path) -> Path | None:
+    """Return the path of the table of positions beside a video, of the same name and .csv, or None."""
+    table = Path(video).with_suffix(".csv")
+    return table if table.is_file() else None
+
+
 def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     """Read a positions.csv. Returns the data of each image by its file name.
 
@@ -71,11 +78,24 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
     """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
-    with open(csv_path, "w", encoding="utf-8", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m", "time"))
-        for name, tag in tags.items():
-            table.writerow((name, *_numbers_of(tag), tag.t_utc_s))
+    _write(
+        csv_path, ("file", *_WRITTEN, "time"), ((name, *_numbers_of(tag), tag.t_utc_s) for name, tag in tags.items())
+    )
+
+
+def write_track(csv_path: str | Path, track: "Track") -> None:
+    """Write the table of positions of a video. `read_track` gives exactly the same track back."""
+    rows = ((t_s, *_numbers_of(tag)) for t_s, tag in zip(track.t_s, track.tags, strict=True))
+    _write(csv_path, ("time", *_WRITTEN), rows)
+
+
+def _write(csv_path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    text = io.StringIO(newline="")
+    table = csv.writer(text)
+    table.writerow(header)
+    table.writerows(rows)
+    content = text.getvalue().encode()
+    write_whole(Path(csv_path), lambda path: path.write_bytes(content))
 
 
 def _numbers_of(tag: GeoTag) -> tuple[Any, ...]:
@@ -189,7 +209,7 @@ def parse_time(text: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class VideoTrack:
+class Track:
     """Positions and attitudes along a video. `t_s` are seconds from its first frame, ascending, and `tags` the data at
     each, all with a position. `path` is the table's file, for messages."""
 
@@ -230,7 +250,7 @@ class VideoTrack:
             )
 
 
-def read_track(csv_path: str | Path) -> VideoTrack:
+def read_track(csv_path: str | Path) -> Track:
     """Read the table of positions of a video: the columns time (seconds from its first frame, ascending), lat, lon and,
     optionally, those of a positions.csv. Rows without a position are ignored. Raises UsageError for a file that cannot
     be read, a wrong value, and a table without any position."""
@@ -247,4 +267,4 @@ def read_track(csv_path: str | Path) -> VideoTrack:
         tags[tag.t_utc_s] = replace(tag, t_utc_s=None)
     if not tags:
         raise UsageError(f"{csv_path} has no line with time, lat and lon: the positions of a video need them.")
-    return VideoTrack(Path(csv_path), tuple(tags), tuple(tags.values()))
+    return Track(Path(csv_path), tuple(tags), tuple(tags.values()))

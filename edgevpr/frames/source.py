@@ -18,10 +18,11 @@ from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, cv2, list_images, read_image
-from edgevpr.frames.positions import GeoTag, find_positions, read_positions, read_track
+from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, Refusal
 
 _READ_TIMEOUT_S = 1.0
+_RIBBON = re.compile(r"rpicam(:\d+)?")
 _ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|udp://.*:\d+.*")  # udp://:PORT: on all interfaces
 
 
@@ -162,7 +163,8 @@ def open_source(
 
     `step_s`: least video time in seconds between two frames of a video file (None: every frame).
     `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
-    video the table that `positions.read_track` reads (None: frames have no positions).
+    video the table that `positions.read_track` reads (None: the .csv of the same name beside it, else frames have no
+    positions).
     `live`: allow cameras and streams, which never end. A stream that is not there yet is opened as soon as it is.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
     for a folder that is flown by its recorded times, the `recorded_steps` (empty: it is not).
@@ -185,7 +187,8 @@ def open_source(
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
-    return VideoSource(path, step_s or 0.0, clock, only, track=read_track(positions) if positions else None)
+    table = positions or find_track(path)
+    return VideoSource(path, step_s or 0.0, clock, only, track=read_track(table) if table else None)
 
 
 def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Iterator[Frame | None]:
@@ -203,11 +206,16 @@ def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Itera
 def is_live(uri: str) -> bool:
     """Return True if `uri` names a camera or a stream; anything else is a recording."""
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
-    return "://" in uri or is_device or uri.lower().endswith(".sdp")
+    return "://" in uri or is_device or uri.lower().endswith(".sdp") or bool(_RIBBON.fullmatch(uri))
 
 
 def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
     """Return a function that opens the camera or stream `uri`. Raises SourceError if that can never succeed."""
+    if _RIBBON.fullmatch(uri):
+        from edgevpr.frames.ribbon import open_ribbon, require_program  # loads FFmpeg
+
+        require_program()
+        return lambda: open_ribbon(uri, clock)
     if "://" in uri:
         if not _ADDRESS.fullmatch(uri):
             raise SourceError(

@@ -37,12 +37,12 @@ _USUAL_OF, _AS_USUAL = 9, 1.5  # number of waits whose median is the usual one, 
 _WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due to the path, and not to congestion
 
 
-def open_stream(uri: str, clock: Callable[[], float]) -> "StreamCapture | None":
+def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -> "StreamCapture | None":
     """Open a network stream or an .sdp file, with time-outs; None if it cannot be opened. `clock` is the monotonic
-    clock, in seconds."""
+    clock, in seconds; `form` FFmpeg's name of the format (None: it finds out)."""
     opened_s = clock()
     options = _OPTIONS if "://" in uri else _SDP_OPTIONS
-    whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
+    whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S), form)
     return StreamCapture(whole, clock, opened_s) if whole else None
 
 

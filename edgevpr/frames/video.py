@@ -3,13 +3,14 @@
 import math
 from collections import deque
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
 from edgevpr.frames.decoding import open_pictures
-from edgevpr.frames.positions import GeoTag, VideoTrack
+from edgevpr.frames.positions import GeoTag, Track, parse_time
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource, tagged
 
@@ -19,6 +20,20 @@ if TYPE_CHECKING:
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 _USUAL_RATE_HZ = 25.0
 _CUT_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
+
+
+def recorded_at(path: Path) -> tuple[float | None, float]:
+    """Return when a video was begun, in seconds since 1970 by the clock of the camera (None: it does not say), and how
+    many seconds it lasts (0: unknown). Raises SourceError for a file that is no video."""
+    whole = open_pictures(str(path), {})
+    if whole is None:
+        raise SourceError(f"{path} is not a video that can be decoded: give the video file of the positions.")
+    said = {**whole.container.metadata, **whole.stream.metadata}.get("creation_time")
+    lasts_s = (whole.container.duration or 0) / 1e6
+    whole.close()
+    with suppress(ValueError, OverflowError):
+        return (parse_time(said) if said else None), lasts_s
+    return None, lasts_s
 
 
 class VideoSource(RecordingSource):
@@ -35,7 +50,7 @@ class VideoSource(RecordingSource):
         clock: Callable[[], float],
         only: Collection[str] | None = None,
         *,
-        track: VideoTrack | None = None,
+        track: Track | None = None,
     ):
         super().__init__(only)
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track

@@ -18,7 +18,7 @@ from edgevpr.core.text import at_work
 from edgevpr.frames.exif import read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
-from edgevpr.frames.positions import count_at_zero, find_positions, read_positions
+from edgevpr.frames.positions import count_at_zero, find_positions, find_track, read_positions
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
 from edgevpr.runtime.recognise.evidence import FEWEST_PLACES
@@ -40,7 +40,8 @@ _MANY_HZ = 4.0  # more places a second of a video show nearly the same
 def say_what_will_lack(uri: str, positions: Path | None, rate_hz: float | None, total: int, places: int | None) -> None:
     """Warn of what the map will lack. `uri`, `positions` and `rate_hz`: see `FlownPictures`. `total`: number of frames
     (0: unknown). `places`: number of those in the map already (None: the map is not to be calibrated)."""
-    table, is_placed = positions, positions is not None
+    table = positions or find_track(uri)
+    is_placed = table is not None
     if Path(uri).is_dir():
         table = positions or find_positions(uri)
         tags = read_positions(table) if table else {}
@@ -55,7 +56,9 @@ def say_what_will_lack(uri: str, positions: Path | None, rate_hz: float | None, 
         )
     if not is_placed:
         _log.warning(
-            "no position was found, and without one no fix can be sent: give --positions, or pictures with GPS"
+            "no position was found, and without one no fix can be sent: run edgevpr positions %s --images %s",
+            next(Path(uri).parent.glob(f"{Path(uri).stem}.[sS][rR][tT]"), "LOG_OR_TRACK"),
+            uri,
         )
     if total and places is not None and total + places < FEWEST_PLACES:
         text = "%d places at most: a map of fewer than %d cannot be calibrated, and finds little: give more pictures"

@@ -1,7 +1,11 @@
 """The commands as a user types them, and one clear sentence for everything that is wrong."""
 
+import argparse
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -10,7 +14,8 @@ import pytest
 import yaml
 from pictures import textured
 
-from edgevpr.cli.main import EXIT_CODES, main
+from edgevpr.cli.examples import EXAMPLES
+from edgevpr.cli.main import EXIT_CODES, command_line, main
 from edgevpr.core.types import StageCost
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
@@ -296,6 +301,62 @@ def test_debug_shows_the_traceback(capsys, caplog, tmp_path):
     with caplog.at_level("DEBUG"):
         assert main(["--debug", "map", "info", str(tmp_path / "no.gpkg")]) == 1
     assert any(record.exc_info for record in caplog.records)
+
+
+def test_quiet_shows_neither_progress_nor_what_goes_well(capsys, tmp_path):
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number}.png"), textured(number))
+    words = ["map", "build", "--images", folder, "--technique", "hog"]
+    assert main([*map(str, words), str(tmp_path / "one.gpkg")]) == 0
+    assert "mapping" in capsys.readouterr().err
+    assert main(["-q", *map(str, words), str(tmp_path / "two.gpkg")]) == 0
+    assert "mapping" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["mpa"], "map"),
+        (["map", "biuld"], "build"),
+        (["map", "info", "m.gpkg", "--jsno"], "--json"),
+        (["match", "m.gpkg", "--images", "x", "--positons=p.csv"], "--positions"),
+    ],
+)
+def test_of_a_wrong_word_the_one_that_may_be_meant_is_named(capsys, words, meant):
+    with pytest.raises(SystemExit) as exit_code:
+        main(words)
+    assert exit_code.value.code == 2
+    assert f"did you mean `{meant}`?" in capsys.readouterr().err
+
+
+def leaves(parser):
+    """The names of all commands, and their parsers."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                yield from leaves(each)
+            return
+    yield parser.prog.partition(" ")[2], parser
+
+
+def test_the_help_of_every_command_has_examples_that_can_be_typed():
+    commands = dict(leaves(command_line()))
+    assert set(commands) == set(EXAMPLES)
+    for command, examples in EXAMPLES.items():
+        assert all(line in commands[command].format_help() for _, line in examples)
+        for _, words in examples:
+            command_line().parse_args([*command.split(), *words.split()])
+
+
+@pytest.mark.process
+def test_the_shell_is_told_how_a_line_may_go_on(tmp_path):
+    line = "edgevpr match --kn"
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    asked["_ARGCOMPLETE_STDOUT_FILENAME"] = str(tmp_path / "said")
+    subprocess.run([sys.executable, "-m", "edgevpr"], env=os.environ | asked, timeout=60)
+    assert (tmp_path / "said").read_text().strip() == "--known"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,61 @@
+"""Examples of each command, as its help shows them: what it is for, and what to type."""
+
+from collections.abc import Mapping
+
+EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "positions": (
+        ("the subtitles beside a video of DJI", "DJI_0001.SRT --images DJI_0001.MP4"),
+        ("photographs by the log of the autopilot", "00000042.BIN --images photos/"),
+        ("a camera whose clock is 3.5 s slow", "track.gpx --images photos/ --offset-s 3.5"),
+    ),
+    "map build": (
+        ("photographs that look straight down", "valley.gpkg --images photos/ --camera nadir"),
+        ("a video, a place each second", "road.gpkg --images flight.mp4 --rate-hz 1"),
+        ("a picture from space, for a camera that shows 120 m", "town.gpkg --orthophoto town.tif --footprint-m 120"),
+    ),
+    "map refine": (("after learning in flight", "valley.gpkg --images photos/"),),
+    "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
+    "map info": (("what is in it", "valley.gpkg"),),
+    "map check": (("before a flight", "valley.gpkg"),),
+    "map repair": (("after `map check` has named damage", "valley.gpkg"),),
+    "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
+    "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
+    "salience": (("what of a flight is worth remembering", "photos/"),),
+    "match": (
+        ("where later pictures were taken", "valley.gpkg --images later/"),
+        ("with what a flight knows beside them", "valley.gpkg --images later/ --known heading,height"),
+    ),
+    "run": (
+        (
+            "a flight that sends nothing yet",
+            "--map valley.gpkg --source /dev/video0 --link udpin:0.0.0.0:14550 --dry-run",
+        ),
+        ("as a configuration says", "--config flight.yaml"),
+    ),
+    "check": (("whether that flight could start", "--config flight.yaml"),),
+    "service print": (("the unit, to read it", ""),),
+    "service install": (("as root, with your configuration", "--config flight.yaml"),),
+    "service uninstall": (("maps, logs and configuration stay", ""),),
+    "doctor": (("what is wrong with autopilot and board", "--link serial:/dev/ttyAMA0:921600"),),
+    "top": (("watch the flight of the service", ""),),
+    "report": (("a page of a flight", "flight.jsonl --out report.html --images later/ --map-images photos/"),),
+    "export": (("its points for QGIS", "flight.jsonl --geojson flight.geojson"),),
+    "replay": (("fly it again, and compare each line", "flight.jsonl --map valley.gpkg"),),
+    "profile": (
+        ("a map on a board", "--map valley.gpkg --board rpi-4b --battery 4S5200 --flight-min 20"),
+        ("which board?", "--places 2000 --board rpi-zero-2w,rpi-4b,rpi-5"),
+    ),
+    "eval": (("techniques on a data set", "--data my_set/ --techniques cohog,hog --camera nadir"),),
+    "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv"),),
+    "simulate flight": (("a generated mapping flight, and a later one over it", "later --which query"),),
+    "demo": (("the whole job in a minute", "--out demo_out"),),
+    "models list": (("which networks there are", ""),),
+    "models verify": (("try them all", ""),),
+    "models add": (("a network of yours", "net.onnx --card net.yaml"),),
+}
+
+
+def shown_examples(command: str) -> str:
+    """Return the examples of a command, such as `map build`, as text below its help."""
+    lines = [f"  # {text}\n  edgevpr {command} {rest}".rstrip() for text, rest in EXAMPLES[command]]
+    return "\n".join(["examples:", *lines])

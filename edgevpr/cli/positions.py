@@ -1,0 +1,79 @@
+"""`edgevpr positions`: where pictures were taken, from a log, a track, subtitles or a table."""
+
+from argparse import Namespace
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from edgevpr.cli.shared import add_json, command, show
+
+
+def add(commands: Any) -> None:
+    """Add the command and its flags."""
+    text = "write where pictures were taken, from a log of an autopilot, a track, subtitles or a table"
+    parser = command(commands, "positions", positions, text)
+    parser.add_argument(
+        "record",
+        metavar="RECORD",
+        help="ArduPilot's .bin, a .tlog, PX4's .ulg, DJI's .SRT, .gpx, GoPro's .mp4, or a table of exiftool, Pix4D, "
+        "Metashape or OpenDroneMap",
+    )
+    parser.add_argument("--images", required=True, metavar="SOURCE", help="the folder of images, or the video file")
+    parser.add_argument(
+        "--offset-s",
+        type=float,
+        metavar="S",
+        help="to add to the camera's clock (default: the time zone that fits); of subtitles, to the time of the video",
+    )
+    parser.add_argument(
+        "--out", metavar="CSV", help="default: positions.csv in the folder, or beside a video its name with .csv"
+    )
+    add_json(parser)
+
+
+def positions(args: Namespace) -> int:
+    """Run `positions`: write the table that all other commands find beside the pictures."""
+    from edgevpr.core.errors import UsageError
+    from edgevpr.core.text import at_work
+    from edgevpr.frames.images import list_images
+    from edgevpr.frames.positions import write_positions, write_track
+    from edgevpr.tracks.placing import place_pictures, place_video, rounded_m
+    from edgevpr.tracks.record import read_record
+
+    source, is_folder = Path(args.images), Path(args.images).is_dir()
+    if not source.exists():
+        raise UsageError(f"There is nothing at {source}: give the folder of the pictures, or the video.")
+    out = Path(args.out) if args.out else source / "positions.csv" if is_folder else source.with_suffix(".csv")
+    if out.exists():
+        raise UsageError(f"{out} exists already: move it away, or name another with --out.")
+    with at_work(f"reading {args.record}"):
+        record = read_record(Path(args.record))
+    placed = (place_pictures if is_folder else place_video)(record, source, args.offset_s)
+    try:
+        if placed.track:
+            write_track(out, placed.track)
+        else:
+            write_positions(out, placed.tags)
+    except OSError as error:
+        raise UsageError(f"{out} cannot be written ({error.strerror}): name another file with --out.") from error
+    found = {
+        "record": record.kind,
+        "how": placed.how,
+        "offset_s": placed.offset_s,
+        "placed": len(placed.track.t_s) if placed.track else sum(bool(tag.position) for tag in placed.tags.values()),
+        "of": None if placed.track else len(list_images(source)),
+        "rounded_m": rounded_m(placed),
+        "out": str(out),
+    }
+    show(found, args.json, _text(args.record, found))
+    return 0
+
+
+def _text(record: str, found: dict[str, Any]) -> Iterator[str]:
+    yield f"{record}: {found['record']}"
+    of = f" of {found['of']} pictures" if found["of"] is not None else " positions"
+    offset_s = found["offset_s"]
+    clock = "" if offset_s is None else f", {offset_s:g} s added to the camera's clock"
+    yield f"{found['out']}: {found['placed']}{of}, {found['how']}{clock}"
+    if found["rounded_m"]:
+        yield f"positions are rounded to {found['rounded_m']:.0f} m: `map build` mends it where the camera looks down"

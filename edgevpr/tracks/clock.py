@@ -1,0 +1,100 @@
+"""Estimates how far the clock of a camera is off that of a track, by the pictures, if it looks straight down.
+
+Two neighbouring pictures that show the same ground say how the aircraft moved between them, in the frame of the first;
+three say how its movement changed: by which factor it became longer, and by which angle it turned. Mounting, heading
+and footprint cancel out. The track says the same of any three times: where both agree, the clock is right. An
+aircraft that only flies straight on says nothing.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.core.arrays import Complexes, Doubles
+from edgevpr.core.errors import ImageError
+from edgevpr.core.geodesy import metres
+from edgevpr.frames.images import read_image
+from edgevpr.frames.positions import MOST_GAP_S, Track
+from edgevpr.runtime.recognise.agreement import PROVEN, agreement
+from edgevpr.runtime.recognise.landmarks import Landmarks, describe
+
+_LANDMARKS = 500
+_WITHIN_S, _STEP_S = 180.0, 0.25  # clocks further off are set wrong, and not only drift
+_MOST_OFF = 1.0  # a movement that differs by more is wrong in the pictures or in the track
+# The least number of turns (radians) that must agree, and by how much all must agree better than at any clock that is
+# further than `_NEAR_S` away: .83 on aerial_caliterra; of pictures of one flight on the track of another .95 or more.
+_FEWEST, _TURNS, _NEAR_S, _BETTER = 4, 0.3, 4.0, 0.9
+Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as those of a tie in `mapmaking.graph`
+
+
+def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
+    """Estimate what is to be added to `times_s`, those of the pictures of `paths` in their order, to get times of the
+    track: at most three minutes. None: the pictures do not tell."""
+    at, changes = _changes_of(paths)
+    if len(at) < _FEWEST:
+        return None
+    t_s, offsets_s = np.array(times_s), np.arange(-_WITHIN_S, _WITHIN_S + _STEP_S, _STEP_S)
+    costs, turning = np.array([_cost(track, t_s, at, changes, each) for each in offsets_s]).T
+    best = int(np.argmin(costs))
+    further = abs(offsets_s - offsets_s[best]) > _NEAR_S
+    if turning[best] < _FEWEST or costs[best] > _BETTER * costs[further].min():
+        return None
+    return float(offsets_s[best])
+
+
+def _cost(track: Track, t_s: Doubles, at: np.ndarray, changes: Complexes, offset_s: float) -> tuple[float, float]:
+    """Return by how much the changes of movement differ from those of the track, 0..1, and how many of these are
+    large; `at` are the numbers of the first of three pictures each."""
+    there = _places(track, t_s + offset_s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        expected = np.log((there[at + 2] - there[at + 1]) / (there[at + 1] - there[at]))
+        off = changes - expected
+    off = np.hypot(off.real, (off.imag + np.pi) % (2 * np.pi) - np.pi)
+    known = np.isfinite(off)
+    return (
+        float(np.where(known, np.minimum(off, _MOST_OFF), _MOST_OFF).mean()),
+        float(np.count_nonzero(known & (abs(expected.imag) > _TURNS) & (off < _MOST_OFF / 2))),
+    )
+
+
+def _places(track: Track, t_s: Doubles) -> Complexes:
+    """Return where the track is at each time, east + i north in metres; NaN outside it and in its gaps."""
+    known_s = np.array(track.t_s)
+    lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
+    east_m, north_m = metres(lat_deg, lon_deg)
+    after = np.clip(np.searchsorted(known_s, t_s), 1, max(len(known_s) - 1, 1))
+    is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MOST_GAP_S)
+    found = np.interp(t_s, known_s, east_m) + 1j * np.interp(t_s, known_s, north_m)
+    return np.where(is_known, found, np.nan)
+
+
+def _changes_of(paths: Iterable[Path]) -> tuple[np.ndarray, Complexes]:
+    """Return, of each three neighbouring pictures that show the same ground, the number of the first, and the logarithm
+    of the factor, a complex number, by which the movement changes."""
+    moves = [_move(one, other) for one, other in pairwise(_marks(paths))]
+    found = [
+        (at, np.log(there[0] / here[0]) + here[1])
+        for at, (here, there) in enumerate(pairwise(moves))
+        if here and there and here[0] and there[0]
+    ]
+    return np.array([at for at, _ in found], int), np.array([change for _, change in found], complex)
+
+
+def _marks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
+    for path in paths:
+        marks = None
+        with suppress(ImageError):
+            marks = describe(read_image(path), None, _LANDMARKS)
+        yield marks
+
+
+def _move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
+    """Return how the middle moves from picture `one` to the `other`, in the frame of `one`, and how it turns."""
+    seen = agreement(other, one) if one is not None and other is not None else None
+    if seen is None or seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None:
+        return None
+    right, down = seen.shift_share
+    return complex(right, -down), complex(np.log(seen.scale or 1.0), -np.radians(seen.rotation_deg))

@@ -1,0 +1,148 @@
+"""Says where the pictures of a folder, or of a video, were taken, by a `Record`: by their names, in the order in which
+the autopilot triggered them, or by time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.core.errors import UsageError
+from edgevpr.core.text import progress
+from edgevpr.frames.exif import read_exif
+from edgevpr.frames.images import list_images
+from edgevpr.frames.positions import GeoTag, Track
+from edgevpr.frames.video import recorded_at
+from edgevpr.tracks.clock import clock_offset_s
+from edgevpr.tracks.record import Record
+
+_ZONE_S, _MOST_ZONE = 900, 4 * 14  # time zones differ by quarters of an hour, and by 14 hours at most
+_LOOKED_AT = 200  # pictures that are compared to set the clock
+_LEAST_SHARE = 0.5  # of the pictures that must lie within the track
+_ROUNDED_DEG, _METRES_A_DEGREE = 1e-4, 111_195  # of latitude
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placed:
+    """`tags`: position and attitude of the pictures that were placed, by name; empty for a video. `track`: that of a
+    video, by its own time. `how`: in words, how pictures were told apart. `offset_s`: seconds added to the clock of the
+    camera (None: no clock was needed)."""
+
+    tags: Mapping[str, GeoTag]
+    track: Track | None
+    how: str
+    offset_s: float | None = None
+
+
+def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Placed:
+    """Place the pictures of a folder. `offset_s` is what is to be added to the clock of the camera (None: estimated).
+    What the record does not say of a picture is taken from its EXIF data. Raises UsageError if they do not belong
+    together."""
+    paths = list_images(folder)
+    own = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
+    if record.named:
+        found, how = _by_name(record.named, list(own)), "by their names"
+    elif len(record.shots) == len(own):
+        found, how = dict(zip(own, record.shots, strict=True)), "in the order of the autopilot's pictures"
+    elif record.track and record.is_utc:
+        return _by_time(record.track, folder, own, offset_s)
+    elif record.shots:
+        raise UsageError(
+            f"{len(record.shots)} pictures were triggered, and {folder} holds {len(own)}: leave only these in it."
+        )
+    else:
+        raise UsageError(f"These positions ({record.kind}) are those of a video: give it as --images.")
+    if not found:
+        raise UsageError(f"No picture of {folder} is named there ({record.kind}): give the folder of these pictures.")
+    return Placed(tags={name: _filled(tag, own[name]) for name, tag in found.items()}, track=None, how=how)
+
+
+def _by_name(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
+    """Find the pictures by their whole names, or by what stands before the ending, in letters of either case."""
+    whole = {name.casefold(): tag for name, tag in named.items()}
+    stems = {Path(name).stem.casefold(): tag for name, tag in named.items()}
+    found = {name: whole.get(name.casefold(), stems.get(Path(name).stem.casefold())) for name in names}
+    return {name: tag for name, tag in found.items() if tag and tag.position}
+
+
+def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placed:
+    times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
+    if not times:
+        raise UsageError("The pictures have no times (EXIF DateTimeOriginal): give those that the camera wrote.")
+    how, times_s = "by time", np.array(list(times.values()))
+    if offset_s is None:
+        offset_s = _zone_offset_s(track, times_s, "the pictures")
+        looked_at = sorted(times, key=times.__getitem__)[:_LOOKED_AT]
+        paths = progress([folder / name for name in looked_at], len(looked_at), "comparing pictures")
+        fine_s = clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
+        offset_s += fine_s or 0.0
+        found = "told by how the pictures move" if fine_s is not None else "right but for its time zone"
+        how = f"by time, the camera's clock taken to be {found}"
+    tags = {}
+    for name, t_s in times.items():
+        if (tag := track.tag_at(t_s + offset_s)).position:
+            tags[name] = _filled(replace(tag, t_utc_s=t_s + offset_s), own[name])
+    if not tags:
+        raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
+    return Placed(tags=tags, track=None, how=how, offset_s=offset_s)
+
+
+def _filled(tag: GeoTag, own: GeoTag) -> GeoTag:
+    """Return `tag`, with what it does not know taken from `own`."""
+    missing = [each.name for each in fields(GeoTag) if getattr(tag, each.name) is None]
+    return replace(tag, **{name: getattr(own, name) for name in missing})
+
+
+def place_video(record: Record, video: Path, offset_s: float | None) -> Placed:
+    """Place the frames of a video. `offset_s` is what is to be added to the clock of the camera (None: estimated), or
+    to the time of the video if the record goes by it. Raises UsageError if they do not belong together."""
+    if record.track is None:
+        raise UsageError(f"These positions ({record.kind}) have no times: a video needs them.")
+    began_s, lasts_s = recorded_at(video)
+    if record.is_utc:
+        if began_s is None:
+            raise UsageError(f"{video} does not say when it was begun: give a recording that goes by the video's time.")
+        if offset_s is None:
+            offset_s = _zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
+        shift_s, how = -began_s - offset_s, "by time"
+    else:
+        shift_s, how = -(offset_s or 0.0), "by the time of the video"
+    track = replace(record.track, t_s=tuple((np.array(record.track.t_s) + shift_s).tolist()))
+    if lasts_s:
+        track.require_within(video, lasts_s)
+    return Placed(tags={}, track=track, how=how, offset_s=offset_s)
+
+
+def _zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
+    """Estimate what is to be added to the clock of a camera that shows a local time, so that most of its times, float
+    (N,), lie within the track: whole hours, else half hours, else quarters."""
+    offsets_s = np.arange(-_MOST_ZONE, _MOST_ZONE + 1) * _ZONE_S
+    first_s, last_s = track.t_s[0], track.t_s[-1]
+    within = np.array([np.mean((times_s + each >= first_s) & (times_s + each <= last_s)) for each in offsets_s])
+    if within.max() < _LEAST_SHARE:
+        raise UsageError(f"No time zone brings {what} into the track: {_spans(track, times_s)}")
+    fitting_s = offsets_s[within == within.max()].tolist()
+    for unit_s in (4 * _ZONE_S, 2 * _ZONE_S, _ZONE_S):
+        of_unit = sorted((each for each in fitting_s if each % unit_s == 0), key=abs)
+        if len(of_unit) > 1:
+            some = ", ".join(f"{each:g}" for each in of_unit[:4])
+            raise UsageError(f"The camera's clock may be off by {some} s: say which with --offset-s (0: it is right).")
+        if of_unit:
+            return float(of_unit[0])
+    raise AssertionError("the smallest unit fits")
+
+
+def _spans(track: Track, times_s: Doubles) -> str:
+    """Say from when to when the camera and the track last."""
+    ends_s = np.array([times_s.min(), times_s.max(), track.t_s[0], track.t_s[-1]])
+    return "the camera says {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
+        *ends_s.astype("datetime64[s]").astype(str)
+    )
+
+
+def rounded_m(placed: Placed) -> float | None:
+    """Return to how many metres all positions are rounded, if it is much, as in subtitles with four decimals."""
+    tags = placed.track.tags if placed.track else placed.tags.values()
+    parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDED_DEG
+    return _ROUNDED_DEG * _METRES_A_DEGREE if np.allclose(parts, np.round(parts), rtol=0, atol=1e-4) else None

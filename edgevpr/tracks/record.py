@@ -1,0 +1,71 @@
+"""Recordings that say where an aircraft was: logs of autopilots, subtitles of drones' videos, tracks of receivers,
+films of action cameras, and tables of other programs. `read_record` finds out which a file is."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+from edgevpr.core.errors import UsageError
+from edgevpr.frames.positions import GeoTag, Track
+
+_STILL_S = 1.0  # while nothing moves, a track keeps a line each second
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """Content of a recording.
+
+    `kind`: what it is, in words. `track`: position and attitude over time (None: it has no times). `is_utc`: the times
+    of the track are seconds since 1970; else seconds from the first frame of the video that it belongs to.
+    `shots`: what the autopilot wrote down for each picture that it triggered, in this order. `named`: position and
+    attitude by the name of the picture, of a table that names pictures.
+    """
+
+    kind: str
+    track: Track | None = None
+    is_utc: bool = True
+    shots: tuple[GeoTag, ...] = ()
+    named: Mapping[str, GeoTag] = field(default_factory=dict)
+
+
+def read_record(path: Path) -> Record:
+    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt, .gpx, .mp4 and .mov, and any other
+    is a table. Raises UsageError for a file that cannot be read, or that has no position."""
+    from edgevpr.tracks import gps, logs, srt, tables
+
+    if not path.is_file():
+        raise UsageError(f"There is no file {path}: name a log, a track, subtitles or a table.")
+    readers: dict[str, Callable[[Path], Record]] = {
+        ".bin": logs.read_ardupilot,
+        ".log": logs.read_ardupilot,
+        ".tlog": logs.read_telemetry,
+        ".ulg": logs.read_px4,
+        ".srt": srt.read_subtitles,
+        ".gpx": gps.read_gpx,
+        ".mp4": gps.read_film,
+        ".mov": gps.read_film,
+    }
+    record = readers.get(path.suffix.lower(), tables.read_table)(path)
+    if not (record.track or record.shots or record.named):
+        raise UsageError(f"{path} ({record.kind}) has no position: was there a fix of GPS?")
+    return record
+
+
+def track_of(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
+    """Make a track of times and positions in any order; None if there is none. Of lines that repeat a position, as
+    subtitles do for each frame, one a second is kept: between two lines positions are interpolated."""
+    kept: dict[float, GeoTag] = {}
+    last_s, last = float("-inf"), GeoTag()
+    for t_s, tag in sorted(lines, key=lambda line: line[0]):
+        if tag.position and (tag.position != last.position or t_s - last_s >= _STILL_S):
+            kept[t_s], last_s, last = replace(tag, t_utc_s=None), t_s, tag
+    return Track(path, tuple(kept), tuple(kept.values())) if kept else None
+
+
+def require(library: str, what: str) -> None:
+    """Raise UsageError if a library that reads `what` is not installed."""
+    if find_spec(library) is None:
+        raise UsageError(
+            f"{what} is read by {library}, which is not here: pip install 'edgevpr[tracks]', or {library}."
+        )

@@ -1,0 +1,74 @@
+"""Subtitles (.srt) that drones of DJI write beside a video: position, height and gimbal of each frame or second, in the
+forms of their models. Times are those of the video, so that no clock matters."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
+from edgevpr.frames.exif import from_straight_down
+from edgevpr.frames.positions import ALT_M, GeoTag, position_or_none
+from edgevpr.tracks.record import Record, track_of
+
+_MAX_FILE_BYTES = 200_000_000  # an hour at 60 frames a second
+_STARTS = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+# `[latitude: 50.1]`, `[longtitude : 8.5]` (so misspelt by some), `[rel_alt: 1.2 abs_alt: 230.4]`, `[gb_yaw: 12.0 ...]`.
+_NAMED = re.compile(
+    rf"\b(lat|latitude|lon|longitude|longtitude|altitude|rel_alt|abs_alt|gb_\w+|drone_yaw|Yaw)\s*:\s*{_NUMBER}"
+)
+_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}(M?)\s*\)")
+_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}\D?,\s*{_NUMBER}\D?,\s*{_NUMBER}")  # pitch, roll, yaw
+_HEIGHT = re.compile(rf"(?:\b(?:BAROMETER|Hb)\s*:\s*|\bH\s+){_NUMBER}\s*m?\b", re.IGNORECASE)
+
+
+def read_subtitles(path: Path) -> Record:
+    """Read the subtitles of a video. Raises UsageError for a file that cannot be read."""
+    try:
+        text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read ({error.strerror}): give the subtitles beside the video.") from error
+    track = track_of(path, _lines(text))
+    return Record(kind="subtitles of a video", track=track, is_utc=False)
+
+
+def _lines(text: str) -> Iterator[tuple[float, GeoTag]]:
+    """Yield the time of each subtitle in the video, in seconds, and what it says."""
+    starts = list(_STARTS.finditer(text))
+    ends = [each.start() for each in starts[1:]] + [len(text)]
+    for start, end in zip(starts, ends, strict=False):  # one end more in an empty file
+        hours, minutes, seconds, fraction = start.groups()
+        t_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
+        yield t_s, _tag_of(text[start.end() : end])
+
+
+def _tag_of(block: str) -> GeoTag:
+    named = {name.lower(): float(number) for name, number in _NAMED.findall(block)}
+    lat_deg, height_m = named.get("lat", named.get("latitude")), named.get("rel_alt")
+    lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
+    alt_m = named.get("abs_alt", named.get("altitude"))
+    if gps := _GPS.search(block):
+        lon_deg, lat_deg = float(gps[1]), float(gps[2])  # the third is an altitude, or the number of satellites
+        if gps[4] or abs(lat_deg) > 90:  # the forms with an altitude in M have the latitude first
+            lon_deg, lat_deg = lat_deg, lon_deg
+    if height_m is None and (height := _HEIGHT.search(block)):
+        height_m = float(height[1])
+    if lat_deg is None or lon_deg is None or not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+        return GeoTag()
+    nose_deg, roll_deg, pitch_deg = named.get("drone_yaw", named.get("yaw")), None, None
+    heading_deg = None if nose_deg is None else nose_deg % 360
+    gimbal = [named[name] for name in ("gb_pitch", "gb_roll", "gb_yaw") if name in named]
+    if told := _GIMBAL.search(block):
+        gimbal = list(map(float, told.groups()))
+    if len(gimbal) == 3 and any(gimbal):
+        pitch, roll, yaw = gimbal
+        heading_deg, roll_deg, pitch_deg = from_straight_down(yaw, pitch, roll)
+    alt_m = alt_m if alt_m is not None and ALT_M[0] <= alt_m <= ALT_M[1] else None
+    return GeoTag(
+        position=position_or_none(lat_deg, lon_deg, alt_m),
+        heading_deg=heading_deg,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        height_m=height_m,
+    )

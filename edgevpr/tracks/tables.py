@@ -1,0 +1,139 @@
+"""Tables of pictures and their positions that other programs write: exiftool (-csv), Pix4D, Metashape, OpenDroneMap
+(geo.txt). Separators and columns are guessed, and said."""
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from math import inf
+from pathlib import Path, PureWindowsPath
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.files import read_file
+from edgevpr.frames.exif import from_straight_down
+from edgevpr.frames.images import is_image
+from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
+from edgevpr.tracks.record import Record
+
+_MAX_FILE_BYTES = 100_000_000
+_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
+_HEAD = 10  # rows among which the names of the columns stand
+# Names of columns, in letters alone; the first that is there counts.
+_COLUMNS = {
+    "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
+    "lat": ("latitude", "lat", "gpslatitude", "ylatitude"),
+    "lon": ("longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
+    "alt": ("altitude", "alt", "gpsaltitude", "absolutealtitude", "zaltitude", "elevation"),
+    "height": ("relativealtitude", "relalt", "heightm", "height"),
+    "nose": ("yawdeg", "headingdeg", "yaw", "heading", "gpsimgdirection", "flightyawdegree"),
+    "yaw": ("gimbalyawdegree",),
+    "pitch": ("gimbalpitchdegree",),
+    "roll": ("gimbalrolldegree",),
+    "time": ("datetimeoriginal", "time"),
+}
+_NEEDED = ("file", "lat", "lon")
+_WITHOUT_NAMES = ("file", "lat", "lon", "alt")  # as Pix4D orders them
+_OF_OPENDRONEMAP = ("file", "lon", "lat", "alt")
+_WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
+_NO_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
+_NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
+_PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
+
+Rows = Sequence[Sequence[str]]
+Layout = tuple[Mapping[str, int], int, Sequence[str]]  # column of each part, the first row of values, and names
+
+
+def read_table(path: Path) -> Record:
+    """Read a table of pictures. Raises UsageError for one in which pictures, latitude and longitude are not found, and
+    for a wrong value."""
+    try:
+        text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is no text that can be read ({error}): save the table as CSV in UTF-8.") from error
+    lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _WITHOUT_NAMES
+    if lines and _PROJECTION.match(lines[0]):
+        if not _WGS84.match(lines[0]):
+            raise UsageError(f"{path} is in `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
+        lines, order = lines[1:], _OF_OPENDRONEMAP
+    for separator, spoken in _SEPARATORS.items():
+        rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+        if layout := _named_columns(rows) or _columns_without_names(rows, order):
+            columns, first, names = layout
+            said = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _NEEDED)
+            return Record(kind=f"table of {said}, {spoken} between them", named=_tags_of(rows[first:], columns, path))
+    raise UsageError(
+        f"{path}: no columns of the picture, latitude and longitude were found: name them file, lat and lon in line 1."
+    )
+
+
+def _named_columns(rows: Rows) -> Layout | None:
+    """Find the row with the names of the columns."""
+    for number, row in enumerate(rows[:_HEAD]):
+        names = [_NO_LETTERS.sub("", cell.lower()) for cell in row]
+        found = {part: _column(known, names) for part, known in _COLUMNS.items()}
+        columns = {part: column for part, column in found.items() if column is not None}
+        is_split = not any(separator in cell for cell in row for separator in ",;\t")
+        if is_split and columns.keys() >= set(_NEEDED):
+            return columns, number + 1, row
+    return None
+
+
+def _column(known: Sequence[str], names: Sequence[str]) -> int | None:
+    """Return the column of the first `known` name, or of `vehicle latitude` and the like."""
+    exact = [names.index(name) for name in known if name in names]
+    ending = [
+        at for at, name in enumerate(names) if name.endswith(("latitude", "longitude")) and name.endswith(known[0])
+    ]
+    return next(iter([*exact, *ending]), None)
+
+
+def _columns_without_names(rows: Rows, order: Sequence[str]) -> Layout | None:
+    """Take the columns in the usual `order` if each row begins with a picture."""
+    if not rows or len(rows[0]) < len(_NEEDED) or not is_image(rows[0][0].strip()):
+        return None
+    return {part: column for column, part in enumerate(order)}, 0, order
+
+
+def _tags_of(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
+    named = {}
+    for row in rows:
+        cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
+        try:
+            named[PureWindowsPath(cells["file"]).name] = _tag_of(cells)
+        except (KeyError, ValueError) as error:
+            raise UsageError(f"{path}: `{' '.join(row):.80}` is not understood ({error}): correct the line.") from error
+    if named and not any(tag.position for tag in named.values()):
+        raise UsageError(f"{path} has no possible position: are latitude and longitude exchanged, or not in degrees?")
+    return named
+
+
+def _tag_of(cells: Mapping[str, str]) -> GeoTag:
+    """Make a tag of the cells of a row; an impossible position is unknown. Raises ValueError for what is no number."""
+    number = {part: _angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
+    lat_deg, lon_deg, alt_m = number.get("lat", inf), number.get("lon", inf), number.get("alt")
+    is_possible = abs(lat_deg) <= 90 and abs(lon_deg) <= 180
+    heading_deg, roll_deg, pitch_deg = number.get("nose"), None, None
+    if {"yaw", "pitch", "roll"} <= number.keys():
+        heading_deg, roll_deg, pitch_deg = from_straight_down(number["yaw"], number["pitch"], number["roll"])
+    t_utc_s = None
+    with suppress(ValueError, OverflowError):
+        t_utc_s = parse_time(cells["time"]) if cells.get("time") else None
+    alt_m = alt_m if alt_m is not None and ALT_M[0] <= alt_m <= ALT_M[1] else None
+    return GeoTag(
+        position=position_or_none(lat_deg, lon_deg, alt_m) if is_possible else None,
+        heading_deg=None if heading_deg is None else heading_deg % 360,
+        t_utc_s=t_utc_s,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        height_m=number.get("height"),
+    )
+
+
+def _angle(text: str) -> float:
+    """Convert `50.05`, `50,05`, `50.05 N` or `50 deg 3' 12.30" N`, and heights as `12.3 m`. Raises ValueError."""
+    numbers = _NUMBERS.findall(text)
+    if not 1 <= len(numbers) <= 3:
+        raise ValueError(f"{text} is no number")
+    value: float = sum(abs(float(part.replace(",", "."))) / 60**place for place, part in enumerate(numbers))
+    is_negative = numbers[0].startswith("-") or text.rstrip().upper().endswith(("S", "W", "BELOW SEA LEVEL"))
+    return -value if is_negative else value

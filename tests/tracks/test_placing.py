@@ -1,0 +1,186 @@
+"""Which picture was taken where: by name, in order, by time and by how pictures move, and the command for people."""
+
+import json
+from datetime import datetime, timedelta, timezone
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+from PIL import Image
+from recordings import START_S, write_dataflash, write_gpx
+
+from edgevpr.cli.main import main
+from edgevpr.core.geodesy import moved
+from edgevpr.frames.positions import find_track, read_positions, read_track
+from edgevpr.tracks.clock import clock_offset_s
+from edgevpr.tracks.record import read_record
+
+SIDE_PX, GROUND_PX = 240, 2400
+HOME = (50.0, 8.0)
+
+
+def taken(path, t_s, picture=None, clock_off_s=0.0):
+    """Write a JPEG whose camera shows the time `t_s` of the flight, in seconds from its start."""
+    exif = Image.Exif()
+    shown = datetime.fromtimestamp(START_S + t_s - clock_off_s, timezone.utc)
+    exif.get_ifd(0x8769)[0x9003] = shown.strftime("%Y:%m:%d %H:%M:%S")
+    Image.fromarray(textured(1, 48, 64) if picture is None else picture).save(path, "JPEG", exif=exif, quality=92)
+
+
+def run(capsys, *argv):
+    assert main([str(word) for word in argv]) == 0
+    return capsys.readouterr()
+
+
+def refused(capsys, *argv):
+    assert main([str(word) for word in argv]) == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "flight").mkdir()
+    for number in range(6):
+        taken(tmp_path / "flight" / f"IMG_{number}.JPG", 2 * number + 1)
+    return tmp_path / "flight"
+
+
+def points(count=15, lat_step=1e-4):
+    return [(t, HOME[0] + lat_step * t, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t in range(count)]
+
+
+def test_pictures_are_placed_by_their_names(capsys, folder, tmp_path):
+    rows = "".join(f"D:\\pics\\img_{number}.tif;50.{number + 1};8\n" for number in range(5))
+    (tmp_path / "table.csv").write_text(f"imagename;latitude;longitude\n{rows}")
+    said = run(capsys, "positions", tmp_path / "table.csv", "--images", folder).out
+    assert "5 of 6 pictures" in said
+    tags = read_positions(folder / "positions.csv")
+    assert tags["IMG_3.JPG"].position.lat_deg == pytest.approx(50.4)
+    assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the table does not say is taken from the picture"
+    assert "exists already" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
+
+
+def test_pictures_that_the_autopilot_triggered_are_placed_in_order(capsys, folder, tmp_path):
+    write_dataflash(tmp_path / "f.bin", points(), shots=points(6, lat_step=1e-3))
+    found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
+    assert (found["placed"], found["of"], found["offset_s"]) == (6, 6, None)
+    tags = read_positions(folder / "positions.csv")
+    assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * number for number in range(6)])
+
+
+def test_where_the_log_has_another_number_of_pictures_they_are_placed_by_time(capsys, folder, tmp_path):
+    write_dataflash(tmp_path / "f.bin", points(), shots=points(3))
+    found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
+    assert (found["placed"], found["offset_s"]) == (6, 0)
+    tag = read_positions(folder / "positions.csv")["IMG_3.JPG"]
+    assert tag.position.lat_deg == pytest.approx(50 + 7e-4, abs=2e-6)
+    assert (tag.height_m, tag.t_utc_s) == (pytest.approx(30, abs=0.1), START_S + 7)
+
+
+@pytest.mark.parametrize("hours", [2, -9.5])
+def test_a_clock_of_another_time_zone_is_found_out(capsys, tmp_path, hours):
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for number in range(6):
+        taken(folder / f"{number}.jpg", 60 * number + 1, clock_off_s=3600 * hours)
+    write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(0, 400, 2)])
+    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", folder, "--json").out)
+    assert (found["placed"], found["offset_s"]) == (6, 3600 * hours)
+
+
+def test_a_clock_that_could_be_of_several_time_zones_is_asked_for(capsys, folder, tmp_path):
+    write_gpx(tmp_path / "t.gpx", [(t, HOME[0], HOME[1] + 1e-6 * t) for t in range(4000, 20_000, 4)])
+    assert "--offset-s" in refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
+    flags = ("--images", folder, "--offset-s", 7200, "--json")
+    assert json.loads(run(capsys, "positions", tmp_path / "t.gpx", *flags).out)["placed"] == 6
+
+
+def test_pictures_of_another_day_are_refused_with_both_times(capsys, folder, tmp_path):
+    write_gpx(tmp_path / "t.gpx", [(t + 300_000, *HOME) for t in range(9)])
+    said = refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
+    day = (datetime.fromtimestamp(START_S, timezone.utc) + timedelta(seconds=300_000)).date().isoformat()
+    assert day in said
+    assert not (folder / "positions.csv").exists()
+
+
+def flown(count=40):
+    """Return a track at 5 Hz, (seconds, lat, lon), of an aircraft that flies curves, and pictures of the ground that it
+    takes every two seconds, its camera turned by 30 degrees against its nose."""
+    ground = textured(5, GROUND_PX, GROUND_PX)
+    ground[: GROUND_PX // 3, : GROUND_PX // 3] = textured(6, GROUND_PX, GROUND_PX)[-GROUND_PX // 3 :, -GROUND_PX // 3 :]
+    noise = np.random.default_rng(2).normal(0, 25, (GROUND_PX // 6, GROUND_PX // 6))
+    ground = np.clip(ground + cv2.resize(noise, ground.shape[::-1], interpolation=cv2.INTER_CUBIC), 0, 255)
+    t_s = np.arange(0, 2 * count + 0.1, 0.2)
+    course = 0.9 * np.sin(t_s / 5) + t_s / 14
+    at = np.cumsum(2.4 * np.exp(1j * (np.pi / 2 - course)))  # right + i up, in pixels of the ground, that are metres
+    at += GROUND_PX * 0.5 * (1 - 1j) - (at.real.max() + at.real.min()) / 2 - 1j * (at.imag.max() + at.imag.min()) / 2
+    pictures = []
+    for number in range(0, len(t_s), 10):
+        turn = cv2.getRotationMatrix2D((at[number].real, -at[number].imag), np.degrees(course[number]) + 30, 1.0)
+        turn[:, 2] += SIDE_PX / 2 - np.array([at[number].real, -at[number].imag])
+        pictures.append(cv2.warpAffine(ground.astype(np.uint8), turn, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR))
+    track = [(t, *moved(*HOME, east, north)) for t, east, north in zip(t_s.tolist(), at.real, at.imag, strict=True)]
+    return track, pictures
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_off_by_seconds_is_set_by_how_the_pictures_move(capsys, tmp_path):
+    track, pictures = flown()
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for number, picture in enumerate(pictures):
+        taken(folder / f"{number}.jpg", 2 * number, picture, clock_off_s=3600 - 17)
+    write_gpx(tmp_path / "t.gpx", track)
+    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", folder, "--json").out)
+    assert found["offset_s"] == pytest.approx(3583, abs=0.8)
+    straight = tmp_path / "straight.gpx"
+    write_gpx(straight, [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(90)])
+    paths = [folder / f"{number}.jpg" for number in range(len(pictures))]
+    times = [START_S + 2 * number for number in range(len(pictures))]
+    assert clock_offset_s(read_record(straight).track, times, paths) is None, "another flight sets no clock"
+
+
+@pytest.fixture
+def film(tmp_path):
+    import av
+
+    path = tmp_path / "DJI_0001.MP4"
+    with av.open(str(path), "w", format="mp4") as out:
+        stream = out.add_stream("mpeg4", rate=5)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        out.metadata["creation_time"] = datetime.fromtimestamp(START_S + 3600, timezone.utc).isoformat()
+        for number in range(25):
+            picture = np.repeat(textured(number, 48, 64)[:, :, None], 3, axis=2)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        out.mux(stream.encode())
+    return path
+
+
+def test_subtitles_place_their_video_and_the_table_is_found_beside_it(capsys, caplog, film, folder, tmp_path):
+    lines = [f"{t}\n00:00:0{t},000 --> 00:00:0{t + 1},000\n[latitude: 50.00{t}] [longitude: 8.0]\n\n" for t in range(6)]
+    (tmp_path / "DJI_0001.SRT").write_text("".join(lines))
+    map_file = tmp_path / "m.gpkg"
+    build = ("map", "build", map_file, "--images", film, "--technique", "hog", "--rate-hz", 1, "--no-calibrate")
+    run(capsys, *build)
+    assert "DJI_0001.SRT --images" in caplog.text, "the subtitles are there, and nobody has read them"
+    map_file.unlink()
+    run(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", film)
+    assert find_track(film) == tmp_path / "DJI_0001.csv"
+    assert read_track(tmp_path / "DJI_0001.csv").tag_at(1.5).position.lat_deg == pytest.approx(50.0015)
+    built = json.loads(run(capsys, *build, "--json").out)
+    assert (built["places"], built["without_position"]) == (5, 0)
+    assert "video" in refused(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", folder)
+
+
+def test_a_track_places_a_video_by_when_it_was_begun(capsys, film, tmp_path):
+    write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(-5, 15)])
+    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", film, "--json").out)
+    assert found["offset_s"] == -3600, "the camera shows the time of another zone"
+    assert read_track(tmp_path / "DJI_0001.csv").tag_at(2.0).position.lat_deg == pytest.approx(50 + 2e-5)
+
+
+def test_positions_that_are_rounded_to_metres_are_named(capsys, film, tmp_path):
+    lines = [f"{t}\n00:00:0{t},000 --> 00:00:0{t + 1},000\nGPS(8.1234,50.123{t},9) BAROMETER:30\n" for t in range(6)]
+    (tmp_path / "DJI_0001.SRT").write_text("".join(lines))
+    assert "11 m" in run(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", film).out

@@ -1,0 +1,202 @@
+"""Reading what recordings say: each format, whole and damaged, and what a reader makes of it."""
+
+import struct
+
+import pytest
+from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
+
+from edgevpr.core.errors import UsageError
+from edgevpr.tracks.record import read_record
+
+# seconds, lat, lon, alt, height, roll, pitch, yaw
+POINTS = [(t, -35.36 + 1e-4 * t, 149.16 + 2e-4 * t, 600.0 + t, 20.0 + t, 5.0, -3.0, 280.0) for t in range(6)]
+SHOTS = [(t + 0.5, -35.5 + 1e-4 * t, 149.5, 610.0, 30.0, 1.0, 2.0, 90.0) for t in range(3)]
+
+
+def agrees(tag, point, of_height=True):
+    _, lat, lon, alt, height, roll, pitch, yaw = point
+    assert (tag.position.lat_deg, tag.position.lon_deg) == pytest.approx((lat, lon), abs=1e-6)
+    assert tag.position.alt_m == pytest.approx(alt, abs=0.1)
+    assert (tag.roll_deg, tag.pitch_deg, tag.heading_deg) == pytest.approx((roll, pitch, yaw), abs=0.02)
+    assert tag.height_m == (pytest.approx(height, abs=0.1) if of_height else None)
+
+
+@pytest.mark.parametrize(("ending", "write"), [(".bin", write_dataflash), (".tlog", write_tlog)])
+def test_a_log_gives_the_track_and_what_was_written_down_of_each_picture(tmp_path, ending, write):
+    path = tmp_path / f"flight{ending}"
+    write(path, POINTS, SHOTS)
+    record = read_record(path)
+    assert record.is_utc
+    assert record.track.t_s == pytest.approx([START_S + t for t in range(6)], abs=0.01)
+    for tag, point in zip(record.track.tags, POINTS, strict=True):
+        agrees(tag, point)
+    for tag, shot in zip(record.shots, SHOTS, strict=True):
+        agrees(tag, shot)
+
+
+@pytest.mark.parametrize(("ending", "write"), [(".bin", write_dataflash), (".tlog", write_tlog)])
+def test_a_log_that_was_cut_off_is_read_to_there_and_nothing_is_printed(tmp_path, capfd, ending, write):
+    path = tmp_path / f"flight{ending}"
+    write(path, POINTS)
+    path.write_bytes(path.read_bytes()[:-30] + b"\x00" * 600)
+    assert 4 <= len(read_record(path).track.t_s) <= 6
+    assert capfd.readouterr() == ("", "")
+
+
+def px4(position="vehicle_global_position"):
+    stamps = [int(1e6 * (7 + t)) for t in range(6)]
+    north = (1.0, 0.0, 0.0, 0.0)
+    where = {"timestamp": "uint64_t", "lat": "double", "lon": "double", "alt": "float"}
+    receiver = {"timestamp": "uint64_t", "time_utc_usec": "uint64_t", "fix_type": "uint8_t"}
+    receiver |= dict.fromkeys(("lat", "lon", "alt"), "int32_t")
+    told = [(at, int(1e6 * (START_S + t)), 3, 471234567, 85551234, 450000) for t, at in enumerate(stamps)]
+    topics = {
+        "vehicle_gps_position": (receiver, told),
+        "vehicle_attitude": ({"timestamp": "uint64_t", "q": "float[4]"}, [(at, north) for at in stamps]),
+        "vehicle_local_position": ({"timestamp": "uint64_t", "z": "float"}, [(at, -40.0) for at in stamps]),
+    }
+    if position:
+        topics[position] = (where, [(at, 47.5 + 1e-4 * t, 8.5, 500.0) for t, at in enumerate(stamps)])
+    return topics
+
+
+def test_a_log_of_px4_is_told_the_time_by_its_receiver(tmp_path):
+    write_ulog(tmp_path / "flight.ulg", px4() | {"camera_capture": px4("camera_capture")["camera_capture"]})
+    record = read_record(tmp_path / "flight.ulg")
+    assert record.track.t_s == pytest.approx([START_S + t for t in range(6)], abs=0.01)
+    assert len(record.shots) == 6
+    for tag in (*record.track.tags, *record.shots):
+        assert (tag.heading_deg, tag.roll_deg, tag.pitch_deg) == pytest.approx((0, 0, 0), abs=1e-6)
+        assert tag.height_m == pytest.approx(40)
+        assert tag.position.lon_deg == pytest.approx(8.5)
+
+
+def test_without_the_estimate_of_px4_its_receiver_says_where(tmp_path):
+    write_ulog(tmp_path / "flight.ulg", px4(position=""))
+    track = read_record(tmp_path / "flight.ulg").track
+    assert (track.tags[0].position.lat_deg, track.tags[0].position.alt_m) == pytest.approx((47.1234567, 450))
+
+
+def test_a_gpx_track_goes_by_the_time_and_one_without_times_is_refused(tmp_path):
+    path = tmp_path / "walk.gpx"
+    write_gpx(path, [(t, 50 + 1e-4 * t, 8) for t in range(4)])
+    record = read_record(path)
+    assert record.track.t_s == tuple(START_S + t for t in range(4))
+    assert record.track.tags[3].position.lat_deg == pytest.approx(50.0003)
+    path.write_text(path.read_text().replace("<time>", "<name>").replace("</time>", "</name>"))
+    with pytest.raises(UsageError, match="times"):
+        read_record(path)
+
+
+# Each form with the position, altitude, height and (heading, roll, pitch) that it says.
+SUBTITLES = {
+    "phantom": ("HOME(8.5,50.1) 2017.08.05 14:11:51\nGPS(8.5,50.2,16) BAROMETER:1.9\nISO:100", 50.2, None, 1.9, None),
+    "old": ("HOME(8.5,50.1) 2017.8.5 14:11:51\nGPS(8.5,50.2,16) Hb:2.9 Hs:1.9", 50.2, None, 2.9, None),
+    "matrice": ("2022.06.21 16:06:17\nGPS(50.2,8.5,310.0M) BAROMETER:0.3M", 50.2, None, 0.3, None),
+    "mini": ("F/2.8, SS 30, GPS (8.5000, 50.2000, 17), D 221.21m, H 200.70m, H.S n/a", 50.2, None, 200.7, None),
+    "rtk": (
+        "GPS (8.5, 50.2, 15), HOME (8.4, 50.1, -57.98m), D 698.70m, H 85.80m, H.S 0.00m/s, "
+        "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-90.0°, 0.0°, -70.0°)",
+        50.2,
+        None,
+        85.8,
+        (290.0, 0.0, 0.0),
+    ),
+    "mavic 2": ("[latitude : 50.2] [longtitude : 8.5] [altitude: 213.9] </font>", 50.2, 213.9, None, None),
+    "mavic 3": ("[latitude: 50.2] [longitude: 8.5] [rel_alt: -2.4 abs_alt: 130.4] </font>", 50.2, 130.4, -2.4, None),
+    "enterprise": (
+        "[latitude: 50.2] [longtitude: 8.5] [rel_alt: 4.1 abs_alt: 485.4] [Drone: Yaw:-17.9, Pitch:-1.4, Roll:1.1]",
+        50.2,
+        485.4,
+        4.1,
+        (342.1, None, None),
+    ),
+    "thermal": (
+        "[latitude: 50.2] [longitude: 8.5] [rel_alt: 80.5 abs_alt: 327.0]\n[drone_yaw: 10.0 drone_roll: 2.0]\n"
+        "[gb_yaw: -100.0 gb_pitch: -80.0 gb_roll: 0.0]",
+        50.2,
+        327.0,
+        80.5,
+        (260.0, 0.0, 10.0),
+    ),
+}
+
+
+@pytest.mark.parametrize("form", SUBTITLES)
+def test_subtitles_of_each_form_are_read(tmp_path, form):
+    block, lat_deg, alt_m, height_m, turned = SUBTITLES[form]
+    text = "".join(f"{at + 1}\n00:00:{at:02},500 --> 00:00:{at + 1:02},500\n{block}\n\n" for at in range(3))
+    (tmp_path / "film.SRT").write_text("\ufeff" + text)
+    record = read_record(tmp_path / "film.SRT")
+    assert not record.is_utc
+    assert record.track.t_s == (0.5, 1.5, 2.5)
+    tag = record.track.tags[0]
+    assert (tag.position.lat_deg, tag.position.lon_deg) == (lat_deg, 8.5)
+    assert (tag.position.alt_m, tag.height_m) == (alt_m, height_m)
+    told = (tag.heading_deg, tag.roll_deg, tag.pitch_deg)
+    assert told == (pytest.approx(turned, abs=1e-6) if turned and turned[1] is not None else turned or (None,) * 3)
+
+
+def test_of_subtitles_that_repeat_a_position_one_a_second_is_kept(tmp_path):
+    lines = [f"{at}\n00:00:0{at // 10},{at % 10}00 --> 00:00:09,000\n[latitude: 50.{at // 15}] [longitude: 8]\n\n"
+             for at in range(40)]  # fmt: skip
+    (tmp_path / "film.srt").write_text("".join(lines))
+    assert read_record(tmp_path / "film.srt").track.t_s == (0.0, 1.0, 1.5, 2.5, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("imagename;latitude;longitude;altitude\nC:\\f\\a.JPG;50,25;8,5;120\n", (50.25, 8.5, 120)),
+        ("SourceFile,GPSLatitude,GPSLongitude\n./f/a.JPG,\"50 deg 15' 0.00\"\" S\",\"8 deg 30' 0.00\"\" W\"\n",
+         (-50.25, -8.5, None)),
+        ("#Label,X/Longitude,Y/Latitude,Z/Altitude\na.JPG,8.5,50.25,120\n", (50.25, 8.5, 120)),
+        ("EPSG:4326\na.JPG 8.5 50.25 120\n", (50.25, 8.5, 120)),
+        ("a.JPG,50.25,8.5,120\nb.JPG,50.26,8.5,120\n", (50.25, 8.5, 120)),
+        ("\ufefffile\tVehicle Latitude [deg]\tVehicle Longitude [deg]\na.JPG\t50.25 N\t8.5 E\n", (50.25, 8.5, None)),
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expected):
+    (tmp_path / "table.csv").write_text(text)
+    record = read_record(tmp_path / "table.csv")
+    at = record.named["a.JPG"].position
+    assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
+    assert "between them" in record.kind
+
+
+def test_the_gimbal_of_a_table_counts_before_the_nose(tmp_path):
+    names = "SourceFile,GPSLatitude,GPSLongitude,RelativeAltitude,FlightYawDegree,GimbalYawDegree,GimbalPitchDegree"
+    rows = "a.jpg,50,8,+30.5,20,100,-80,0\nb.jpg,250,325,+30.5,20,,,\n"
+    (tmp_path / "table.csv").write_text(f"{names},GimbalRollDegree\n{rows}")
+    named = read_record(tmp_path / "table.csv").named
+    tag = named["a.jpg"]
+    assert (tag.heading_deg, tag.pitch_deg, tag.height_m) == pytest.approx((100, 10, 30.5))
+    assert named["b.jpg"].position is None, "an impossible position is none"
+    assert named["b.jpg"].heading_deg == 20
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("t.csv", b"file,x,y\na.jpg,1,2\n", "line 1"),
+        ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
+        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "understood"),
+        ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "exchanged"),
+        ("t.csv", bytes(range(256)), "UTF-8"),
+        ("t.bin", b"", "log"),
+        ("t.bin", struct.pack("64x"), "no position"),
+        ("t.log", b"nothing\n", "no position"),
+        ("t.tlog", b"\x00" * 100, "no position"),
+        ("t.ulg", b"ULo", "PX4"),
+        ("t.srt", b"", "no position"),
+        ("t.srt", b"1\n00:00:01,000 --> 00:00:02,000\n[latitude: 0.0] [longitude: 0.0]\n", "no position"),
+        ("t.gpx", b"<gpx", "GPX"),
+        ("t.mp4", b"nothing", "telemetry"),
+    ],
+)
+def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UsageError, match=said):
+        read_record(tmp_path / name)
+    with pytest.raises(UsageError, match="no file"):
+        read_record(tmp_path / "nothing.bin")
