@@ -1,6 +1,7 @@
 """`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
 from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,12 @@ def add(commands: Any) -> None:
 
 
 def _add_plan(parser: ArgumentParser) -> None:
-    parser.add_argument("--board", default="this", metavar="NAME", help="a board, or `this` (default); see --list")
+    parser.add_argument(
+        "--board",
+        default="this",
+        metavar="NAME",
+        help="a board, or `this` (default); several beside each other: A,B,C; see --list",
+    )
     parser.add_argument("--flight-min", type=positive, default=20.0, metavar="MIN", help="length of the flight (20)")
     add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
     parser.add_argument("--hover-w", type=positive, metavar="W", help="what the aircraft draws to hover: minutes lost")
@@ -43,8 +49,8 @@ def profile(args: Namespace) -> int:
     from edgevpr.runtime.preflight.choose import preferred
     from edgevpr.runtime.preflight.estimate import estimate
     from edgevpr.runtime.preflight.own_board import scaled_from
-    from edgevpr.runtime.preflight.presentation import format_table
-    from edgevpr.runtime.preflight.trial import try_each
+    from edgevpr.runtime.preflight.presentation import format_boards, format_table
+    from edgevpr.runtime.preflight.trial import Trial, try_each
 
     if args.out and not args.detect:
         raise UsageError("--out is for --detect: name it too.")
@@ -54,13 +60,21 @@ def profile(args: Namespace) -> int:
         return 0
     if args.detect:
         return _detect(args)
-    board = load_board(args.board)
-    preferred(board)  # raises if the profile names a technique that is not there
-    plan, wanted = _plan(args, board)
-    here = scaled_from(load_board("this"), board)
-    trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
-    result = estimate(board, here, trials, plan)
-    show(result, args.json, format_table(result))
+    boards = [load_board(name.strip()) for name in args.board.split(",")]
+    for board in boards:
+        preferred(board)  # raises if the profile names a technique that is not there
+    results = []
+    tried: dict[int, list[Trial]] = {}  # by the number of threads for networks
+    for board in boards:
+        plan, wanted = _plan(args, board)
+        if board.threads not in tried:
+            trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
+            tried[board.threads] = list(trials)
+        results.append(estimate(board, scaled_from(load_board("this"), board), tried[board.threads], plan))
+    if len(results) == 1:
+        show(results[0], args.json, format_table(results[0]))
+    else:
+        show([asdict(each) for each in results], args.json, format_boards(results))
     return 0
 
 

@@ -103,10 +103,20 @@ def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
 def test_progress_is_shown_and_the_text_has_both_tables(capsys, tried):
     said = run(capsys, "--board", "rpi-4b", "--places", 20)
     assert "trying techniques" in said.err
-    assert said.out.startswith("Raspberry Pi 4B, 64-bit: 20 places, 0.5 Hz")
-    assert "\nRecommended: cohog: " in said.out
+    assert said.out.startswith("Recommended: cohog: ")
+    assert "\nRaspberry Pi 4B, 64-bit: 20 places, 0.5 Hz" in said.out
     assert "no model `calc`" in said.out
     assert all(len(line) <= 120 for line in said.out.splitlines())
+
+
+def test_boards_stand_beside_each_other_and_techniques_are_tried_once_for_those_alike(capsys, tried):
+    boards = ["rpi-4b", "rpi-5", "rpi-3b"]
+    said = run(capsys, "--board", ",".join(boards), "--places", 20).out.splitlines()
+    assert [line.split()[:2] for line in said[3:]] == [[board, "cohog"] for board in boards]
+    assert len(tried) == len(set(tried))
+    found = json.loads(run(capsys, "--board", ",".join(boards), "--places", 20, "--json").out)
+    assert [each["board"] for each in found] == boards
+    assert refused(capsys, "--board", "rpi-4b,nothing", "--places", 20)[0] == 2
 
 
 def test_with_a_map_its_places_count_and_only_its_forms_are_tried(capsys, tmp_path, tried):

@@ -1,5 +1,7 @@
 """Estimates for people: tables of at most 120 columns with a line per technique, and notes."""
 
+from collections.abc import Sequence
+
 from edgevpr.core.text import aligned, wrapped
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 
@@ -7,12 +9,13 @@ from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 _NEEDS = ("technique", "fits", "B/place", "map MB", "disk MB", "peak MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
 _FINDS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "chosen by itself")
 _DRAWS = ("technique", "mAh/query", "marginal", "mAh/flight", "marginal", "of pack")
+_BOARD = ("board", "technique", "peak MB", "Hz", "query s", "mAh/flight", "marginal", "of pack")
 _LOSES = ("min lost", "marginal")
 
 
 def format_table(estimate: FlightEstimate) -> str:
-    """Format an estimate as text: tables of what each technique needs, finds and draws, why techniques do not fit,
-    notes, and the recommended technique."""
+    """Format an estimate as text: the recommended technique, tables of what each needs, finds and draws, why techniques
+    do not fit, and notes."""
     plan, rows = estimate.plan, estimate.techniques
     hovers = f", hovering at {plan.hover_w:g} W" if plan.hover_w else ""
     heading = (
@@ -33,8 +36,29 @@ def format_table(estimate: FlightEstimate) -> str:
     for why in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == why]
         notes.append(f"{', '.join(names)} cannot be used: {why}")
-    notes += [*estimate.notes, f"Recommended: {estimate.reason}"]
-    return "\n".join([heading, "", *tables, *(line for note in notes for line in wrapped(note))])
+    notes += estimate.notes
+    answer = wrapped(f"Recommended: {estimate.reason}")
+    return "\n".join([*answer, "", heading, "", *tables, *(line for note in notes for line in wrapped(note))])
+
+
+def format_boards(estimates: Sequence[FlightEstimate]) -> str:
+    """Format estimates of the same flight on several boards as text: what is recommended on each, and what it takes
+    there."""
+    rows = [_BOARD, *map(_on_board, estimates)]
+    none = [f"{each.title}: {each.reason}" for each in estimates if not each.recommended]
+    plan = estimates[0].plan
+    heading = f"{plan.places} places, {plan.flight_min:g} min, {plan.pack.cells}S{plan.pack.capacity_mah}"
+    return "\n".join([heading, "", *aligned(rows, left=2), *(line for note in none for line in wrapped(note))])
+
+
+def _on_board(estimate: FlightEstimate) -> list[str]:
+    row = next((row for row in estimate.techniques if row.option.label == estimate.recommended), None)
+    if row is None:
+        return [estimate.board, "none", *("" for _ in _BOARD[2:])]
+    fit = row.option.fit
+    asked = f"{fit.reachable_hz:.3g} of {estimate.plan.rate_hz:g}"
+    charge = f"{row.flight_mah:.1f}", f"{row.flight_marginal_mah:.2f}", f"{row.flight_pack_frac:.1%}"
+    return [estimate.board, row.option.label, f"{fit.process_ram_mb:.0f}", asked, f"{fit.t_query_s:.2f}", *charge]
 
 
 def _needs(row: TechniqueEstimate) -> list[str]:

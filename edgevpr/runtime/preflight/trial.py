@@ -4,19 +4,23 @@ library that crashes on this processor fails only its own trial.
 `python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints a Trial as JSON.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from edgevpr import techniques
 from edgevpr.core.child import ask_child, serve_parent
 from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import EdgevprError
+from edgevpr.power import machine
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import weights_of
 
 _TRIED_S = 1.0  # pictures are tried again for so long; the check before a flight has no time for that
+_TRIAL_MB = 1500.0  # of RAM for each that runs beside others; the largest networks take less
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
@@ -54,19 +58,31 @@ def offers(
     return tuple(listed)
 
 
-def try_each(wanted: Iterable[Trial], threads: int) -> Iterator[Trial]:
+def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
     """Make each of the `wanted` trials in a child process, and yield it with its result. A technique that cannot be
-    used has one result, labelled with its name. `threads`: number of threads for networks."""
+    used has one result, labelled with its name. `threads`: number of threads for networks.
+
+    Where cores and RAM allow, several are made at once, each with its own cores."""
     refused = set()
-    for offer in wanted:
-        if offer.name not in refused:
-            try:
-                job = {"threads": threads, "trial": asdict(offer)}
-                answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}")
-                yield build(Trial, answer, "a trial")
-            except EdgevprError as error:
-                refused.add(offer.name)
-                yield replace(offer, label=offer.name, problem=str(error))
+    at_once = max(1, min(int(machine.cores()) // threads, int(machine.ram_limit_mb() // _TRIAL_MB)))
+    pool = ThreadPoolExecutor(at_once)
+    try:
+        for trial in pool.map(partial(_tried, threads), wanted):
+            if trial.name not in refused:
+                yield trial
+            if trial.problem:
+                refused.add(trial.name)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _tried(threads: int, offer: Trial) -> Trial:
+    try:
+        job = {"threads": threads, "trial": asdict(offer)}
+        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}")
+        return build(Trial, answer, "a trial")
+    except EdgevprError as error:
+        return replace(offer, label=offer.name, problem=str(error))
 
 
 def _try_here(job: dict[str, Any]) -> dict[str, Any]:
