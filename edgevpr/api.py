@@ -1,0 +1,199 @@
+"""The Python interface: `edgevpr.build` makes a map, `edgevpr.Map` finds pictures in it. Everything else in the package
+may change from version to version; this may not.
+
+    import cv2, edgevpr
+
+    edgevpr.build("valley.gpkg", "photos/", camera="nadir")
+    with edgevpr.Map("valley.gpkg") as valley:
+        match = valley.match(cv2.imread("later.jpg"), heading_deg=90)
+    print(match.position, match.accuracy_m, match.reason)
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edgevpr.core.arrays import Covariance, Image
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.text import progress
+from edgevpr.core.types import Frame, Place, Position
+from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder, make_map
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.recognise.recognition import Recognition
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Match:
+    """Answer to one picture. None: unknown, or nothing was found.
+
+    `accepted`: the picture shows `place`, and `reason` says why, or why not. `confidence`: probability that it does.
+    `position`: where the aircraft was, if it is accepted. `accuracy_m`: its standard deviation, metres.
+    `covariance_m2`: (variance east, covariance, variance north). `of_place`: `position` is that of the place, since
+    nothing is known of the way from there. `heading_deg`: compass direction of the top of the picture. `turned_deg`:
+    rotation of the picture against that of the place, clockwise. `t_query_s`: seconds that it took.
+    """
+
+    accepted: bool
+    reason: str
+    place: Place | None
+    score: float | None
+    confidence: float | None
+    position: Position | None
+    accuracy_m: float | None
+    covariance_m2: Covariance | None
+    of_place: bool
+    heading_deg: float | None
+    turned_deg: float | None
+    t_query_s: float
+
+    def geojson(self) -> dict[str, Any]:
+        """Return the position as a GeoJSON feature; its geometry is None without a position."""
+        at = self.position
+        about = {
+            "accepted": self.accepted,
+            "reason": self.reason,
+            "confidence": self.confidence,
+            "accuracy_m": self.accuracy_m,
+            "place": self.place and self.place.place_id,
+        }
+        geometry = None if at is None else {"type": "Point", "coordinates": [at.lon_deg, at.lat_deg]}
+        return {"type": "Feature", "geometry": geometry, "properties": about}
+
+
+class Map:
+    """A map file, opened to find pictures in.
+
+    `config`: a configuration of a flight (None: the shipped one). `fov_deg`: field of view across the longest side of
+    the pictures; with it they are untilted and scaled by attitude and height. `accept_precision`: probability that a
+    match must have. `follow`: the pictures are those of one flight, in order. Raises EdgevprError for a map that cannot
+    be used. Not safe to use from several threads at once.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        config: str | Path | None = None,
+        fov_deg: float | None = None,
+        accept_precision: float | None = None,
+        follow: bool = False,
+    ) -> None:
+        wanted = {"map": str(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
+        settings = load_config(config, wanted)
+        self._needs_height = settings.source.fov_deg is not None
+        known = ("heading", "height", "reach") if self._needs_height else ("heading", "reach")
+        self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
+
+    def __enter__(self) -> "Map":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self._recogniser.place_map)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._recogniser.place_map.close()
+
+    def places(self) -> Iterator[Place]:
+        """Yield the places as they are read from the file: number, picture, position, heading and pose of each."""
+        yield from self._recogniser.place_map.places()
+
+    def match(
+        self,
+        image: Image,
+        *,
+        heading_deg: float | None = None,
+        height_m: float | None = None,
+        roll_deg: float | None = None,
+        pitch_deg: float | None = None,
+        near: Position | None = None,
+        t_s: float | None = None,
+    ) -> Match:
+        """Find the place of a picture, uint8 (H, W) grey or (H, W, 3) blue, green, red.
+
+        `heading_deg`: compass direction of the nose. `height_m`: above the ground; it counts with `fov_deg` only, and
+        is needed then. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: places within 300 m of it are searched, and a
+        few others in case that is wrong. `t_s`: when it was taken, seconds of any clock (None: now); it counts with
+        `follow`. Raises ImageError for a picture that cannot be used, UsageError for a missing height.
+        """
+        if self._needs_height and height_m is None:
+            raise UsageError("The map was opened with a field of view: give the height_m of each picture too.")
+        frame = Frame(
+            image=image,
+            name="",
+            t_mono_s=time.monotonic() if t_s is None else t_s,
+            position=near,
+            heading_deg=heading_deg,
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
+            height_m=height_m,
+        )
+        event = self._recogniser.step(frame)
+        if event.failed:
+            raise ImageError(event.reason)
+        return _match_of(event)
+
+
+def _match_of(event: Recognition) -> Match:
+    best, where, cost = event.best, event.located, event.cost
+    return Match(
+        accepted=event.accepted,
+        reason=event.reason,
+        place=best.place if best else None,
+        score=best.match.score if best else None,
+        confidence=event.confidence,
+        position=event.position,
+        accuracy_m=event.accuracy_m,
+        covariance_m2=where.covariance_m2 if where else None,
+        of_place=bool(where and not where.places),
+        heading_deg=where.heading_deg if where else None,
+        turned_deg=best.match.rotation_deg if best else None,
+        t_query_s=cost.t_encode_s + cost.t_match_s,
+    )
+
+
+def build(
+    path: str | Path,
+    images: str | Path | None = None,
+    *,
+    camera: str | None = None,
+    technique: str | None = None,
+    positions: str | Path | None = None,
+    rate_hz: float | None = None,
+    orthophoto: str | Path | None = None,
+    footprint_m: float | None = None,
+    spacing_m: float | None = None,
+    config: str | Path | None = None,
+    refine: bool = True,
+    calibrate: bool = True,
+    unusable: Callable[[ImageError], None] = lambda error: None,
+    shown: Callable[[Iterable[Any], int, str], Iterable[Any]] = progress,
+) -> MadeMap:
+    """Make a map of a folder of pictures or a video, or of an orthophoto with the ground that a picture shows and the
+    ground from place to place, as `edgevpr map build` does; the arguments are its flags. `unusable` is called with an
+    error for each picture that is left out; `shown` wraps what is worked through, to show progress. Raises
+    EdgevprError."""
+    settings = load_config(config, {"source.camera": camera})
+    pictures: FlownPictures | Cuttings
+    if images is not None and orthophoto is None:
+        table = None if positions is None else Path(positions)
+        pictures = FlownPictures(source=str(images), positions=table, rate_hz=rate_hz)
+    elif orthophoto is not None and images is None and footprint_m and spacing_m:
+        pictures = Cuttings(orthophoto=str(orthophoto), footprint_m=footprint_m, spacing_m=spacing_m)
+    else:
+        raise UsageError("Give either images, or an orthophoto with footprint_m and spacing_m.")
+    order = MapOrder(
+        path=str(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
+    )
+    return make_map(order, settings, unusable, shown)
+
+
+__all__: Sequence[str] = ("Map", "Match", "build")

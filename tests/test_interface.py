@@ -1,0 +1,118 @@
+"""The Python interface, and the scripts in examples/ that use it, run as a user runs them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pictures import textured
+
+import edgevpr
+from edgevpr.core.errors import ImageError, MapError, UsageError
+from edgevpr.core.types import Position
+
+pytestmark = pytest.mark.slow
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PLACES = 6
+
+
+def seen(place, turned_deg=0.0):
+    """The ground at a place, seen from straight above."""
+    ground = textured(place, 800, 800)
+    turn = cv2.getRotationMatrix2D((400, 400), turned_deg, 1.0)
+    return cv2.warpAffine(ground, turn, (800, 800))[240:560, 240:560]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Mapped pictures with positions in mapped/, the same turned and darker in later/."""
+    folder = tmp_path_factory.mktemp("flight")
+    rows = ["file,lat,lon,yaw_deg"]
+    for side in ("mapped", "later"):
+        (folder / side).mkdir()
+    for place in range(PLACES):
+        cv2.imwrite(str(folder / "mapped" / f"{place}.jpg"), seen(place))
+        cv2.imwrite(str(folder / "later" / f"{place}.jpg"), cv2.convertScaleAbs(seen(place, 45), alpha=0.8))
+        rows.append(f"{place}.jpg,{50 + 0.002 * place:.6f},8,0")
+    (folder / "mapped" / "positions.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def valley(flight):
+    path = flight / "valley.gpkg"
+    made = edgevpr.build(path, flight / "mapped", camera="nadir", calibrate=False)
+    assert (made.technique, made.places, made.with_position) == ("cohog", PLACES, PLACES)
+    return path
+
+
+def test_a_picture_is_found_with_its_position_and_what_it_rests_on(flight, valley):
+    with edgevpr.Map(valley) as ground:
+        assert len(ground) == PLACES
+        assert [place.source_image for place in ground.places()] == [f"{place}.jpg" for place in range(PLACES)]
+        match = ground.match(cv2.imread(str(flight / "later" / "3.jpg")))
+        assert match.accepted
+        assert match.place.source_image == "3.jpg"
+        assert match.position.lat_deg == pytest.approx(50.006, abs=1e-4)
+        assert match.confidence > 0.999
+        assert (
+            abs((match.turned_deg - 315 + 180) % 360 - 180) <= 15
+            or abs((match.turned_deg - 45 + 180) % 360 - 180) <= 15
+        )
+        assert match.t_query_s > 0
+        feature = json.loads(json.dumps(match.geojson()))
+        assert feature["geometry"]["coordinates"] == [match.position.lon_deg, match.position.lat_deg]
+        nothing = ground.match(np.full((240, 320, 3), 90, np.uint8))
+        assert (nothing.accepted, nothing.position, nothing.geojson()["geometry"]) == (False, None, None)
+        assert nothing.reason
+
+
+def test_what_is_known_narrows_the_search(flight, valley):
+    picture = cv2.imread(str(flight / "later" / "3.jpg"))
+    with edgevpr.Map(valley) as ground:
+        turned_deg = ground.match(picture).turned_deg
+        assert ground.match(picture, heading_deg=turned_deg).accepted
+        assert not ground.match(picture, heading_deg=turned_deg + 90).accepted
+        assert ground.match(picture, near=Position(50.006, 8.0)).accepted
+
+
+def test_what_cannot_be_done_gets_a_sentence(flight, valley, tmp_path):
+    with pytest.raises(MapError, match="nowhere"):
+        edgevpr.Map(tmp_path / "nowhere.gpkg")
+    with edgevpr.Map(valley) as ground, pytest.raises(ImageError):
+        ground.match(None)
+    with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
+        ground.match(seen(1))
+    with pytest.raises(UsageError, match="footprint_m"):
+        edgevpr.build(tmp_path / "m.gpkg", orthophoto="x.tif")
+    with pytest.raises(AttributeError):
+        edgevpr.Mop  # noqa: B018
+
+
+@pytest.mark.process
+def test_the_package_is_light_until_the_interface_is_asked_for():
+    code = "import sys, edgevpr; assert 'numpy' not in sys.modules; edgevpr.Map; assert 'numpy' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("script", "more", "said"),
+    [
+        ("build_and_match.py", ["{flight}/mapped", "{flight}/later", "{tmp}/m.geojson"], "3.jpg  50.006"),
+        ("own_frames.py", ["{valley}", "{flight}/later"], "5.0 s  yes"),
+        ("to_ros2.py", ["{valley}", "{flight}/later"], "pose "),
+    ],
+)
+def test_the_examples_run(flight, valley, tmp_path, script, more, said):
+    words = [word.format(flight=flight, valley=valley, tmp=tmp_path) for word in more]
+    done = subprocess.run([sys.executable, EXAMPLES / script, *words], capture_output=True, text=True, env=os.environ)
+    assert done.returncode == 0, done.stderr
+    assert said in done.stdout
+    if script == "build_and_match.py":
+        assert len(json.loads((tmp_path / "m.geojson").read_text())["features"]) == PLACES
