@@ -10,7 +10,8 @@ __version__ = "0.1.0"
 # and then compares it with the header of a picture before any pixel is decoded.
 os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = "102100000"
 
-_INTERFACE = ("Map", "Match", "build")  # loaded when they are asked for: `import edgevpr` and the commands stay light
+# Loaded when they are asked for: `import edgevpr` and the commands stay light.
+_INTERFACE = ("Cuttings", "FlownPictures", "Map", "Match", "build")
 
 
 def __getattr__(name: str) -> object:

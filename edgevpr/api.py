@@ -9,8 +9,9 @@ may change from version to version; this may not.
     print(match.position, match.accuracy_m, match.reason)
 """
 
+import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,6 +26,8 @@ from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder,
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,38 +165,26 @@ def _match_of(event: Recognition) -> Match:
 
 def build(
     path: str | Path,
-    images: str | Path | None = None,
+    images: str | Path | FlownPictures | Cuttings,
     *,
     camera: str | None = None,
     technique: str | None = None,
-    positions: str | Path | None = None,
-    rate_hz: float | None = None,
-    orthophoto: str | Path | None = None,
-    footprint_m: float | None = None,
-    spacing_m: float | None = None,
     config: str | Path | None = None,
     refine: bool = True,
     calibrate: bool = True,
-    unusable: Callable[[ImageError], None] = lambda error: None,
-    shown: Callable[[Iterable[Any], int, str], Iterable[Any]] = progress,
 ) -> MadeMap:
-    """Make a map of a folder of pictures or a video, or of an orthophoto with the ground that a picture shows and the
-    ground from place to place, as `edgevpr map build` does; the arguments are its flags. `unusable` is called with an
-    error for each picture that is left out; `shown` wraps what is worked through, to show progress. Raises
-    EdgevprError."""
-    settings = load_config(config, {"source.camera": camera})
-    pictures: FlownPictures | Cuttings
-    if images is not None and orthophoto is None:
-        table = None if positions is None else Path(positions)
-        pictures = FlownPictures(source=str(images), positions=table, rate_hz=rate_hz)
-    elif orthophoto is not None and images is None and footprint_m and spacing_m:
-        pictures = Cuttings(orthophoto=str(orthophoto), footprint_m=footprint_m, spacing_m=spacing_m)
-    else:
-        raise UsageError("Give either images, or an orthophoto with footprint_m and spacing_m.")
+    """Make a map as `edgevpr map build` does, and show the progress on stderr.
+
+    `images`: a folder of pictures or a video; `FlownPictures` say more of them, and `Cuttings` take an orthophoto.
+    `camera`: "nadir" or "forward". `technique`: None chooses it. `config`: a configuration of the flight (None: the
+    shipped one). Pictures that cannot be used are left out with a warning. Raises EdgevprError.
+    """
+    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=str(images))
     order = MapOrder(
         path=str(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
-    return make_map(order, settings, unusable, shown)
+    settings = load_config(config, {"source.camera": camera})
+    return make_map(order, settings, lambda error: _log.warning("%s", error), progress)
 
 
-__all__: Sequence[str] = ("Map", "Match", "build")
+__all__ = ("Cuttings", "FlownPictures", "Map", "Match", "build")

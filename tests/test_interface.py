@@ -12,7 +12,7 @@ import pytest
 from pictures import textured
 
 import edgevpr
-from edgevpr.core.errors import ImageError, MapError, UsageError
+from edgevpr.core.errors import ImageError, MapError, SourceError, UsageError
 from edgevpr.core.types import Position
 
 pytestmark = pytest.mark.slow
@@ -88,8 +88,10 @@ def test_what_cannot_be_done_gets_a_sentence(flight, valley, tmp_path):
         ground.match(None)
     with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
         ground.match(seen(1))
-    with pytest.raises(UsageError, match="footprint_m"):
-        edgevpr.build(tmp_path / "m.gpkg", orthophoto="x.tif")
+    with pytest.raises(SourceError, match="nothing"):
+        edgevpr.build(
+            tmp_path / "m.gpkg", edgevpr.Cuttings(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)
+        )
     with pytest.raises(AttributeError):
         edgevpr.Mop  # noqa: B018
 
