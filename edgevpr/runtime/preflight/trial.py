@@ -19,7 +19,7 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import weights_of
 
-_TRIED_S = 1.0  # pictures are tried again for so long; the check before a flight has no time for that
+_TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
 _TRIAL_MB = 1500.0  # of RAM for each that runs beside others; the largest networks take less
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
