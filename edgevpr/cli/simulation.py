@@ -40,7 +40,7 @@ def add(commands: Any) -> None:
     flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (default), or a later one")
     flight.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another landscape and sway (1)")
     over = flight.add_argument_group("over an orthophoto")
-    over.add_argument("--orthophoto", metavar="FILE", help="as for `map build`: needs edgevpr[maps]")
+    over.add_argument("--orthophoto", metavar="FILE", help="as for `map build`: needs rasterio")
     over.add_argument(
         "--track",
         metavar="FILE",

@@ -254,5 +254,5 @@ def _needing_scipy() -> Iterator[None]:
     except ModuleNotFoundError as error:
         raise UsageError(
             f"Refining and calibrating a map need SciPy ({error}): install it on the machine that builds maps, with "
-            "`pip install 'edgevpr[maps]'`, and run `edgevpr map refine` and `edgevpr map calibrate`."
+            "`pip install scipy`, and run `edgevpr map refine` and `edgevpr map calibrate`."
         ) from error

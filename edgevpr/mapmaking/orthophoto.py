@@ -34,7 +34,7 @@ try:
     from rasterio.windows import Window
 except ModuleNotFoundError as error:
     raise SourceError(
-        f"An orthophoto is read with rasterio, and {error.name} is not installed: pip install 'edgevpr[maps]'."
+        f"An orthophoto is read with rasterio, and {error.name} is not installed: run `pip install rasterio scipy`."
     ) from error
 
 logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words

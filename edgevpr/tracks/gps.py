@@ -16,7 +16,7 @@ _FIX, _FIX_2D = "0x47505346", 2  # GPSF of GoPro, and from which value on there 
 
 def read_gpx(path: Path) -> Record:
     """Read the points with a time of all tracks of a GPX file; a time without a zone is UTC."""
-    require("gpxpy", "A GPX file")
+    require("gpxpy", "gpxpy", "A GPX file")
     import gpxpy
     from gpxpy.gpx import GPXException
 
@@ -36,7 +36,7 @@ def read_gpx(path: Path) -> Record:
 
 def read_film(path: Path) -> Record:
     """Read the positions that a camera wrote into its film. Their times are those of the film."""
-    require("telemetry_parser", "The telemetry of a film")
+    require("telemetry_parser", "telemetry-parser", "The telemetry of a film")
     import telemetry_parser
 
     try:

@@ -107,7 +107,7 @@ def _messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> l
 def read_px4(path: Path) -> Record:
     """Read a log of PX4: its estimate of position, height over the place where it started, attitude, and
     `camera_capture`."""
-    require("pyulog", "A log of PX4")
+    require("pyulog", "pyulog", "A log of PX4")
     from pyulog import ULog
 
     try:

@@ -63,9 +63,7 @@ def track_of(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
     return Track(path, tuple(kept), tuple(kept.values())) if kept else None
 
 
-def require(library: str, what: str) -> None:
-    """Raise UsageError if a library that reads `what` is not installed."""
-    if find_spec(library) is None:
-        raise UsageError(
-            f"{what} is read by {library}, which is not here: pip install 'edgevpr[tracks]', or {library}."
-        )
+def require(module: str, package: str, what: str) -> None:
+    """Raise UsageError if the module that reads `what` is not installed; `package` is its name on PyPI."""
+    if find_spec(module) is None:
+        raise UsageError(f"{what} is read by {package}, which is not here: run `pip install {package}`.")

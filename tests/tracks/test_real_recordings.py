@@ -83,6 +83,8 @@ def fetched(name):
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_real_recording_is_read(name):
+    if name.endswith(".mp4"):
+        pytest.importorskip("telemetry_parser", reason="it has no wheel for this Python")
     kind, count, where, lasts_s = RECORDINGS[name]
     record = read_record(fetched(name))
     assert kind in record.kind

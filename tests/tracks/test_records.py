@@ -1,13 +1,16 @@
 """Reading what recordings say: each format, whole and damaged, and what a reader makes of it."""
 
 import struct
+from importlib.util import find_spec
 
 import pytest
 from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
 
 from edgevpr.core.errors import UsageError
+from edgevpr.tracks import record
 from edgevpr.tracks.record import read_record
 
+HAS_FILMS, NO_FILMS = find_spec("telemetry_parser") is not None, "telemetry-parser has no wheel for this Python"
 # seconds, lat, lon, alt, height, roll, pitch, yaw
 POINTS = [(t, -35.36 + 1e-4 * t, 149.16 + 2e-4 * t, 600.0 + t, 20.0 + t, 5.0, -3.0, 280.0) for t in range(6)]
 SHOTS = [(t + 0.5, -35.5 + 1e-4 * t, 149.5, 610.0, 30.0, 1.0, 2.0, 90.0) for t in range(3)]
@@ -191,7 +194,7 @@ def test_the_gimbal_of_a_table_counts_before_the_nose(tmp_path):
         ("t.srt", b"", "no position"),
         ("t.srt", b"1\n00:00:01,000 --> 00:00:02,000\n[latitude: 0.0] [longitude: 0.0]\n", "no position"),
         ("t.gpx", b"<gpx", "GPX"),
-        ("t.mp4", b"nothing", "telemetry"),
+        pytest.param("t.mp4", b"nothing", "telemetry", marks=pytest.mark.skipif(not HAS_FILMS, reason=NO_FILMS)),
     ],
 )
 def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
@@ -200,3 +203,11 @@ def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
         read_record(tmp_path / name)
     with pytest.raises(UsageError, match="no file"):
         read_record(tmp_path / "nothing.bin")
+
+
+@pytest.mark.parametrize("ending", [".gpx", ".ulg", ".mp4"])
+def test_without_its_reader_the_sentence_says_what_to_install(tmp_path, monkeypatch, ending):
+    monkeypatch.setattr(record, "find_spec", lambda name: None)
+    (tmp_path / f"t{ending}").write_bytes(b"")
+    with pytest.raises(UsageError, match="pip install"):
+        read_record(tmp_path / f"t{ending}")
