@@ -11,7 +11,10 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map build": (
         ("photographs that look straight down", "valley.gpkg --images photos/ --camera nadir"),
         ("a video, a place each second", "road.gpkg --images flight.mp4 --rate-hz 1"),
-        ("a picture from space, for a camera that shows 120 m", "town.gpkg --orthophoto town.tif --footprint-m 120"),
+        (
+            "a picture from space, for a camera that shows 120 m",
+            "town.gpkg --orthophoto town.tif --footprint-m 120 --spacing-m 30",
+        ),
     ),
     "map refine": (("after learning in flight", "valley.gpkg --images photos/"),),
     "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
@@ -20,7 +23,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map repair": (("after `map check` has named damage", "valley.gpkg"),),
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
     "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
-    "salience": (("what of a flight is worth remembering", "photos/"),),
+    "salience": (("what of a picture is worth remembering", "photos/0042.jpg"),),
     "match": (
         ("where later pictures were taken", "valley.gpkg --images later/"),
         ("with what a flight knows beside them", "valley.gpkg --images later/ --known heading,height"),
@@ -47,7 +50,10 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     ),
     "eval": (("techniques on a data set", "--data my_set/ --techniques cohog,hog --camera nadir"),),
     "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv"),),
-    "simulate flight": (("a generated mapping flight, and a later one over it", "later --which query"),),
+    "simulate flight": (
+        ("a generated mapping flight", "mapping"),
+        ("a later one over the same ground", "later --which query"),
+    ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
     "models list": (("which networks there are", ""),),
     "models verify": (("try them all", ""),),

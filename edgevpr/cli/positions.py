@@ -35,7 +35,6 @@ def positions(args: Namespace) -> int:
     """Run `positions`: write the table that all other commands find beside the pictures."""
     from edgevpr.core.errors import UsageError
     from edgevpr.core.text import at_work
-    from edgevpr.frames.images import list_images
     from edgevpr.frames.positions import write_positions, write_track
     from edgevpr.tracks.placing import place_pictures, place_video, rounded_m
     from edgevpr.tracks.record import read_record
@@ -61,7 +60,7 @@ def positions(args: Namespace) -> int:
         "how": placed.how,
         "offset_s": placed.offset_s,
         "placed": len(placed.track.t_s) if placed.track else sum(bool(tag.position) for tag in placed.tags.values()),
-        "of": None if placed.track else len(list_images(source)),
+        "of": None if placed.track else placed.pictures,
         "rounded_m": rounded_m(placed),
         "out": str(out),
     }

@@ -155,6 +155,9 @@ def progress(
 @contextmanager
 def at_work(text: str, stream: TextIO | None = None) -> Iterator[None]:
     """Write `text` and the seconds so far to `stream` (None: stderr) every 5 s until the body of `with` has ended."""
+    if is_quiet():
+        yield
+        return
     stream, ended, began_s = stream or sys.stderr, Event(), time.monotonic()
 
     def tell() -> None:
@@ -162,8 +165,6 @@ def at_work(text: str, stream: TextIO | None = None) -> Iterator[None]:
             stream.write(f"{text}, {time.monotonic() - began_s:.0f} s so far\n")
             stream.flush()
 
-    if is_quiet():
-        ended.set()
     teller = Thread(target=tell, daemon=True)
     teller.start()
     try:

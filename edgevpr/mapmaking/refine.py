@@ -322,6 +322,4 @@ def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
 
 
 def _tie(seen: Overlay, sds: tuple[float, float]) -> Tie:
-    dx, dy = seen.shift_share
-    turned = np.radians((seen.rotation_deg + 180) % 360 - 180)
-    return Tie(complex(dx, -dy), complex(np.log(seen.scale or 1.0), -turned), *sds)
+    return Tie(*seen.step_and_turn, *sds)

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.arrays import Complexes, Doubles
+from edgevpr.core.arrays import Complexes, Doubles, Ints
 from edgevpr.core.errors import ImageError
 from edgevpr.core.geodesy import metres
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import MOST_GAP_S, Track
-from edgevpr.runtime.recognise.agreement import PROVEN, agreement
+from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, describe
 
 _LANDMARKS = 500
@@ -36,8 +36,9 @@ def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]
     at, changes = _changes_of(paths)
     if len(at) < _FEWEST:
         return None
-    t_s, offsets_s = np.array(times_s), np.arange(-_WITHIN_S, _WITHIN_S + _STEP_S, _STEP_S)
-    costs, turning = np.array([_cost(track, t_s, at, changes, each) for each in offsets_s]).T
+    offsets_s = np.arange(-_WITHIN_S, _WITHIN_S + _STEP_S, _STEP_S)
+    places = _places(track, np.array(times_s) + offsets_s[:, None])
+    costs, turning = np.array([_cost(there, at, changes) for there in places]).T
     best = int(np.argmin(costs))
     further = abs(offsets_s - offsets_s[best]) > _NEAR_S
     if turning[best] < _FEWEST or costs[best] > _BETTER * costs[further].min():
@@ -45,10 +46,9 @@ def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]
     return float(offsets_s[best])
 
 
-def _cost(track: Track, t_s: Doubles, at: np.ndarray, changes: Complexes, offset_s: float) -> tuple[float, float]:
-    """Return by how much the changes of movement differ from those of the track, 0..1, and how many of these are
-    large; `at` are the numbers of the first of three pictures each."""
-    there = _places(track, t_s + offset_s)
+def _cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]:
+    """Return by how much the changes of movement differ, 0..1, and how many turns agree, if the pictures were taken
+    `there`, complex (N,). `at`, int (C,), are the numbers of the first of three pictures each."""
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = np.log((there[at + 2] - there[at + 1]) / (there[at + 1] - there[at]))
         off = changes - expected
@@ -61,7 +61,8 @@ def _cost(track: Track, t_s: Doubles, at: np.ndarray, changes: Complexes, offset
 
 
 def _places(track: Track, t_s: Doubles) -> Complexes:
-    """Return where the track is at each time, east + i north in metres; NaN outside it and in its gaps."""
+    """Return where the track is at each of `t_s`, east + i north in metres: complex of its shape, NaN outside the track
+    and in its gaps."""
     known_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
     east_m, north_m = metres(lat_deg, lon_deg)
@@ -71,7 +72,7 @@ def _places(track: Track, t_s: Doubles) -> Complexes:
     return np.where(is_known, found, np.nan)
 
 
-def _changes_of(paths: Iterable[Path]) -> tuple[np.ndarray, Complexes]:
+def _changes_of(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     """Return, of each three neighbouring pictures that show the same ground, the number of the first, and the logarithm
     of the factor, a complex number, by which the movement changes."""
     moves = [_move(one, other) for one, other in pairwise(_marks(paths))]
@@ -96,5 +97,4 @@ def _move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
     seen = agreement(other, one) if one is not None and other is not None else None
     if seen is None or seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None:
         return None
-    right, down = seen.shift_share
-    return complex(right, -down), complex(np.log(seen.scale or 1.0), -np.radians(seen.rotation_deg))
+    return Overlay(seen.shift_share, seen.rotation_deg, seen.scale).step_and_turn

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
-from edgevpr.tracks.record import Record, require, track_of
+from edgevpr.frames.positions import GeoTag, parse_time
+from edgevpr.tracks.record import Record, require, tag_of, track_of
 
 _FIRST_YEAR = 1990  # receivers that have lost the time write others
 _FIX, _FIX_2D = "0x47505346", 2  # GPSF of GoPro, and from which value on there is a fix
@@ -29,7 +29,8 @@ def read_gpx(path: Path) -> Record:
     if points and not timed:
         raise UsageError(f"{path} has no times: export the track with them, for pictures are placed by time.")
     lines = [
-        (parse_time(point.time.isoformat()), _tag(point.latitude, point.longitude, point.elevation)) for point in timed
+        (parse_time(point.time.isoformat()), tag_of(point.latitude, point.longitude, point.elevation))
+        for point in timed
     ]
     return Record(kind="GPX track", track=track_of(path, lines))
 
@@ -61,11 +62,4 @@ def _lines(telemetry: list[dict[str, Any]]) -> Iterator[tuple[float, GeoTag]]:
         samples = np.array([sample[:3] for sample in block["Data"]], float) / np.array(block["Scale"][:3], float)
         lasts_s = min(end_s - began_s, 1.0)  # a fix may be lost between two blocks
         for at, (lat_deg, lon_deg, alt_m) in enumerate(samples.tolist()):
-            yield began_s + at * lasts_s / len(samples), _tag(lat_deg, lon_deg, alt_m)
-
-
-def _tag(lat_deg: float, lon_deg: float, alt_m: float | None) -> GeoTag:
-    if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
-        return GeoTag()
-    is_possible = alt_m is not None and ALT_M[0] <= alt_m <= ALT_M[1]
-    return GeoTag(position=position_or_none(lat_deg, lon_deg, alt_m if is_possible else None))
+            yield began_s + at * lasts_s / len(samples), tag_of(lat_deg, lon_deg, alt_m)

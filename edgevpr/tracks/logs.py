@@ -13,8 +13,8 @@ import numpy as np
 
 from edgevpr.core.arrays import Array
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.positions import ALT_M, GeoTag, position_or_none
-from edgevpr.tracks.record import Record, require, track_of
+from edgevpr.frames.positions import GeoTag
+from edgevpr.tracks.record import Attitude, Record, require, tag_of, track_of
 
 _FIX_3D = 3  # GPS status from which on a position counts
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
@@ -27,7 +27,6 @@ _OF_PX4 = (
     "camera_capture",
 )
 
-Attitude = tuple[float, float | None, float | None]  # yaw, roll and pitch, degrees
 Topic = dict[str, Array]  # the values of a field of a PX4 message, by its name
 Topics = dict[str, Topic]
 
@@ -47,7 +46,7 @@ def read_ardupilot(path: Path) -> Record:
         elif kind != "GPS" or message.Status >= _FIX_3D:
             height_m = getattr(message, "RelHomeAlt", getattr(message, "RelAlt", None))
             own = _angles(message) if kind in ("CAM", "TRIG") else attitude
-            tag = _tag(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
+            tag = tag_of(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
             lines[kind].append((message._timestamp, tag))
     shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
     return Record(kind="ArduPilot log", track=track_of(path, lines["POS"] or lines["GPS"]), shots=shots)
@@ -77,10 +76,10 @@ def read_telemetry(path: Path) -> Record:
             attitude = degrees(message.yaw), degrees(message.roll), degrees(message.pitch)
         elif kind == "CAMERA_FEEDBACK":
             turned = message.yaw, message.roll, message.pitch
-            shots.append(_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, turned, message.alt_rel))
+            shots.append(tag_of(message.lat / 1e7, message.lng / 1e7, message.alt_msl, turned, message.alt_rel))
         else:
             heading = attitude or (None if message.hdg == _NO_HEADING else (message.hdg / 100, None, None))
-            tag = _tag(message.lat / 1e7, message.lon / 1e7, message.alt / 1000, heading, message.relative_alt / 1000)
+            tag = tag_of(message.lat / 1e7, message.lon / 1e7, message.alt / 1000, heading, message.relative_alt / 1000)
             lines.append((message._timestamp, tag))
     return Record(kind="telemetry log", track=track_of(path, lines), shots=tuple(shots))
 
@@ -142,8 +141,9 @@ def _tags_of(data: Topics, positions: Topic | None) -> list[tuple[float, GeoTag]
         return []
     at_us = positions["timestamp"]
     t_utc_s = at_us / 1e6 + _behind_utc_s(data)
-    where = positions["lat"], positions["lon"], positions["alt"], _attitude_at(data, at_us), _heights_at(data, at_us)
-    return list(zip(t_utc_s.tolist(), map(_tag, *where), strict=True))
+    where = (positions[name].tolist() for name in ("lat", "lon", "alt"))
+    tags = map(tag_of, *where, _attitude_at(data, at_us), _heights_at(data, at_us))
+    return list(zip(t_utc_s.tolist(), tags, strict=True))
 
 
 def _behind_utc_s(data: Topics) -> float:
@@ -172,23 +172,3 @@ def _attitude_at(data: Topics, at_us: Array) -> Sequence[Attitude | None]:
 def _heights_at(data: Topics, at_us: Array) -> Sequence[float | None]:
     told = data.get("vehicle_local_position")
     return [None] * len(at_us) if told is None else np.interp(at_us, told["timestamp"], -told["z"]).tolist()
-
-
-def _tag(
-    lat_deg: float,
-    lon_deg: float,
-    alt_m: float,
-    turned_deg: Attitude | None,
-    height_m: float | None,
-) -> GeoTag:
-    """Make a tag; `turned_deg` is (yaw, roll, pitch). Impossible values are unknown."""
-    yaw, roll_deg, pitch_deg = turned_deg or (None, None, None)
-    is_possible = abs(lat_deg) <= 90 and abs(lon_deg) <= 180
-    alt = alt_m if ALT_M[0] <= alt_m <= ALT_M[1] else None
-    return GeoTag(
-        position=position_or_none(float(lat_deg), float(lon_deg), alt and float(alt)) if is_possible else None,
-        heading_deg=None if yaw is None else yaw % 360,
-        roll_deg=roll_deg,
-        pitch_deg=pitch_deg,
-        height_m=height_m,
-    )

@@ -2,13 +2,14 @@
 the autopilot triggered them, or by time."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import EARTH_RADIUS_M
 from edgevpr.core.text import progress
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
@@ -20,18 +21,19 @@ from edgevpr.tracks.record import Record
 _ZONE_S, _MOST_ZONE = 900, 4 * 14  # time zones differ by quarters of an hour, and by 14 hours at most
 _LOOKED_AT = 200  # pictures that are compared to set the clock
 _LEAST_SHARE = 0.5  # of the pictures that must lie within the track
-_ROUNDED_DEG, _METRES_A_DEGREE = 1e-4, 111_195  # of latitude
+_ROUNDED_DEG = 1e-4  # as subtitles with four decimals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placed:
-    """`tags`: position and attitude of the pictures that were placed, by name; empty for a video. `track`: that of a
-    video, by its own time. `how`: in words, how pictures were told apart. `offset_s`: seconds added to the clock of the
-    camera (None: no clock was needed)."""
+    """`how`: in words, how pictures were told apart. `tags`: position and attitude of those of the `pictures` that were
+    placed, by name; empty for a video. `track`: that of a video, by its own time. `offset_s`: seconds added to the
+    clock of the camera (None: no clock was needed)."""
 
-    tags: Mapping[str, GeoTag]
-    track: Track | None
     how: str
+    tags: Mapping[str, GeoTag] = field(default_factory=dict)
+    pictures: int = 0
+    track: Track | None = None
     offset_s: float | None = None
 
 
@@ -55,7 +57,8 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
         raise UsageError(f"These positions ({record.kind}) are those of a video: give it as --images.")
     if not found:
         raise UsageError(f"No picture of {folder} is named there ({record.kind}): give the folder of these pictures.")
-    return Placed(tags={name: _filled(tag, own[name]) for name, tag in found.items()}, track=None, how=how)
+    tags = {name: _filled(tag, own[name]) for name, tag in found.items()}
+    return Placed(how=how, tags=tags, pictures=len(own))
 
 
 def _by_name(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
@@ -85,7 +88,7 @@ def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: fl
             tags[name] = _filled(replace(tag, t_utc_s=t_s + offset_s), own[name])
     if not tags:
         raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
-    return Placed(tags=tags, track=None, how=how, offset_s=offset_s)
+    return Placed(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
 
 
 def _filled(tag: GeoTag, own: GeoTag) -> GeoTag:
@@ -111,7 +114,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placed:
     track = replace(record.track, t_s=tuple((np.array(record.track.t_s) + shift_s).tolist()))
     if lasts_s:
         track.require_within(video, lasts_s)
-    return Placed(tags={}, track=track, how=how, offset_s=offset_s)
+    return Placed(how=how, track=track, offset_s=offset_s)
 
 
 def _zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
@@ -142,7 +145,11 @@ def _spans(track: Track, times_s: Doubles) -> str:
 
 
 def rounded_m(placed: Placed) -> float | None:
-    """Return to how many metres all positions are rounded, if it is much, as in subtitles with four decimals."""
+    """Return to how many metres all positions are rounded, if it is much (None: not)."""
     tags = placed.track.tags if placed.track else placed.tags.values()
     parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDED_DEG
-    return _ROUNDED_DEG * _METRES_A_DEGREE if np.allclose(parts, np.round(parts), rtol=0, atol=1e-4) else None
+    return (
+        float(np.radians(_ROUNDED_DEG)) * EARTH_RADIUS_M
+        if np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)
+        else None
+    )

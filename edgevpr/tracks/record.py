@@ -2,14 +2,16 @@
 films of action cameras, and tables of other programs. `read_record` finds out which a file is."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.positions import GeoTag, Track
+from edgevpr.frames.positions import ALT_M, GeoTag, Track, position_or_none
 
 _STILL_S = 1.0  # while nothing moves, a track keeps a line each second
+Attitude = tuple[float | None, float | None, float | None]  # heading, roll and pitch, degrees
+_UNKNOWN: Attitude = (None, None, None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +54,30 @@ def read_record(path: Path) -> Record:
     return record
 
 
+def tag_of(
+    lat_deg: float | None,
+    lon_deg: float | None,
+    alt_m: float | None = None,
+    attitude: Attitude | None = None,
+    height_m: float | None = None,
+) -> GeoTag:
+    """Make a tag of what a recording says. None and what is impossible, NaN too, are unknown."""
+    heading_deg, roll_deg, pitch_deg = attitude or _UNKNOWN
+    alt_m, height_m = (
+        each if each is not None and ALT_M[0] <= each <= ALT_M[1] else None for each in (alt_m, height_m)
+    )
+    position = None
+    if lat_deg is not None and lon_deg is not None and abs(lat_deg) <= 90 and abs(lon_deg) <= 180:
+        position = position_or_none(float(lat_deg), float(lon_deg), alt_m)
+    return GeoTag(
+        position=position,
+        heading_deg=None if heading_deg is None else heading_deg % 360,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        height_m=height_m,
+    )
+
+
 def track_of(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
     """Make a track of times and positions in any order; None if there is none. Of lines that repeat a position, as
     subtitles do for each frame, one a second is kept: between two lines positions are interpolated."""
@@ -59,7 +85,7 @@ def track_of(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
     last_s, last = float("-inf"), GeoTag()
     for t_s, tag in sorted(lines, key=lambda line: line[0]):
         if tag.position and (tag.position != last.position or t_s - last_s >= _STILL_S):
-            kept[t_s], last_s, last = replace(tag, t_utc_s=None), t_s, tag
+            kept[t_s], last_s, last = tag, t_s, tag
     return Track(path, tuple(kept), tuple(kept.values())) if kept else None
 
 

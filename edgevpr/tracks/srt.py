@@ -8,8 +8,8 @@ from pathlib import Path
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.frames.exif import from_straight_down
-from edgevpr.frames.positions import ALT_M, GeoTag, position_or_none
-from edgevpr.tracks.record import Record, track_of
+from edgevpr.frames.positions import GeoTag
+from edgevpr.tracks.record import Attitude, Record, tag_of, track_of
 
 _MAX_FILE_BYTES = 200_000_000  # an hour at 60 frames a second
 _STARTS = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
@@ -47,28 +47,17 @@ def _tag_of(block: str) -> GeoTag:
     named = {name.lower(): float(number) for name, number in _NAMED.findall(block)}
     lat_deg, height_m = named.get("lat", named.get("latitude")), named.get("rel_alt")
     lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
-    alt_m = named.get("abs_alt", named.get("altitude"))
     if gps := _GPS.search(block):
         lon_deg, lat_deg = float(gps[1]), float(gps[2])  # the third is an altitude, or the number of satellites
         if gps[4] or abs(lat_deg) > 90:  # the forms with an altitude in M have the latitude first
             lon_deg, lat_deg = lat_deg, lon_deg
     if height_m is None and (height := _HEIGHT.search(block)):
         height_m = float(height[1])
-    if lat_deg is None or lon_deg is None or not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
-        return GeoTag()
-    nose_deg, roll_deg, pitch_deg = named.get("drone_yaw", named.get("yaw")), None, None
-    heading_deg = None if nose_deg is None else nose_deg % 360
+    attitude: Attitude = (named.get("drone_yaw", named.get("yaw")), None, None)
     gimbal = [named[name] for name in ("gb_pitch", "gb_roll", "gb_yaw") if name in named]
     if told := _GIMBAL.search(block):
         gimbal = list(map(float, told.groups()))
     if len(gimbal) == 3 and any(gimbal):
         pitch, roll, yaw = gimbal
-        heading_deg, roll_deg, pitch_deg = from_straight_down(yaw, pitch, roll)
-    alt_m = alt_m if alt_m is not None and ALT_M[0] <= alt_m <= ALT_M[1] else None
-    return GeoTag(
-        position=position_or_none(lat_deg, lon_deg, alt_m),
-        heading_deg=heading_deg,
-        roll_deg=roll_deg,
-        pitch_deg=pitch_deg,
-        height_m=height_m,
-    )
+        attitude = from_straight_down(yaw, pitch, roll)
+    return tag_of(lat_deg, lon_deg, named.get("abs_alt", named.get("altitude")), attitude, height_m)

@@ -5,15 +5,15 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from math import inf
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.frames.exif import from_straight_down
 from edgevpr.frames.images import is_image
-from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
-from edgevpr.tracks.record import Record
+from edgevpr.frames.positions import GeoTag, parse_time
+from edgevpr.tracks.record import Attitude, Record, tag_of
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
@@ -110,23 +110,13 @@ def _tags_of(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, Ge
 def _tag_of(cells: Mapping[str, str]) -> GeoTag:
     """Make a tag of the cells of a row; an impossible position is unknown. Raises ValueError for what is no number."""
     number = {part: _angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
-    lat_deg, lon_deg, alt_m = number.get("lat", inf), number.get("lon", inf), number.get("alt")
-    is_possible = abs(lat_deg) <= 90 and abs(lon_deg) <= 180
-    heading_deg, roll_deg, pitch_deg = number.get("nose"), None, None
+    attitude: Attitude = (number.get("nose"), None, None)
     if {"yaw", "pitch", "roll"} <= number.keys():
-        heading_deg, roll_deg, pitch_deg = from_straight_down(number["yaw"], number["pitch"], number["roll"])
-    t_utc_s = None
-    with suppress(ValueError, OverflowError):
-        t_utc_s = parse_time(cells["time"]) if cells.get("time") else None
-    alt_m = alt_m if alt_m is not None and ALT_M[0] <= alt_m <= ALT_M[1] else None
-    return GeoTag(
-        position=position_or_none(lat_deg, lon_deg, alt_m) if is_possible else None,
-        heading_deg=None if heading_deg is None else heading_deg % 360,
-        t_utc_s=t_utc_s,
-        roll_deg=roll_deg,
-        pitch_deg=pitch_deg,
-        height_m=number.get("height"),
-    )
+        attitude = from_straight_down(number["yaw"], number["pitch"], number["roll"])
+    tag = tag_of(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
+    with suppress(KeyError, ValueError, OverflowError):  # no time, or none that can be read
+        return replace(tag, t_utc_s=parse_time(cells["time"]))
+    return tag
 
 
 def _angle(text: str) -> float:

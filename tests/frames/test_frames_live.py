@@ -8,14 +8,12 @@ import time
 import numpy as np
 import pytest
 from fakes import FakeClock
+from live_sources import PATIENCE_S, wait_for
 
 from edgevpr.core.errors import SourceError
-from edgevpr.frames import streams
 from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition, Refusal, Shot
 from edgevpr.frames.source import open_source
-
-PATIENCE_S = 60.0
 
 
 @pytest.fixture
@@ -24,30 +22,6 @@ def cameras():
     import live_cameras
 
     return live_cameras
-
-
-@pytest.fixture
-def opened(monkeypatch):
-    """open_source for live sources, with a short read time-out; closed at the end."""
-    monkeypatch.setattr(streams, "READ_TIMEOUT_S", 0.7)
-    sources = []
-
-    def open_live(uri):
-        sources.append(open_source(uri, live=True))
-        return sources[-1]
-
-    yield open_live
-    for source in sources:
-        source.close()
-
-
-def wait_for(condition):
-    """Turn until `condition()` is true and return what it gave."""
-    give_up_s = time.monotonic() + PATIENCE_S
-    while not (result := condition()):
-        assert time.monotonic() < give_up_s, "nothing happened"
-        time.sleep(0.01)
-    return result
 
 
 def next_frame(source):

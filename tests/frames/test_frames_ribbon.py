@@ -7,42 +7,24 @@ import time
 from pathlib import Path
 
 import pytest
+from live_sources import wait_for
 
 from edgevpr.core.errors import SourceError
-from edgevpr.frames import streams
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import is_live, open_source
 
 pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
-PATIENCE_S = 60.0
 
 
 @pytest.fixture
-def rpicam(tmp_path, monkeypatch):
-    """rpicam-vid on the path, and sources that end with the test."""
+def rpicam(tmp_path, monkeypatch, opened):
+    """rpicam-vid on the path, and a function that opens its camera."""
     program = tmp_path / "rpicam-vid"
     fake = Path(__file__).with_name("fake_rpicam.py")
     program.write_text(f'#!/bin/sh\nexec {sys.executable} {fake} "$@"\n')
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setattr(streams, "READ_TIMEOUT_S", 1.0)
-    sources = []
-
-    def opened(uri="rpicam"):
-        sources.append(open_source(uri, live=True))
-        return sources[-1]
-
-    yield opened
-    for source in sources:
-        source.close()
-
-
-def wait_for(condition):
-    give_up_s = time.monotonic() + PATIENCE_S
-    while not (result := condition()):
-        assert time.monotonic() < give_up_s, "nothing happened"
-        time.sleep(0.01)
-    return result
+    return lambda: opened("rpicam")
 
 
 def running():

@@ -13,7 +13,7 @@ from typing import Any
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import is_image, write_png
-from edgevpr.frames.positions import MOST_GAP_S, GeoTag, write_positions
+from edgevpr.frames.positions import MOST_GAP_S, GeoTag, find_track, write_positions
 from edgevpr.frames.source import open_source
 from edgevpr.lab.evaluate.asking import Progress
 from edgevpr.lab.evaluate.evaluate import all_frames
@@ -27,11 +27,10 @@ def pictures_of(given: Path, kept: Path, rate_hz: float | None, progress: Progre
     have a position. From a video `rate_hz` pictures a second are taken (None: every frame) and kept below the folder
     `kept`; `progress` shows it. Raises UsageError for a video without positions, ImageError for a damaged one,
     SourceError for a file that is no video, and EdgevprError for a full disk."""
-    table = given.with_suffix(".csv")
     if not given.is_file() or is_image(given.name):
         return given
-    if not table.is_file():
-        raise UsageError(f"{given} has no positions beside it: write {table.name} there ({_FORM}).")
+    if (table := find_track(given)) is None:
+        raise UsageError(f"{given} has no positions beside it: write {given.stem}.csv there ({_FORM}).")
     made = kept / key_of(given, stamp(given), stamp(table), rate_hz)
     if made.is_dir():
         return made

@@ -64,6 +64,14 @@ class Overlay:
         """Rotation and scale as one complex factor."""
         return np.complex64((self.scale or 1.0) * np.exp(1j * np.deg2rad(self.rotation_deg)))
 
+    @property
+    def step_and_turn(self) -> tuple[complex, complex]:
+        """Relative pose of the query as in a tie of `mapmaking.graph`: its offset, right + i up, and the logarithm of
+        its scale + i times its counter-clockwise rotation."""
+        dx, dy = self.shift_share
+        turned = np.radians((self.rotation_deg + 180) % 360 - 180)
+        return complex(dx, -dy), complex(np.log(self.scale or 1.0), -turned)
+
 
 def onto(one: Overlay, other: Overlay) -> Overlay:
     """Return how one place lies on another, given the overlays `one` and `other` of the same query on these places."""
