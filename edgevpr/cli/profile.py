@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, positive, report, show
 from edgevpr.core.errors import UsageError
-from edgevpr.core.text import progress
+from edgevpr.core.text import at_work, progress
 
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
@@ -67,10 +67,11 @@ def profile(args: Namespace) -> int:
     tried: dict[int, list[Trial]] = {}  # by the number of threads for networks
     for board in boards:
         plan, wanted = _plan(args, board)
-        if board.threads not in tried:
-            trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
-            tried[board.threads] = list(trials)
-        results.append(estimate(board, scaled_from(load_board("this"), board), tried[board.threads], plan))
+        with at_work("measuring on this machine what techniques take"):
+            if board.threads not in tried:
+                trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
+                tried[board.threads] = list(trials)
+            results.append(estimate(board, scaled_from(load_board("this"), board), tried[board.threads], plan))
     if len(results) == 1:
         show(results[0], args.json, format_table(results[0]))
     else:

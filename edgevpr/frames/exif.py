@@ -44,6 +44,13 @@ def read_exif(path: str | Path) -> GeoTag:
     )
 
 
+def is_at_zero(path: str | Path) -> bool:
+    """Return True if the EXIF data of a picture say exactly (0, 0), as of a receiver without a fix. Never raises."""
+    with contextlib.suppress(Exception):
+        return _lat_lon_deg(_exif_of(path)) == (0.0, 0.0)
+    return False
+
+
 def _exif_of(path: str | Path) -> Tags:
     import exifread  # not at the top: most sources never need it
 
@@ -63,8 +70,12 @@ def _within(value: float, low: float, high: float) -> float:
 def _position(tags: Tags) -> Position | None:
     if "GPS GPSStatus" in tags and tags["GPS GPSStatus"].values == "V":  # void: the receiver has lost its fix
         return None
+    return position_or_none(*_lat_lon_deg(tags), None)
+
+
+def _lat_lon_deg(tags: Tags) -> tuple[float, float]:
     lat_deg = _degrees(tags, "GPS GPSLatitude", {"N": 1, "S": -1}, 90)
-    return position_or_none(lat_deg, _degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180), None)
+    return lat_deg, _degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180)
 
 
 def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import at_work
-from edgevpr.frames.exif import read_exif, read_xmp
+from edgevpr.frames.exif import is_at_zero, read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
 from edgevpr.frames.positions import count_at_zero, find_positions, find_track, read_positions
@@ -47,6 +47,9 @@ def say_what_will_lack(uri: str, positions: Path | None, rate_hz: float | None, 
         tags = read_positions(table) if table else {}
         some = [path for run in _runs(list_images(uri)) for path in run]
         is_placed = any((tags.get(path.name) or read_exif(path)).position for path in some)
+        if not table and (blank := sum(map(is_at_zero, some))):
+            text = "%s: of %d pictures looked at, %d say 0, 0, as of a camera without a fix: that counts as no position"
+            _log.warning(text, uri, len(some), blank)
     elif not rate_hz and total > _MANY_HZ * (lasts_s := _film(uri).total):
         text = "every frame of %s becomes a place, %d in %d s: --rate-hz 1 makes %d"
         _log.warning(text, uri, total, lasts_s, lasts_s)

@@ -48,10 +48,10 @@ def tried(monkeypatch):
     asked = []
 
     def answer(module, job, limit_s, what):
-        asked.append(job["trial"]["label"])
-        if job["trial"]["name"] == "calc":
+        asked.extend(each["label"] for each in job["trials"])
+        if job["trials"][0]["name"] == "calc":
             raise EdgevprError("There is no model `calc`.")
-        return {**job["trial"], "costs": asdict(HOG if job["trial"]["name"] == "hog" else COSTS)}
+        return [{**each, "costs": asdict(HOG if each["name"] == "hog" else COSTS)} for each in job["trials"]]
 
     monkeypatch.setattr(trial, "ask_child", answer)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))

@@ -4,7 +4,7 @@ import photographs
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.frames.exif import read_exif
+from edgevpr.frames.exif import is_at_zero, read_exif
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 
@@ -14,6 +14,7 @@ LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT, TIME, STATUS = 1, 2, 3, 4, 5, 6, 7, 9
 DIRECTION_REF, DIRECTION, DATE = 16, 17, 29
 GPS = {LAT_REF: "N", LAT: (46.0, 50.0, 33.0), LON_REF: "W", LON: (91.0, 59.0, 42.0)}
 POSITION = Position(46.8425, -91.995, None)
+NO_FIX = {LAT: (0.0, 0.0, 0.0), LON: (0.0, 0.0, 0.0)}  # as a receiver writes it that knows no position
 TAKEN, ZONE = 0x9003, 0x9011
 
 
@@ -45,7 +46,7 @@ def test_a_height_above_the_ellipsoid_and_a_magnetic_heading_are_not_taken_for_w
 @pytest.mark.parametrize(
     "gps",
     [
-        {LAT: (0.0, 0.0, 0.0), LON: (0.0, 0.0, 0.0)},  # a receiver without a fix
+        NO_FIX,
         {STATUS: "V"},  # the receiver itself says that the position is void
         {LAT: (96.0, 0.0, 0.0)},
         {LAT: (46.0, 99.0, 33.0)},
@@ -58,6 +59,7 @@ def test_a_height_above_the_ellipsoid_and_a_magnetic_heading_are_not_taken_for_w
 def test_a_senseless_position_is_no_position(gps, tmp_path):
     assert tag_of(tmp_path, GPS).position == POSITION
     assert tag_of(tmp_path, GPS | gps).position is None
+    assert is_at_zero(tmp_path / "photo.jpg") == (gps == NO_FIX)
 
 
 def test_the_camera_clock_counts_where_the_receiver_gives_no_time(tmp_path):

@@ -1,13 +1,16 @@
-"""Trials of techniques, each in a child process: the memory that one has loaded is not counted for another, and a
-library that crashes on this processor fails only its own trial.
+"""Trials of techniques, each in a child process with all its forms: the memory that one has loaded is not counted for
+another, and a library that crashes on this processor fails only its own trials.
 
-`python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints a Trial as JSON.
+`python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints Trials as JSON.
 """
 
+import ctypes
+import gc
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 from edgevpr import techniques
@@ -59,38 +62,44 @@ def offers(
 
 
 def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
-    """Make each of the `wanted` trials in a child process, and yield it with its result. A technique that cannot be
-    used has one result, labelled with its name. `threads`: number of threads for networks.
+    """Make the `wanted` trials, those of a technique in one child process, and yield each with its result. A technique
+    that cannot be used has one result, labelled with its name. `threads`: number of threads for networks.
 
-    Where cores and RAM allow, several are made at once, each with its own cores."""
-    refused = set()
+    Where cores and RAM allow, several techniques are tried at once, each with its own cores."""
     at_once = max(1, min(int(machine.cores()) // threads, int(machine.ram_limit_mb() // _TRIAL_MB)))
+    of_each = [list(forms) for _, forms in groupby(wanted, lambda trial: trial.name)]
     pool = ThreadPoolExecutor(at_once)
     try:
-        for trial in pool.map(partial(_tried, threads), wanted):
-            if trial.name not in refused:
-                yield trial
-            if trial.problem:
-                refused.add(trial.name)
+        for trials in pool.map(partial(_tried, threads), of_each):
+            yield from trials
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _tried(threads: int, offer: Trial) -> Trial:
+def _tried(threads: int, forms: Sequence[Trial]) -> list[Trial]:
+    name = forms[0].name
     try:
-        job = {"threads": threads, "trial": asdict(offer)}
-        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {offer.label}")
-        return build(Trial, answer, "a trial")
+        job = {"threads": threads, "trials": [asdict(each) for each in forms]}
+        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}")
+        return [build(Trial, each, "a trial") for each in answer]
     except EdgevprError as error:
-        return replace(offer, label=offer.name, problem=str(error))
+        return [replace(forms[0], label=name, problem=str(error))]
 
 
-def _try_here(job: dict[str, Any]) -> dict[str, Any]:
-    offer = build(Trial, job["trial"], "a trial")
-    technique = made_for(job["threads"], offer.name, offer.settings)
-    spec = technique.spec
-    costs = probe(technique, tried_s=_TRIED_S)
-    return asdict(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters))
+def _try_here(job: dict[str, Any]) -> list[dict[str, Any]]:
+    tried = []
+    for each in job["trials"]:
+        offer = build(Trial, each, "a trial")
+        technique = made_for(job["threads"], offer.name, offer.settings)
+        costs = probe(technique, tried_s=_TRIED_S)
+        spec = technique.spec
+        tried.append(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters))
+        # What a form has taken is given back, or it would be counted for the next one.
+        del technique
+        gc.collect()
+        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
+            trim(0)
+    return [asdict(each) for each in tried]
 
 
 if __name__ == "__main__":
