@@ -1,5 +1,5 @@
-"""What the site holds beside the pages of this folder: pages that stand elsewhere in the repository, and the reference
-of the configuration and of the command line, both made from the code.
+"""What the site holds beside the pages of this folder: pages that stand elsewhere in the repository, and the references
+of the configuration and of the command line, made from the code, and of the output as JSON, made from its schema.
 
 A link between two files of the repository stays one between two pages of the site; one to a file that is no page leads
 to the repository.
@@ -10,7 +10,9 @@ import posixpath
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -38,6 +40,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     files.append(File.generated(config, "results/index.md", content=contents_of_results()))
     files.append(File.generated(config, "reference/configuration.md", content=configuration()))
     files.append(File.generated(config, "reference/command-line.md", content=commands()))
+    files.append(File.generated(config, "reference/json-output.md", content=json_output()))
     return files
 
 
@@ -127,6 +130,41 @@ def commands() -> str:
             lines += [f"| {name} | {str(text).replace('|', '&#124;')} |" for name, text in rows]
             lines.append("")
     return "\n".join(lines)
+
+
+def json_output() -> str:
+    """Return the page of what `--json` prints, made from its schema."""
+    path = "docs/reference/json-output.yaml"
+    schema = yaml.safe_load((ROOT / path).read_text("utf-8"))
+    lines = ["# JSON output", "", "\n".join(re.findall(r"^# ?(.*)", (ROOT / path).read_text("utf-8"), re.M)), ""]
+    lines += [
+        "With `--json` a command prints its result on stdout and nothing else; messages go to stderr. A field keeps",
+        "its name and meaning from version to version; new ones may come, so read those that you know.",
+        f"[The schema]({path}) is what the tests hold every output to.",
+    ]
+    for name, part in schema["$defs"].items():
+        lines += ["", f"## {name}", "", part.get("description", ""), "", "| field | type | meaning |", "|---|---|---|"]
+        lines += [f"| {field} | {kind} | {text} |" for field, kind, text in fields_of(part, "")]
+    return "\n".join(lines) + "\n"
+
+
+def fields_of(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Yield field, type and meaning of all fields that a part of the schema has, those of inner objects included."""
+    if "$ref" in part:
+        name = part["$ref"].rpartition("/")[2]
+        yield f"`{prefix}*`", "", f"the fields of [{name}](#{name})"
+    for name, each in part.get("properties", {}).items():
+        kinds = each.get("type", "")
+        kind = " or ".join([kinds] if isinstance(kinds, str) else kinds)
+        only = f"only with {each['only']}" if str(each.get("only", "")).startswith("--") else each.get("only", "")
+        only = f"only if {only}" if only and not only.startswith("only") else only
+        texts = [each.get("description", ""), only, ", ".join(f"`{value}`" for value in each.get("enum", ()))]
+        yield f"`{prefix}{name}`", kind, "; ".join(filter(None, texts))
+        yield from fields_of({key: each[key] for key in each.keys() - {"description"}}, f"{prefix}{name}.")
+    if isinstance(part.get("items"), dict):
+        yield from fields_of(part["items"], f"{prefix}[].")
+    for each in part.get("anyOf", ()):
+        yield from fields_of(each, prefix)
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

@@ -4,8 +4,10 @@ import os
 import signal
 
 import pytest
+from documented import Checked
 
 import edgevpr  # noqa: F401  # it sets OpenCV's limit of pixels, which counts when OpenCV is imported
+from edgevpr.cli import shared
 
 # As edgevpr's command line does, before anything imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -36,6 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Bring the longest files to the front."""
     rank = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
+@pytest.fixture(autouse=True)
+def documented(monkeypatch):
+    """Whatever test prints a result as JSON, it is as its schema says."""
+    monkeypatch.setattr(shared, "json", Checked)
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ from edgevpr.core.text import progress, shown, waiting
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recogniser import Recogniser
+    from edgevpr.runtime.service.finding import Finding
 
 _MATCHING_KEYS = (
     "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
@@ -55,6 +56,7 @@ def add(commands: Any) -> None:
     check = command(commands, "check", run_check, "say whether a configuration would fly")
     check.add_argument("--config", required=True, metavar="FILE")
     check.add_argument("--offline", action="store_true", help="wait for no frame and no heartbeat: on the bench")
+    add_json(check)
 
     services = group(commands, "service", "print the systemd unit for a board, or install it all")
     unit = command(services, "print", service_print, "print the unit")
@@ -137,8 +139,7 @@ def run_check(args: Namespace) -> int:
     from edgevpr.runtime.service.finding import lines
 
     findings = check(args.config, offline=args.offline, say=waiting)
-    for line in lines(findings):
-        print(shown(line))
+    show(_found(findings), args.json, lines(findings))
     return max(finding.exit_code for finding in findings)
 
 
@@ -184,8 +185,10 @@ def run_doctor(args: Namespace) -> int:
         raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
     findings, reading = doctor(config, address, waiting)
-    is_fine = all(finding.ok for finding in findings)
-    found = [asdict(finding) for finding in findings]
-    known = {"link": str(address), "ok": is_fine, "findings": found, "reading": reading and asdict(reading)}
+    known = {"link": str(address), **_found(findings), "reading": reading and asdict(reading)}
     show(known, args.json, lines(findings))
     return max(finding.exit_code for finding in findings)
+
+
+def _found(findings: "Sequence[Finding]") -> dict[str, Any]:
+    return {"ok": all(each.ok for each in findings), "findings": [asdict(each) for each in findings]}

@@ -54,13 +54,15 @@ def add(commands: Any) -> None:
     add_json(calibrate)
     add_json(of_map("info", map_info, "say what a map holds"))
     add_json(of_map("check", map_check, "read everything in a map, and say what is damaged"))
-    of_map("repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged")
+    add_json(of_map("repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged"))
     merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
     merge.add_argument("out", metavar="OUT", help="the map file to make")
     merge.add_argument("maps", metavar="MAP", nargs="+")
+    add_json(merge)
     smaller = of_map("shrink", map_shrink, "keep only the best places, spread over the map")
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
     smaller.add_argument("--places", type=count, metavar="N", required=True, help="as many places")
+    add_json(smaller)
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
     worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
@@ -195,12 +197,12 @@ def map_repair(args: Namespace) -> int:
     from edgevpr.places.examine import check, repair
 
     found = check(args.map, progress)
-    show(found, False, of_check(found))
-    if found.is_whole:
-        print("nothing is damaged: the map is as it was")
-        return 0
-    original = repair(args.map, progress)
-    print(f"{args.map}: repaired, {found.places} places kept, {len(found.damaged)} dropped; the original is {original}")
+    original = None if found.is_whole else repair(args.map, progress)
+    dropped = len(found.damaged)
+    done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
+    last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
+    text = "nothing is damaged: the map is as it was" if original is None else last
+    show(done, args.json, [*of_check(found), text])
     return 0
 
 
@@ -210,11 +212,16 @@ def map_merge(args: Namespace) -> int:
     from edgevpr.places.mapfiles import map_path
 
     counts, were_calibrated = merge(args.maps, map_path(args.out), progress)
-    for path, (copied, already_here) in zip(args.maps, counts, strict=True):
-        print(f"{path}: {copied} places copied, {already_here} there already")
-    print(f"{args.out}: {sum(copied for copied, _ in counts)} places")
+    parts = [
+        {"map": path, "copied": copied, "already_here": already_here}
+        for path, (copied, already_here) in zip(args.maps, counts, strict=True)
+    ]
+    merged = {"map": args.out, "places": sum(copied for copied, _ in counts), "of": parts}
+    text = [f"{part['map']}: {part['copied']} places copied, {part['already_here']} there already" for part in parts]
+    text.append(f"{args.out}: {merged['places']} places")
     if were_calibrated:
-        print(f"  not calibrated: how sure the maps were does not hold for it; run `edgevpr map calibrate {args.out}`")
+        text.append(f"  not calibrated: how sure the maps were does not hold for it: edgevpr map calibrate {args.out}")
+    show({**merged, "lost_calibration": were_calibrated}, args.json, text)
     return 0
 
 
@@ -224,7 +231,7 @@ def map_shrink(args: Namespace) -> int:
     from edgevpr.places.mapfiles import map_path
 
     kept, places = shrink(args.map, map_path(args.out), args.places, progress)
-    print(f"{args.out}: {kept} of {places} places")
+    show({"map": args.out, "kept": kept, "of": places}, args.json, f"{args.out}: {kept} of {places} places")
     return 0
 
 

@@ -7,7 +7,7 @@ import time
 from argparse import Namespace
 from typing import Any
 
-from edgevpr.cli.shared import command
+from edgevpr.cli.shared import add_json, command, show
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import nines, printable
 
@@ -25,17 +25,18 @@ def add(commands: Any) -> None:
     parser = command(commands, "top", run_top, "show how the flight on this computer goes")
     parser.add_argument("--file", default=_FILE, metavar="PATH", help=f"the flight's status.file ({_FILE})")
     parser.add_argument("--once", action="store_true", help="show it once, and end")
+    add_json(parser)
 
 
 def run_top(args: Namespace) -> int:
     """Run `top`: show the status of a flight until Ctrl-C; once with --once, or if stdout is no terminal."""
     from edgevpr.runtime.flight.status import read_status
 
-    if args.once or not sys.stdout.isatty():
+    if args.once or args.json or not sys.stdout.isatty():
         found = read_status(args.file)
         if found is None or found[1] > _GONE_S:
             raise EdgevprError(" ".join(_no_flight(args.file)))
-        print("\n".join(lines_of(found[0])))
+        show(found[0], args.json, lines_of(found[0]))
         return 0
     try:
         while True:

@@ -171,8 +171,8 @@ def test_a_score_that_says_nothing_is_not_accepted_for_want_of_another_place(cap
 
 
 def test_maps_are_merged(capsys, valley, tmp_path):
-    assert main(["map", "merge", str(tmp_path / "all.gpkg"), str(valley), str(valley)]) == 0
-    assert "6 there already" in capsys.readouterr().out
+    merged = run_json(capsys, "map", "merge", tmp_path / "all.gpkg", valley, valley, "--json")
+    assert [(part["copied"], part["already_here"]) for part in merged["of"]] == [(6, 0), (0, 6)]
     assert run_json(capsys, "map", "info", tmp_path / "all.gpkg", "--json")["places"] == 6
 
 
@@ -281,7 +281,7 @@ def test_commands_end_with_the_exit_codes_that_are_told_and_check_as_run_does(ca
     path = tmp_path / "c.yaml"
     for code, change in table:
         path.write_text(yaml.safe_dump(good | change))
-        ends = [main([*command, "--config", str(path)]) for command in (["check", "--offline"], ["run"])]
+        ends = [main([*command, "--config", str(path)]) for command in (["check", "--offline", "--json"], ["run"])]
         assert ends == [code, code], (change, capsys.readouterr().err)
     words = [
         (0, ["map", "check", valley]),

@@ -68,6 +68,8 @@ def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, ca
     assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
     assert "nothing" in capsys.readouterr().out
+    assert main(["map", "repair", str(valley), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"path": str(valley), "kept": 6, "dropped": 0, "original": None}
     assert valley.read_bytes() == before
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 

@@ -133,7 +133,9 @@ def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
     place_map, smaller = tmp_path / "m.gpkg", tmp_path / "s.gpkg"
     command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
     assert main([*command, "--config", config(tmp_path)]) == 0
-    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12"]) == 0
+    capsys.readouterr()
+    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["kept"] == 12
     with PlaceMap.open(smaller) as opened:
         kept = list(opened.places())
         assert len(kept) == 12

@@ -1,0 +1,41 @@
+"""`--json`: every command that has it is in the schema. `conftest.documented` holds what they print to it."""
+
+import argparse
+import json
+
+import jsonschema
+import pytest
+from documented import require_documented, schema
+from statuses import STATUS
+
+from edgevpr.cli.main import command_line, main
+
+
+def commands_with_json(parser=None):
+    parser = parser or command_line()
+    if "--json" in parser._option_string_actions:
+        yield parser.prog
+    for each in parser._actions:
+        if isinstance(each, argparse._SubParsersAction):
+            for inner in each.choices.values():
+                yield from commands_with_json(inner)
+
+
+def test_the_schema_is_one_and_has_a_definition_for_every_command_and_no_other():
+    jsonschema.Draft202012Validator.check_schema(schema())
+    assert {name for name in schema()["$defs"] if name.startswith("edgevpr ")} == set(commands_with_json())
+
+
+def test_what_is_not_documented_is_refused():
+    whole = {"map": "m.gpkg", "kept": 3, "of": 5}
+    require_documented("edgevpr map shrink", json.dumps(whole))
+    for other in (whole | {"kept": "3"}, whole | {"more": 1}, {"map": "m.gpkg", "kept": 3}):
+        with pytest.raises(jsonschema.ValidationError):
+            require_documented("edgevpr map shrink", json.dumps(other))
+
+
+def test_a_status_is_shown_once(tmp_path, capsys):
+    path = tmp_path / "status.json"
+    path.write_text(json.dumps(STATUS))
+    assert main(["top", "--file", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == STATUS
