@@ -9,6 +9,7 @@ import threading
 import time
 
 import pytest
+from documented import require_documented
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
 
 from edgevpr.cli.main import main
@@ -204,6 +205,7 @@ def test_the_command_says_what_is_up_and_sets_parameters():
     assert said == f"edgevpr: a simulated arducopter that has lost GPS, system 1, is up at {link}\n"
     assert more == ""
     assert json.loads(printed)["companion"] == "1/197"
+    require_documented("edgevpr simulate autopilot", printed)
 
 
 @pytest.mark.parametrize(
