@@ -16,6 +16,7 @@ from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
 T = TypeVar("T")
 Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSLatitude"
 
+_FILM_DIAGONAL_MM, _LONGEST_OF_DIAGONAL = 43.27, 0.82
 _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
 # A value in XMP, as an attribute or an element. The prefixes are those that DJI, Parrot and Pix4D write.
 _XMP = re.compile(rb"""((?:drone-dji|drone-parrot|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
@@ -49,6 +50,20 @@ def is_at_zero(path: str | Path) -> bool:
     with contextlib.suppress(Exception):
         return _lat_lon_deg(_exif_of(path)) == (0.0, 0.0)
     return False
+
+
+def fov_deg_of(path: str | Path) -> float | None:
+    """Return about how wide the lens sees along the longest side of a picture, by the focal length in its EXIF data
+    that gives the same view on film of 36 x 24 mm. The views are compared along the diagonal (CIPA DCG-001). None: the
+    EXIF data do not say it. Never raises."""
+    with contextlib.suppress(Exception):
+        tags = _exif_of(path)
+        focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
+        sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
+        # Wider pictures than the sensors of 4:3 and 3:2 are cut out of theirs, and as long.
+        longest = min(max(sides) / math.hypot(*sides), _LONGEST_OF_DIAGONAL)
+        return _within(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
+    return None
 
 
 def _exif_of(path: str | Path) -> Tags:

@@ -15,7 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import at_work
-from edgevpr.frames.exif import is_at_zero, read_exif, read_xmp
+from edgevpr.frames.exif import fov_deg_of, is_at_zero, read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
 from edgevpr.frames.positions import count_at_zero, find_positions, find_track, read_positions
@@ -66,6 +66,17 @@ def say_what_will_lack(uri: str, positions: Path | None, rate_hz: float | None, 
     if total and places is not None and total + places < FEWEST_PLACES:
         text = "%d places at most: a map of fewer than %d cannot be calibrated, and finds little: give more pictures"
         _log.warning(text, total + places, FEWEST_PLACES)
+
+
+def say_what_lens(folder: Path) -> None:
+    """Log how wide the lens sees by the EXIF data of a picture, for the user to say it: without it pictures are neither
+    untilted nor scaled."""
+    fov_deg = fov_deg_of(next(iter(list_images(folder))))
+    if fov_deg is not None:
+        text = (
+            "EXIF data say a lens of about %.0f degrees: with --fov-deg %.0f, here and in flight, positions are finer"
+        )
+        _log.info(text, fov_deg, fov_deg)
 
 
 @at_work("looking where the camera looks")

@@ -16,7 +16,7 @@ from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.beforehand import require_ahead, say_what_will_lack
+from edgevpr.mapmaking.beforehand import require_ahead, say_what_lens, say_what_will_lack
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, covered_by
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
@@ -130,6 +130,9 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             if isinstance(pictures, FlownPictures):
                 places = len(place_map) if order.calibrate and kinds_of(technique.spec) else None
                 say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, source.total, places)
+                is_down = technique.spec.parameters.get("camera") == "nadir"
+                if is_down and config.source.fov_deg is None and Path(pictures.source).is_dir():
+                    say_what_lens(Path(pictures.source))
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 technique,

@@ -4,7 +4,7 @@ import photographs
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.frames.exif import is_at_zero, read_exif
+from edgevpr.frames.exif import fov_deg_of, is_at_zero, read_exif
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 
@@ -108,3 +108,19 @@ def test_a_time_that_cannot_be_is_unknown(gps, taken, tmp_path):
 
 def test_a_position_without_its_height_is_still_one(tmp_path):
     assert tag_of(tmp_path, GPS | {ALT_REF: b"\x00", ALT: 4e9}).position == POSITION
+
+
+@pytest.mark.parametrize(
+    ("focal_mm", "sides", "fov_deg"),
+    [
+        (24, (4000, 3000), 71.6),  # as DJI says of the Mini 2: 83 degrees across the diagonal
+        (24, (3000, 4000), 71.6),
+        (20, (4000, 2250), 83.1),
+        (0, (4000, 3000), None),
+        (24, (), None),
+    ],
+)
+def test_the_field_of_view_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_deg, tmp_path):
+    size = dict(zip((0xA002, 0xA003), sides, strict=False))
+    photographs.write_jpeg(tmp_path / "photo.jpg", camera={0xA405: focal_mm, **size})
+    assert fov_deg_of(tmp_path / "photo.jpg") == (None if fov_deg is None else pytest.approx(fov_deg, abs=0.1))
