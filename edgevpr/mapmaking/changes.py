@@ -9,8 +9,12 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
+from edgevpr.frames.images import resized
 
 _STRENGTH = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
+# Of the pictures of the sets that the strengths were chosen on. Larger ones take long to change, and their noise, which
+# is that of pixels, would be averaged away.
+_LONGEST_PX = 640
 _TONES = 6  # points of a tone curve
 _PATCHES = 2  # most plain patches that hide a part of the picture
 
@@ -20,9 +24,14 @@ def changed(
 ) -> tuple[Image, Mask | None]:
     """Change a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
     by any angle. `shown`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
-    * the changed picture, uint8 (H, W) grey, and
+    * the changed picture, uint8 grey, at most 640 pixels long, and
     * `shown` for the changed picture."""
     strength = rng.uniform(*_STRENGTH)
+    if (shrink := _LONGEST_PX / max(image.shape[:2])) < 1:
+        size_px = round(shrink * image.shape[1]), round(shrink * image.shape[0])
+        image = resized(image, size_px)
+        if shown is not None:
+            shown = cv2.resize(shown.view(np.uint8), size_px, interpolation=cv2.INTER_NEAREST).view(bool)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     warp = _from_beside(grey.shape, rng, strength, looks_down)
     seen = _warped(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
