@@ -7,6 +7,7 @@ silent for five seconds. MAVSDK is `pip install "mavsdk>=4"`.
 """
 
 import json
+import math
 import sys
 import time
 
@@ -52,9 +53,10 @@ def main(port: str = "14540") -> None:
     for name in ("HEARTBEAT", "NAMED_VALUE_FLOAT"):
         direct.subscribe_message(name, edgevpr.hear)
     while time.monotonic() - edgevpr.beat_s < SILENT_AFTER_S:
-        at = telemetry.position()  # NaN as long as the autopilot knows none
+        at = telemetry.position()
+        here = f"at {at.latitude_deg:.6f}, {at.longitude_deg:.6f}" if not math.isnan(at.latitude_deg) else "nowhere"
         known = f"known, {edgevpr.confidence:.6f} sure" if edgevpr.knows_the_place() else "not known"
-        print(f"autopilot at {at.latitude_deg:.6f}, {at.longitude_deg:.6f}; the place is {known}", flush=True)
+        print(f"autopilot: {here}; the place is {known}", flush=True)
         time.sleep(1.0)
     station.destroy()
 

@@ -40,10 +40,10 @@ def test_what_is_copied_is_enough_for_the_wheel(dockerfile, tmp_path):
             for source in sources:
                 assert target in ("./", source, f"{Path(source).parent}/"), "it lies where it lay"
                 (tmp_path / source).parent.mkdir(parents=True, exist_ok=True)
-                copied = shutil.copytree if (ROOT / source).is_dir() else shutil.copy
-                copied(
-                    ROOT / source, tmp_path / source, **({"dirs_exist_ok": True} if copied is shutil.copytree else {})
-                )
+                if (ROOT / source).is_dir():
+                    shutil.copytree(ROOT / source, tmp_path / source, dirs_exist_ok=True)
+                else:
+                    shutil.copy(ROOT / source, tmp_path / source)
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -82,7 +82,7 @@ def test_what_blueos_reads_is_json_and_true(dockerfile, flown):
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.network
-def test_it_is_built_and_flies_from_a_disk_that_cannot_be_written():
+def test_it_is_built_and_starts_from_a_disk_that_cannot_be_written():
     docker = shutil.which("docker")
     if docker is None or subprocess.run([docker, "info"], capture_output=True).returncode:
         pytest.skip("no Docker runs here")
