@@ -113,7 +113,8 @@ class Conversation:
         self._health, self._health_set_s = health, self._clock()
 
     def want_position(self) -> None:
-        """From now on request the autopilot's reports of position, attitude and so on, and again whenever they stop."""
+        """From now on request the autopilot's reports of position, attitude and so on, and again whenever they stop
+        or become rare."""
         self._ask_position_s = self._clock()
 
     def offer(self, wishes: Collection[Wish]) -> None:
@@ -251,7 +252,8 @@ class Conversation:
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
-        """Queue the questions that choose the channel, and request reports that have stopped, as after a restart."""
+        """Queue the questions that choose the channel, and request reports that have stopped, as after a restart, or
+        have become half as frequent."""
         if self._ask_position_s is None:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))
@@ -261,11 +263,13 @@ class Conversation:
         if now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
-        vehicle = self.autopilot.vehicle
-        heard_s = min(vehicle.t_heard_s if vehicle else -math.inf, self.autopilot.attitudes.t_heard_s)
-        if now_s - heard_s > ASK_AGAIN_S or self._asked_for_state != self.channel.is_continuous:
-            self._asked_for_state = self.channel.is_continuous
-            self.send(*messages.report_requests(system_id, self.autopilot.firmware, self._asked_for_state))
+        vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
+        is_silent = vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S
+        # A ground station that asks for rates of its own sets ours back, as all of a port share them.
+        is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
+        if is_silent or is_slowed or self._asked_for_state != is_continuous:
+            self._asked_for_state = is_continuous
+            self.send(*messages.report_requests(system_id, self.autopilot.firmware, is_continuous))
 
     def _hear_request(self, message: Message, now_s: float) -> None:
         self.send(*self.requests.hear(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))

@@ -189,11 +189,16 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). `firmware` is a MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more, at higher rates."""
-    rates_hz = _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
+    rates_hz = _rates_hz(is_continuous)
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
     interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
     return tuple(_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
+
+
+def attitude_hz(is_continuous: bool) -> int:
+    """Return how many attitudes a second `report_requests` asks for."""
+    return _rates_hz(is_continuous)[mavlink.MAVLINK_MSG_ID_ATTITUDE]
 
 
 def message_request(target_system: int, message_id: int) -> Message:
@@ -285,6 +290,10 @@ _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
 }
+
+
+def _rates_hz(is_continuous: bool) -> dict[int, int]:
+    return _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
 
 
 def _command(target_system: int, command: int, first: float, second: float = 0) -> Message:

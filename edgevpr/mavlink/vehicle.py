@@ -45,10 +45,9 @@ class Attitudes:
     def __init__(self) -> None:
         self._kept: tuple[Attitude, ...] = ()
 
-    @property
-    def t_heard_s(self) -> float:
-        """The time of the newest attitude; -inf if there is none."""
-        return self._kept[-1].t_s if self._kept else -math.inf
+    def rate_hz(self, now_s: float) -> float:
+        """Return how many attitudes a second have come in the last three seconds."""
+        return sum(now_s - attitude.t_s <= _KEPT_S for attitude in self._kept) / _KEPT_S
 
     def hear(self, message: Message, now_s: float) -> None:
         """Add the attitude of an ATTITUDE message; one that is not finite is ignored."""

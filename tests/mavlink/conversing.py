@@ -41,6 +41,13 @@ class Autopilot:
     def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
         self.say(mavlink.MAVLink_attitude_message(0, *map(math.radians, (roll_deg, pitch_deg, yaw_deg)), 0, 0, 0))
 
+    def fly_on(self, seconds, attitude_hz):
+        for _ in range(seconds * attitude_hz):
+            self.wait(1 / attitude_hz)
+            self.beat()
+            self.position()
+            self.attitude()
+
     def range(self, distance_m, orientation=25, signal_quality=0):
         fields = 0, 20, 10_000, round(distance_m * 100), 0, 0, orientation, 0
         self.say(mavlink.MAVLink_distance_sensor_message(*fields, signal_quality=signal_quality))

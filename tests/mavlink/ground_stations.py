@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from mavlink_peers import wait_until
+from mavlink_peers import PATIENCE_S, wait_until
 
 from edgevpr.mavlink.wire import PacketReader
 
@@ -119,6 +119,10 @@ class Station:
         except AssertionError as error:
             raise AssertionError(f"{error}; it said:\n{''.join(self.said)}") from None
 
+    def wait_for_end(self) -> int:
+        """Wait until it ends by itself; return its exit code."""
+        return self._process.wait(PATIENCE_S)
+
 
 def mavsdk(port: int, folder: Path) -> Station:
     """Start MAVSDK, as `mavsdk_watch` says."""
@@ -126,11 +130,22 @@ def mavsdk(port: int, folder: Path) -> Station:
     return Station([str(Path(__file__).with_name("mavsdk_watch.py")), str(port)], folder)
 
 
+def mavsdk_example(port: int, folder: Path) -> Station:
+    """Start the example of MAVSDK beside edgevpr."""
+    _need("mavsdk")
+    return Station([str(Path(__file__).parents[2] / "examples" / "mavsdk_beside.py"), str(port)], folder)
+
+
 def mavproxy(port: int, folder: Path) -> Station:
     """Start MAVProxy without windows; it takes its usual commands."""
+    return mavproxy_with(folder, f"--master=udpin:127.0.0.1:{port}")
+
+
+def mavproxy_with(folder: Path, *flags: str) -> Station:
+    """Start MAVProxy with these flags, without windows."""
     _need("MAVProxy")
-    command = [str(CLIENTS / "bin" / "mavproxy.py"), f"--master=udpin:127.0.0.1:{port}", "--default-modules=link"]
-    return Station([*command, f"--logfile={folder / 'mavproxy.tlog'}"], folder)
+    quiet = ["--default-modules=link", f"--logfile={folder / 'mavproxy.tlog'}"]
+    return Station([str(CLIENTS / "bin" / "mavproxy.py"), *flags, *quiet], folder)
 
 
 def _need(package: str) -> None:

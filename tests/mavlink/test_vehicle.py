@@ -84,10 +84,7 @@ def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
     assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000} | dict.fromkeys((132, 136, 193), 500_000)
     assert all(command.target_system == 7 for command in requests)
     for _ in range(3):  # what is heard needs no asking, but the version, which it does not say
-        autopilot.wait(4.0)
-        autopilot.beat()
-        autopilot.position()
-        autopilot.attitude()
+        autopilot.fly_on(seconds=4, attitude_hz=10)
         assert [each.command for each in autopilot.questions()] == [mavlink.MAV_CMD_REQUEST_MESSAGE]
     asked = []
     for _ in range(3):
@@ -95,7 +92,16 @@ def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
         autopilot.beat()
         autopilot.position()
         asked += autopilot.questions()
-    assert len(asked) == 6, "it says no attitude any more: it has started anew"
+    assert {int(each.param1) for each in asked} == set(intervals_us), "it says no attitude any more: it started anew"
+
+
+def test_it_is_asked_again_where_a_ground_station_has_set_other_rates(autopilot):
+    autopilot.conversation.want_position()
+    autopilot.questions()
+    for attitude_hz, has_to_ask in ((10, False), (4, True), (10, False), (5, False)):
+        autopilot.fly_on(seconds=5, attitude_hz=attitude_hz)
+        asked = [each.param1 for each in autopilot.questions() if each.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL]
+        assert (mavlink.MAVLINK_MSG_ID_ATTITUDE in asked) is has_to_ask, attitude_hz
 
 
 def test_the_attitude_is_that_of_the_frame_s_time(autopilot):

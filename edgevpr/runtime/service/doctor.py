@@ -64,7 +64,11 @@ def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Map
         unlike = f"{address}: the autopilots heard are of system {systems}, none is the one configured."
         return wrong("link", unlike, f"mavlink: {{system_id: {min(others)}}}")
     if address.kind == "serial":
-        seen = "bytes arrive that are no MAVLink (another baud rate?)" if bad_bytes else "nothing arrives (TX and RX?)"
+        seen = (
+            "bytes arrive that are no MAVLink (another baud rate, or another program?)"
+            if bad_bytes
+            else "nothing arrives (TX and RX?)"
+        )
         return wrong(
             "link",
             f"{address}: no heartbeat in 5 s, {seen}: set the port of the flight controller for MAVLink 2 at this "
@@ -120,7 +124,7 @@ def _link(reading: AutopilotReading, address: LinkAddress) -> Finding:
             why = "the wire from the board's TX to its RX, or the clock of this board, may be the reason"
         return wrong("link", f"{who} is heard, but answers nothing: {why}.")
     if reading.bad_bytes > _BAD_BYTES:
-        look_at = "look at ground wire, cable and baud rate"
+        look_at = "look at ground wire, cable and baud rate, and for another program on the port"
         return wrong("link", f"{who}: {reading.bad_bytes} bytes arrived damaged: {look_at}.")
     if reading.round_trip_s is None:
         return fine("link", who)

@@ -305,7 +305,7 @@ def test_an_old_or_a_silent_px4_is_wrong():
     ("link", "bad_bytes", "others", "refused", "message"),
     [
         (SERIAL, 0, (), {}, "nothing arrives (TX and RX?)"),
-        (SERIAL, 900, (), {}, "another baud rate?"),
+        (SERIAL, 900, (), {}, "another baud rate, or another program?"),
         (UDP, 0, (5, 3), {}, "the autopilots heard are of system 3 and 5, none is the one configured."),
         (UDP, 0, (), {UNSIGNED: 4, WRONG: 5}, "messages arrive, and are refused (wrong signature): the other end has "),
         (UDP, 0, (), {}, "no heartbeat of an autopilot in 5 s: let the autopilot, its simulator or a router send "),

@@ -1,4 +1,5 @@
-"""Real ground stations, MAVSDK and MAVProxy, see the companion: its component, its health, its events."""
+"""Real ground stations, MAVSDK and MAVProxy, see the companion: its component, its health, its events. So does
+the example with MAVSDK."""
 
 import json
 import signal
@@ -6,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 from flight_process import start
-from ground_stations import Router, mavproxy, mavsdk
+from ground_stations import Router, mavproxy, mavsdk, mavsdk_example
 from mavlink_peers import AutopilotThread, free_port
 
 pytestmark = pytest.mark.process
@@ -28,6 +29,8 @@ def seen_by(recording, tmp_path):
             router = stack.enter_context(Router(autopilot, ground))
             if open_station is mavsdk:
                 station.wait_for('"autopilot": 1')
+            elif open_station is mavsdk_example:
+                station.wait_for("the place is not known")
             else:  # shows what one component says, at first the autopilot
                 station.wait_for("Detected vehicle 1:1 ")
                 station.ask("vehicle 1:197")
@@ -59,3 +62,11 @@ def test_mavproxy_sees_the_component_its_health_its_events_and_its_figures(seen_
         station.wait_for("NAMED_VALUE_FLOAT {", "name : vpr_mah", ask="status NAMED_VALUE_FLOAT")
         station.wait_for("NAMED_VALUE_INT {", "name : vpr_place", ask="status NAMED_VALUE_INT")
         station.wait_for("MAV Errors: 0", ask="status")
+
+
+def test_the_example_with_mavsdk_says_whether_the_place_is_known(seen_by, recording):
+    with seen_by(mavsdk_example, "--rate-hz", "4", source=recording / "blind" / "images") as station:
+        station.wait_for("the place is known")
+        station.wait_for("text edgevpr: started")
+        assert station.wait_for_end() == 0
+    assert "the place is not known" in station.said[-1]

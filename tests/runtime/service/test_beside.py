@@ -1,0 +1,113 @@
+"""A flight beside other programs on the only port of the flight controller: the routers themselves, configured as
+docs/how-to/beside-other-software.md says, with the ports and addresses of the test put in."""
+
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+import pytest
+from flight_process import start
+from flights import of_kind
+from ground_stations import mavproxy_with
+from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort, free_port, wait_until
+
+from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.flight.flightlog import read_log
+
+pytestmark = [pytest.mark.process, pytest.mark.network]
+
+PAGE = Path(__file__).parents[3] / "docs/how-to/beside-other-software.md"
+EDGEVPR = 197
+
+
+def written(section: str, language: str) -> str:
+    """The block of this language under a heading of the page."""
+    text = PAGE.read_text().split(f"## {section}\n")[1].split("\n## ")[0]
+    return re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1]
+
+
+@contextmanager
+def mavlink_router(put, folder):
+    if shutil.which("mavlink-routerd") is None:
+        pytest.skip("mavlink-routerd is not installed (github.com/mavlink-router/mavlink-router)")
+    settings = folder / "main.conf"
+    settings.write_text("[General]\nTcpServerPort = 0\n\n" + put(written("mavlink-router owns it", "ini")))
+    router = subprocess.Popen(["mavlink-routerd", "-c", settings], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        router.kill()
+        router.wait()
+
+
+@contextmanager
+def mavproxy(put, folder):
+    _, *flags = shlex.split(put(written("MAVProxy owns it", "sh")))
+    with mavproxy_with(folder, *flags):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("owner", "section"),
+    [(mavlink_router, "mavlink-router owns it"), (mavproxy, "MAVProxy owns it")],
+    ids=["mavlink-router", "MAVProxy"],
+)
+def test_fixes_are_answered_and_a_ground_station_hears_all_though_the_owner_of_the_port_is_killed_in_flight(
+    recording, tmp_path, owner, section
+):
+    cable, log = SerialCable(tmp_path), tmp_path / "flight.jsonl"
+    with ExitStack() as stack:
+        station_port = stack.enter_context(closing(UdpPort()))
+        replaced = {
+            "/dev/ttyAMA0": str(cable.ends[1]),
+            "192.168.1.10": "127.0.0.1",
+            "14560": str(free_port()),
+            "14550": str(station_port.number),
+            "14540": str(free_port()),
+        }
+
+        def put(text):
+            return re.sub("|".join(replaced), lambda found: replaced[found[0]], text)
+
+        cable.plug()
+        stack.callback(cable.unplug)
+        pilot = AutopilotThread(f"serial:{cable.ends[0]}:921600")
+        config = tmp_path / "config.yaml"
+        config.write_text(put(written(section, "yaml")))
+        images = recording / "blind" / "images"
+        flight = start(recording / "cohog.gpkg", images, log, "--config", config, "--rate-hz", "1")
+        stack.callback(flight.communicate)
+        stack.callback(flight.send_signal, signal.SIGTERM)
+
+        def accepted():
+            assert flight.poll() is None, flight.communicate()[1]
+            answers = of_kind(read_log(log), "answer") if log.exists() else []
+            return sum(line["result"] == "ACCEPTED" for line in answers)
+
+        station = Peer(station_port, system_id=255)
+
+        def hears(name, component_id, **fields):
+            while True:
+                message = station.expect(name)
+                if message.get_srcComponent() == component_id and fields.items() <= message.to_dict().items():
+                    return
+
+        with owner(put, tmp_path):  # after the flight
+            wait_until(accepted, "a fix was taken")
+            for name in ("HEARTBEAT", "STATUSTEXT", "NAMED_VALUE_FLOAT"):
+                hears(name, EDGEVPR)
+            hears("HEARTBEAT", 1)
+            station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EK3_ENABLE", -1), component_id=190)
+            hears("PARAM_VALUE", 1, param_id="EK3_ENABLE")
+        before = accepted()
+        with owner(put, tmp_path):
+            wait_until(lambda: accepted() > before, "a fix was taken again")
+        flight.send_signal(signal.SIGTERM)
+        assert flight.wait(timeout=60) == 0
+        seen = pilot.finish()
+    assert seen.companion == f"1/{EDGEVPR}"
+    assert (seen.fixes_denied, seen.fixes_failed) == (0, 0)
