@@ -88,7 +88,7 @@ class Map:
     ) -> None:
         wanted = {"map": str(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
         settings = load_config(config, wanted)
-        self._needs_height = settings.source.fov_deg is not None
+        self._needs_height = bool(settings.source.fov_deg or settings.source.lens)
         known = ("heading", "height", "reach") if self._needs_height else ("heading", "reach")
         self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
 

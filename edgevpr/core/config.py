@@ -68,6 +68,7 @@ class SourceConfig:
         "--rate-hz HZ", "queries a second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     )
     mask: str | None = key("--mask PNG", "black where frames show a display and no ground")
+    lens: str | None = key("--lens FILE", "calibration of the camera, of OpenCV, ROS or Kalibr: takes distortion away")
     fov_deg: float | None = key(
         "--fov-deg DEG", "field of view across the longest side of the picture", within=(5, 150)
     )
