@@ -42,10 +42,10 @@ def add(commands: Any) -> None:
 def calibrate_camera(args: Namespace) -> int:
     """Run `calibrate-camera`: write the calibration of a camera, and say how good it is."""
     from edgevpr.core.files import require_folder
-    from edgevpr.frames.chequerboard import Views, calibrated, write_lens
+    from edgevpr.frames.chequerboard import BoardViews, calibrated, write_lens
 
     require_folder(Path(args.out))
-    views, unusable = Views(args.board), list[ImageError]()
+    views, unusable = BoardViews(args.board), list[ImageError]()
     for frame in _frames(args, unusable):
         try:
             views.look(frame)

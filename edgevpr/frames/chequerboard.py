@@ -46,7 +46,7 @@ class CalibratedCamera:
     advice: tuple[str, ...]
 
 
-class Views:
+class BoardViews:
     """The views of a board that differ, as they are collected. `board`: numbers of inner corners along a row and a
     column. `found`: the corners of each view, (N, 2) pixels; `pictures`: number of pictures looked at; `size_px`: their
     width and height (None: none yet)."""
@@ -99,7 +99,7 @@ def live_frames(source: Source, seconds: float, clock: Callable[[], float] = tim
             yield frame
 
 
-def calibrated(views: Views, path: str, is_fisheye: bool) -> CalibratedCamera:
+def calibrated(views: BoardViews, path: str, is_fisheye: bool) -> CalibratedCamera:
     """Compute the lens from views of the board. `path` is the file that will name it. Raises EdgevprError, with what to
     do, if the views are too few or fit no lens."""
     columns, rows = views.board
@@ -162,7 +162,7 @@ def write_lens(camera: CalibratedCamera) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """What OpenCV computes: camera matrix (3, 3), coefficients, error of each view, and how far each view is tilted."""
+    """The result of OpenCV: camera matrix (3, 3), coefficients, error of each view, and how far each view is tilted."""
 
     matrix: Doubles
     coefficients: Doubles
@@ -213,7 +213,7 @@ def _solved(found: Sequence[Singles], points: Singles, size_px: Size, is_fisheye
     )
 
 
-def _advice(views: Views, solved: _Solved) -> Iterator[str]:
+def _advice(views: BoardViews, solved: _Solved) -> Iterator[str]:
     if empty := views.empty_cells():
         yield f"No corner in {_listed(empty)}: hold the board there."
     if (solved.tilts_deg > _TILTED_DEG).sum() < _LEAST_TILTED:

@@ -68,7 +68,7 @@ class CalibratedLens:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class LensSight:
     """The view of a `lens`, for pictures of its size. `half`: the ray to the lower right corner of its straightened
     picture. `farthest`: the length of a ray up to which its model holds. `field_deg`: all that it shows across the
     longest side of its pictures, at most 170."""
@@ -148,7 +148,7 @@ def _remapped(image: Image, pixels: Singles, how: int, border: int) -> Image:
 
 
 @lru_cache(maxsize=8)
-def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> Sight:
+def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
     """Return what a lens shows in pictures of `size_px` (width, height). Raises ImageError for pictures of another
     shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
     (width, height), (own_width, own_height) = size_px, lens.size_px
@@ -184,7 +184,7 @@ def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> Sight:
         raise _impossible(lens, "pixels towards the corners of the picture have no direction of their own")
     if field_deg < _NARROWEST_DEG:
         raise _impossible(lens, f"it sees {field_deg:.1f} degrees")
-    return Sight(lens, half, farthest, field_deg)
+    return LensSight(lens, half, farthest, field_deg)
 
 
 def read_lens(path: str) -> CalibratedLens:

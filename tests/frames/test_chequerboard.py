@@ -7,14 +7,14 @@ from fakes import FakeClock, FakeSource
 
 from edgevpr.core.errors import EdgevprError, ImageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.chequerboard import LEAST_VIEWS, Views, calibrated, live_frames, write_lens
+from edgevpr.frames.chequerboard import LEAST_VIEWS, BoardViews, calibrated, live_frames, write_lens
 from edgevpr.frames.lens import read_lens
 
 BOARD = 9, 6
 
 
 def looked(images, board=BOARD):
-    views = Views(board)
+    views = BoardViews(board)
     for number, image in enumerate(images):
         views.look(Frame(image=image, name=f"{number}.png", t_mono_s=0.0))
     return views
