@@ -27,6 +27,7 @@ _FISHEYE, _NEITHER = "equidistant", "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NEITHER)
 _WIDEST_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
+_MOST_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
 _NARROWEST_DEG = 5.0  # as of `source.fov_deg`
 _FARTHEST_DEG, _STEP_DEG = 85.0, 0.25  # up to which angle from its axis a lens is looked at, and how finely
 _AROUND_DEG = range(0, 360, 15)
@@ -194,9 +195,8 @@ def read_lens(path: str) -> CalibratedLens:
         data = read_file(path, _MOST_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    fields = {
-        name.lower(): value for name, value in (_stored(data, path) if b"opencv" in data else read_yaml(path)).items()
-    }
+    said = _stored(data, path) if b"opencv" in data else read_yaml(path)
+    fields = {str(name).lower(): value for name, value in said.items()}  # old files of OpenCV have capitals
     try:
         lens = _of_kalibr(fields["cam0"], path) if "cam0" in fields else _of_matrix(fields, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -220,6 +220,8 @@ def _of_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
     matrix, coefficients = _numbers(fields["camera_matrix"]), _numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
         raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and nine are needed.")
+    if abs(matrix[1]) > _MOST_SKEW * abs(matrix[0]):
+        raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without it.")
     model = fields.get("distortion_model", _FISHEYE if fields.get("fisheye_model") else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
     return _lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)

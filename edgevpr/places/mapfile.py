@@ -92,11 +92,11 @@ class PlaceMap(MapConnection):
         unknown."""
         return self._text_beside(mapspec.LENS)
 
-    def record_lens(self, name: str | None) -> None:
+    def record_lens(self, path: str | None) -> None:
         """Store the name of the calibration by which the pictures of the places are straightened. None: they are not,
         and nothing is stored. Raises MapError."""
-        if name is not None:
-            self._record_beside(mapspec.LENS, name)
+        if path is not None:
+            self._record_beside(mapspec.LENS, Path(path).name)
 
     @property
     def calibration(self) -> str | None:

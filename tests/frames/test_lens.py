@@ -94,6 +94,8 @@ def test_a_file_of_kalibr_is_read(tmp_path, model, coefficients, read):
         (ROS.replace("322.0", "3220"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "outside"),
         (ROS.replace("400.0", "9e9"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "0.0 degrees"),
         (ROS.replace("image_height: 480", ""), {"model": "plumb_bob", "coefficients": "0"}, "lacks `image_height`"),
+        ("camera_matrix: [400, 5, 320, 0, 400, 240, 0, 0, 1]\ndistortion_coefficients: [0]", {}, "skew"),
+        ("1: 2", {}, "lacks `camera_matrix`"),
         ("camera_matrix: [1, 2]\ndistortion_coefficients: [0]", {}, "2 numbers"),
         ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n", {}, "is not whole"),
         ("<?xml version='1.0'?>\n<opencv_storage><a>", {}, "is damaged"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from distorted_cameras import DistortedCamera, fisheye, wide
 
+from edgevpr.api import Map
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
@@ -103,6 +104,16 @@ def test_a_calibration_that_one_of_map_and_flight_has_is_said(maps, lenses, grou
     with caplog.at_level(logging.INFO):
         off_m(maps["wide"], CAMERAS["straight"], ground, fov_deg=66.0)
     assert "wide.yaml" in caplog.text
+
+
+def test_from_python_a_picture_through_a_lens_needs_a_height(maps, lenses, ground, tmp_path):
+    config = tmp_path / "flight.yaml"
+    config.write_text(f"source: {{lens: {lenses['wide']}}}\n")
+    image = CAMERAS["wide"].photograph(ground, M_PER_PX, east_m=250.0, north_m=200.0, **STRAIGHT)
+    with Map(maps["wide"], config=config) as opened:
+        with pytest.raises(UsageError, match="height_m"):
+            opened.match(image)
+        assert opened.match(image, height_m=100.0).accepted
 
 
 def test_a_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
