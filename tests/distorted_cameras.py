@@ -26,6 +26,8 @@ class DistortedCamera:
         until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10)
         if self.fisheye:
             rays = cv2.fisheye.undistortPoints(pixels, self.matrix, self.coefficients, criteria=until)
+        elif hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+            rays = cv2.undistortPointsIter(pixels, self.matrix, self.coefficients, np.eye(3), np.eye(3), until)
         else:
             rays = cv2.undistortPoints(pixels, self.matrix, self.coefficients, criteria=until)
         return rays.reshape(height, width, 2)

@@ -138,8 +138,9 @@ class Remap:
             height, width = image.shape[:2]
             small = max(1, round(width / self.shrink)), max(1, round(height / self.shrink))
             image = resized(image, small)
-            scale, half = np.array([small[0] / width, small[1] / height], np.float32), np.float32(0.5)
-            pixels = (pixels + half) * scale - half
+            pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
+            pixels *= np.array([small[0] / width, small[1] / height], np.float32)
+            pixels -= np.float32(0.5)
         return _remapped(image, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
@@ -195,7 +196,8 @@ def read_lens(path: str) -> CalibratedLens:
         data = read_file(path, _MOST_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    said = _stored(data, path) if b"opencv" in data else read_yaml(path)
+    is_of_opencv = b"opencv-matrix" in data or b"opencv_storage" in data
+    said = _stored(data, path) if is_of_opencv else read_yaml(path)
     fields = {str(name).lower(): value for name, value in said.items()}  # old files of OpenCV have capitals
     try:
         lens = _of_kalibr(fields["cam0"], path) if "cam0" in fields else _of_matrix(fields, path)
