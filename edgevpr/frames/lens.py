@@ -153,7 +153,13 @@ def _remapped(image: Image, pixels: Singles, how: int, border: int) -> Image:
 def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
     """Return what a lens shows in pictures of `size_px` (width, height). Raises ImageError for pictures of another
     shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
-    (width, height), (own_width, own_height) = size_px, lens.size_px
+    (width, height), (own_width, own_height), (column, row) = size_px, lens.size_px, lens.centre_px
+    if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
+        raise _impossible(lens, "a value is no number")
+    if min(lens.focal_px) <= 0:
+        raise _impossible(lens, "a focal length is not above zero")
+    if not (0 < column < own_width and 0 < row < own_height):
+        raise _impossible(lens, "its centre lies outside of the picture")
     if abs(height - width * own_height / own_width) > 1 and abs(width - height * own_width / own_height) > 1:
         raise ImageError(
             f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {own_width}x{own_height}: "
@@ -206,13 +212,6 @@ def read_lens(path: str) -> CalibratedLens:
         raise ConfigError(
             f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr, such as `edgevpr calibrate-camera` writes."
         ) from error
-    (width, height), (column, row) = lens.size_px, lens.centre_px
-    if not np.isfinite([*lens.focal_px, *lens.centre_px, *lens.coefficients]).all():
-        raise _impossible(lens, "a value is no number")
-    if min(lens.focal_px) <= 0:
-        raise _impossible(lens, "a focal length is not above zero")
-    if min(lens.size_px) < 1 or not (0 < column < width and 0 < row < height):
-        raise _impossible(lens, "its centre lies outside of the picture")
     sight_of(lens, lens.size_px)
     return lens
 

@@ -34,8 +34,12 @@ _log = logging.getLogger(__name__)
 
 
 def require_program(uri: str) -> str:
-    """Return the path of the system's program that reads this camera. Raises SourceError if it is not installed."""
-    name = _PIPELINE if uri.startswith("gst:") else _RIBBON
+    """Return the path of the system's program that reads this camera. Raises SourceError if it is not installed, or if
+    `uri` is no pipeline."""
+    name = _RIBBON
+    if uri.startswith("gst:"):
+        name = _PIPELINE
+        _words(uri)
     found = shutil.which(name) or shutil.which(_OLDER.get(name, name))
     if found is None:
         packages = _PACKAGES[name]
@@ -98,10 +102,22 @@ def _ribbon(uri: str, port: int) -> list[str]:
 def _pipeline(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a pipeline to those who connect to `port`. It does not notice that
     they have gone, so setpriv has it ended with us."""
-    pipeline = _APPSINK.sub("", uri.removeprefix("gst:"))
     sink = f"sync=false buffers-soft-max={_WAITING_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     sent = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    return ["setpriv", "--pdeathsig", "TERM", require_program(uri), "-q", *shlex.split(pipeline), *sent.split()]
+    return ["setpriv", "--pdeathsig", "TERM", require_program(uri), "-q", *_words(uri), *sent.split()]
+
+
+def _words(uri: str) -> list[str]:
+    """Split a pipeline, without an appsink, into words. Raises SourceError if there is none or a quote does not end."""
+    try:
+        words = shlex.split(_APPSINK.sub("", uri.removeprefix("gst:")))
+    except ValueError:
+        words = []
+    if not words:
+        raise SourceError(
+            f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end."
+        )
+    return words
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

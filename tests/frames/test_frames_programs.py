@@ -87,6 +87,12 @@ def test_without_the_program_the_sentence_says_what_to_install(monkeypatch, tmp_
         open_source(uri, live=True)
 
 
+@pytest.mark.parametrize("pipeline", ["gst:", "gst: ! appsink", "gst: v4l2src device='/dev/video0"])
+def test_what_is_no_pipeline_is_refused(pipeline):
+    with pytest.raises(SourceError, match="is no pipeline"):
+        open_source(pipeline, live=True)
+
+
 @needs_gstreamer
 @pytest.mark.parametrize("end", ["", " ! videoconvert ! appsink drop=true"])
 def test_the_pictures_of_a_pipeline_come_and_it_ends_with_the_source(opened, end):
