@@ -7,6 +7,7 @@ a field of view holds for it. A *ray* is a direction from the lens, as its tange
 """
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -18,10 +19,12 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.files import read_file
-from edgevpr.core.yamlfile import read_yaml
+from edgevpr.core.yamlfile import parsed_yaml
 from edgevpr.frames.images import resized
 
-_MOST_FILE_BYTES = 10_000_000  # OpenCV's program writes all corners of the board into its file too
+_MOST_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
+# What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
+_OPENCVS_OWN = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
 _COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
 _FISHEYE, _NEITHER = "equidistant", "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
@@ -202,8 +205,7 @@ def read_lens(path: str) -> CalibratedLens:
         data = read_file(path, _MOST_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    is_of_opencv = b"opencv-matrix" in data or b"opencv_storage" in data
-    said = _stored(data, path) if is_of_opencv else read_yaml(path)
+    said = _of_xml(data, path) if data.lstrip().startswith(b"<") else parsed_yaml(_OPENCVS_OWN.sub(b"", data), path)
     fields = {str(name).lower(): value for name, value in said.items()}  # old files of OpenCV have capitals
     try:
         lens = _of_kalibr(fields["cam0"], path) if "cam0" in fields else _of_matrix(fields, path)
@@ -223,7 +225,7 @@ def _of_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
         raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and nine are needed.")
     if abs(matrix[1]) > _MOST_SKEW * abs(matrix[0]):
         raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without it.")
-    model = fields.get("distortion_model", _FISHEYE if fields.get("fisheye_model") else "")
+    model = fields.get("distortion_model", _FISHEYE if int(fields.get("fisheye_model") or 0) else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
     return _lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
 
@@ -268,23 +270,15 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return tuple(map(float, value["data"] if isinstance(value, dict) else value))
 
 
-def _stored(data: bytes, path: str) -> dict[str, Any]:
-    """Read the numbers, texts and matrices of a file written by OpenCV."""
+def _of_xml(data: bytes, path: str) -> dict[str, Any]:
+    """Read the fields of an XML file of OpenCV, matrices as in files of ROS."""
+    from xml.etree import ElementTree  # hardly any calibration is XML
+
     try:
-        storage = cv2.FileStorage(data.decode(), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        names = storage.root().keys()
-        return {name: _value(storage.getNode(name)) for name in names}
-    # A file that cannot be parsed is a SystemError in OpenCV's wrapper, around its own.
-    except (cv2.error, SystemError, UnicodeDecodeError, AttributeError) as error:
-        raise ConfigError(f"{path} is damaged: give the calibration as OpenCV wrote it.") from error
-
-
-def _value(node: cv2.FileNode) -> Any:
-    """Return what a node holds: the numbers of a matrix, a text, or a number; 0 for anything else."""
-    parts = node.keys() if node.isMap() else ()
-    if "data" in parts:
-        return node.mat().ravel().tolist()
-    return node.string() if node.isString() else node.real() if node.isInt() or node.isReal() else 0
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ConfigError(f"{path} is not valid XML ({error}): give the calibration as OpenCV wrote it.") from error
+    return {each.tag: {"data": (each.findtext("data") or "").split()} if len(each) else each.text for each in root}
 
 
 def _impossible(lens: CalibratedLens, why: str) -> ConfigError:
