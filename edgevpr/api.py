@@ -88,9 +88,11 @@ class Map:
     ) -> None:
         wanted = {"map": str(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
         settings = load_config(config, wanted)
-        self._needs_height = settings.source.fov_deg is not None
-        known = ("heading", "height", "reach") if self._needs_height else ("heading", "reach")
+        source = settings.source
+        known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
+        is_nadir = self._recogniser.technique.spec.cells is not None
+        self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
 
     def __enter__(self) -> "Map":
         return self
@@ -122,10 +124,11 @@ class Map:
     ) -> Match:
         """Find the place of a picture, uint8 (H, W) grey or (H, W, 3) blue, green, red.
 
-        `heading_deg`: compass direction of the nose. `height_m`: above the ground; it counts with `fov_deg` only, and
-        is needed then. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: places within 300 m of it are searched, and a
-        few others in case that is wrong. `t_s`: when it was taken, seconds of any clock (None: now); it counts with
-        `follow`. Raises ImageError for a picture that cannot be used, UsageError for a missing height.
+        `heading_deg`: compass direction of the nose. `height_m`: above the ground; it counts, and is needed, only with
+        `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: places within 300 m
+        of it are searched, and a few others in case that is wrong. `t_s`: when it was taken, seconds of any clock
+        (None: now); it counts with `follow`. Raises ImageError for a picture that cannot be used, UsageError for a
+        missing height.
         """
         if self._needs_height and height_m is None:
             raise UsageError("The map was opened with a field of view: give the height_m of each picture too.")

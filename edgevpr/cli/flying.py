@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from edgevpr.runtime.service.finding import Finding
 
 _MATCHING_KEYS = (
-    "board", "technique", "source.camera", "source.mask", "source.fov_deg", "source.up_deg",
+    "board", "technique", "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg",
     "match.matching", "match.form", "match.candidates", "match.sequence",
     "match.accept_precision", "match.min_score", "match.min_margin", "memory.budget_mb", "battery.pack",
     "salience.use",

@@ -23,8 +23,8 @@ FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from larg
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
 BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
-    "a folder of images, a video file, a camera (/dev/video0, or rpicam on a Raspberry Pi's ribbon) or a stream "
-    "(rtsp://, udp://, tcp://, http://, FILE.sdp)"
+    "a folder of images, a video file, a camera (/dev/video0, or rpicam on a Raspberry Pi's ribbon), a stream "
+    "(rtsp://, udp://, tcp://, http://, FILE.sdp) or gst: and a pipeline of GStreamer"
 )
 
 _LARGEST = 2**63
@@ -68,6 +68,7 @@ class SourceConfig:
         "--rate-hz HZ", "queries a second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     )
     mask: str | None = key("--mask PNG", "black where frames show a display and no ground")
+    lens: str | None = key("--lens FILE", "calibration of the camera, of OpenCV, ROS or Kalibr: takes distortion away")
     fov_deg: float | None = key(
         "--fov-deg DEG", "field of view across the longest side of the picture", within=(5, 150)
     )

@@ -15,12 +15,19 @@ MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads som
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML mapping; an empty file gives {}. Raises ConfigError for a file that is missing, unreadable, too large
     or not a mapping, for a duplicate key, and for aliases (`*name`), which can make a small file huge."""
+    try:
+        data = read_file(path, MAX_FILE_BYTES)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
+    return parsed_yaml(data, path)
+
+
+def parsed_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
+    """Parse the bytes of the YAML file `path`; raises ConfigError as `read_yaml` does."""
     import yaml  # not at the top: the command line lists its flags without it
 
     try:
-        content = deepcopy(_content(read_file(path, MAX_FILE_BYTES).decode("utf-8-sig")))
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
+        content = deepcopy(_content(data.decode("utf-8-sig")))
     # An impossible date or a number of 5000 digits is a ValueError, deep nesting a RecursionError.
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)

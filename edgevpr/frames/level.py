@@ -15,6 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import resized
+from edgevpr.frames.lens import CalibratedLens, Remap, sight_of
 
 MOST_TILT_DEG = 45.0
 _MOST_OFF_DOWN_DEG = 85.0  # between a corner's ray and straight down: beyond are the horizon and far too distant ground
@@ -30,11 +31,13 @@ _SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera's lens without distortion, and how the camera is mounted. `fov_deg`: its field of view across the
-    longest side of the picture. `up_deg`: compass direction of the picture's top while the nose points north."""
+    """A camera's lens, and how the camera is mounted. `fov_deg`: its field of view across the longest side of the
+    picture. `up_deg`: compass direction of the picture's top while the nose points north. `calibrated`: its distortion
+    (None: it has none); then `fov_deg` is that of the straightened picture, see `frames.lens`."""
 
     fov_deg: float
     up_deg: float = 0.0
+    calibrated: CalibratedLens | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,8 +97,9 @@ def levelled(
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
     scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). Its middle shows the
     same point as before or, with `below`, the point under the camera. `overlay`, bool (H, W), is False where the
-    picture shows no ground (None: it shows ground everywhere). A picture of known pose, or that needs no warp, or is
-    tilted too far for one, is returned unchanged. Impossible values in frame or vehicle never raise.
+    picture shows no ground (None: it shows ground everywhere). A picture of known pose is returned unchanged, and
+    so is, but for the distortion of its lens, one that needs no warp or is tilted too far for one. Impossible values in
+    frame or vehicle never raise; ImageError is raised for a picture of another shape than the calibrated lens takes.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
@@ -103,38 +107,49 @@ def levelled(
     taking = _Taking(frame, vehicle, lens)
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
-        return Levelled(frame.image, overlay, view)
+        return straightened(frame.image, overlay, view, lens.calibrated)
     zoom = taking.own_m / footprint_m if taking.own_m and footprint_m else 1.0
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
         zoom = 1.0
     turn_deg = abs(((taking.top_deg or 0.0) + 180) % 360 - 180)
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=taking.aside(taking.straight, 1.0))
-        return Levelled(frame.image, overlay, view)
+        return straightened(frame.image, overlay, view, lens.calibrated)
 
     side = min(taking.longest_px, _LONGEST_PX)
     out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
     turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
     middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
     right, down = (side - 1) / 2 - middle
-    out_from_pixel = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned @ taking.lens_from_pixel
+    out_from_ray = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned
+    warp = taking.warp(out_from_ray, out_px, side)
 
-    mask = _quadrangle(out_from_pixel @ taking.corners, side)
-    height, width = (min(1.0, zoom * px / taking.longest_px) for px in frame.image.shape[:2])
-    if (filled := mask.mean() / (height * width)) < _LEAST_FILLED:
+    width, height = (min(1.0, zoom * px / taking.longest_px) for px in taking.size_px)
+    if (filled := warp.shown.mean() / (height * width)) < _LEAST_FILLED:
         reason = f"it shows {filled:.0%} of the ground under it at a tilt of {taking.tilt_deg:.0f} degrees"
-        return Levelled(frame.image, overlay, View(up_deg=taking.top_deg, reason=reason))
-    if overlay is not None:
-        size = (side, side)
-        mask &= cv2.warpPerspective(overlay.view(np.uint8), out_from_pixel, size, flags=cv2.INTER_NEAREST).view(bool)
+        view = View(up_deg=taking.top_deg, reason=reason)
+        return straightened(frame.image, overlay, view, lens.calibrated)
     view = View(
         up_deg=None if taking.heading_deg is None else 0.0,
         footprint_m=taking.own_m and taking.own_m / zoom,
         zoom=zoom,
         aside=(0.0, 0.0) if below and taking.is_attitude_known else taking.aside(turned, zoom),
     )
-    image = _shrunk_and_warped(frame.image, out_from_pixel, side, taking.focal_px / out_px)
-    return Levelled(image, None if mask.all() else mask, view)
+    return _warped(frame.image, overlay, warp, view)
+
+
+def straightened(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
+    """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
+    `levelled`. Raises ImageError for a picture of another shape than the lens takes."""
+    if lens is None:
+        return Levelled(image, overlay, view)
+    height, width = image.shape[:2]
+    return _warped(image, overlay, sight_of(lens, (width, height)).straightening(_LONGEST_PX), view)
+
+
+def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", view: View) -> Levelled:
+    mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
+    return Levelled(warp.picture(image), None if mask.all() else mask, view)
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
@@ -164,7 +179,8 @@ class _Taking:
     `straight` is the rotation from lens to level picture without a turn, `tilt_deg` the angle between the viewing
     direction and straight down, and `is_too_tilted` is True if that is too much for a warp. `top_deg` is the compass
     direction of the picture's top (None: unknown). `own_m` is the ground length of the longest side if the picture were
-    level (None: height unknown). `corners` (3, 4) are the picture's corners in homogeneous pixels, one per column."""
+    level (None: height unknown). `corners` (3, 4) are the picture's corners in homogeneous pixels, one per column.
+    `size_px` is its size (width, height). Of a lens with distortion, the picture meant is the straightened one."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
@@ -173,7 +189,10 @@ class _Taking:
         self._level_from_body = _level_from_body(*known)
         self._lens = lens
         height, width = frame.image.shape[:2]
-        self.longest_px = max(height, width)
+        self._sight = sight_of(lens.calibrated, (width, height)) if lens.calibrated else None
+        if self._sight:
+            width, height = self._sight.straight_px
+        self.size_px, self.longest_px = (width, height), max(height, width)
         half = math.tan(math.radians(lens.fov_deg) / 2)
         self.focal_px = self.longest_px / 2 / half
         self.own_m = 2 * height_m * half if height_m is not None and 0 < height_m <= _HIGHEST_M else None
@@ -187,6 +206,13 @@ class _Taking:
         lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
         self.is_too_tilted = self.tilt_deg > MOST_TILT_DEG or lowest < math.cos(math.radians(_MOST_OFF_DOWN_DEG))
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
+
+    def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> "_Homography | Remap":
+        """Return the warp to (side, side) pixels by the homography (3, 3) from rays to pixels of an output of the focal
+        length `out_px`."""
+        if self._sight:
+            return self._sight.remap(out_from_ray, out_px, (side, side))
+        return _Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
@@ -219,21 +245,32 @@ def _body_from_lens(up_deg: float) -> Doubles:
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
 
 
-def _quadrangle(corners: Doubles, side: int) -> Mask:
-    """Return a mask, bool (side, side), True inside the quadrangle of `corners`, homogeneous pixels (3, 4)."""
-    points = np.round((corners[:2] / corners[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
-    return cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS).view(np.bool_)
+class _Homography:
+    """The warp of a picture without distortion to (side, side) pixels by a homography (3, 3), like `frames.lens.Remap`.
+    `corners` are those of the picture, homogeneous pixels (3, 4)."""
 
+    def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
+        self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
+        ends = out_from_pixel @ corners
+        points = np.round((ends[:2] / ends[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
+        shown = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
+        self.shown: Mask = shown.view(np.bool_)
 
-def _shrunk_and_warped(image: Image, out_from_pixel: Doubles, side: int, shrink: float) -> Image:
-    """Warp an image to (side, side) pixels by a homography (3, 3); `shrink` input pixels along a side become one."""
-    if shrink > 2:  # averaged first, since a warp alone would ignore most pixels
-        height, width = image.shape[:2]
-        small = max(1, round(width / shrink)), max(1, round(height / shrink))
-        across, along = width / small[0], height / small[1]
-        image = resized(image, small)
-        out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
-    # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
-    return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
-        image, out_from_pixel, (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    def overlay(self, overlay: Mask) -> Mask:
+        size = (self._side, self._side)
+        return cv2.warpPerspective(overlay.view(np.uint8), self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(
+            bool
+        )
+
+    def picture(self, image: Image) -> Image:
+        out_from_pixel = self._out_from_pixel
+        if self._shrink > 2:  # averaged first, since a warp alone would ignore most pixels
+            height, width = image.shape[:2]
+            small = max(1, round(width / self._shrink)), max(1, round(height / self._shrink))
+            across, along = width / small[0], height / small[1]
+            image = resized(image, small)
+            out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
+        # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
+        return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
+            image, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )

@@ -22,7 +22,7 @@ from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_po
 from edgevpr.frames.shot import Capture, Condition, Refusal
 
 _READ_TIMEOUT_S = 1.0
-_RIBBON = re.compile(r"rpicam(:\d+)?")
+_BY_PROGRAM = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 _ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|udp://.*:\d+.*")  # udp://:PORT: on all interfaces
 
 
@@ -141,7 +141,7 @@ def recorded_steps(uri: str | None, positions: Path | None = None) -> list[float
     `uri` is no folder, an image has no time, one is older than the image before it, or all have the same time; or the
     folder or the table cannot be used, which `open_source` says."""
     times: list[float | None] = []
-    if uri is not None and Path(uri).is_dir():
+    if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
             times = [tag.t_utc_s for tag in tags_of(Path(uri), positions).values()]
     steps_s = [there - here for here, there in pairwise(times) if here is not None and there is not None]
@@ -173,7 +173,7 @@ def open_source(
     path = Path(uri)
     if positions and is_live(uri):
         raise UsageError(f"{positions} can only place the pictures of a recording, and {uri} is none: leave it out.")
-    if path.is_dir():
+    if os.path.isdir(uri):  # Path.is_dir raises OSError for a long pipeline
         return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
     if is_live(uri):
         if not live:
@@ -206,16 +206,21 @@ def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Itera
 def is_live(uri: str) -> bool:
     """Return True if `uri` names a camera or a stream; anything else is a recording."""
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
-    return "://" in uri or is_device or uri.lower().endswith(".sdp") or bool(_RIBBON.fullmatch(uri))
+    return "://" in uri or is_device or uri.lower().endswith(".sdp") or is_by_program(uri)
+
+
+def is_by_program(uri: str) -> bool:
+    """Return True if `uri` names a camera that a program of the system reads, see `frames.programs`."""
+    return bool(_BY_PROGRAM.fullmatch(uri))
 
 
 def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
     """Return a function that opens the camera or stream `uri`. Raises SourceError if that can never succeed."""
-    if _RIBBON.fullmatch(uri):
-        from edgevpr.frames.ribbon import open_ribbon, require_program  # loads FFmpeg
+    if is_by_program(uri):
+        from edgevpr.frames.programs import open_by_program, require_program  # loads FFmpeg
 
-        require_program()
-        return lambda: open_ribbon(uri, clock)
+        require_program(uri)
+        return lambda: open_by_program(uri, clock)
     if "://" in uri:
         if not _ADDRESS.fullmatch(uri):
             raise SourceError(

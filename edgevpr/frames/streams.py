@@ -26,6 +26,7 @@ READ_TIMEOUT_S = 3.0
 # are allowed.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
 _SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
+_RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
 _BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # prefixes of pixel formats whose first plane is the brightness
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
 _TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
@@ -39,9 +40,9 @@ _WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due 
 
 def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -> "StreamCapture | None":
     """Open a network stream or an .sdp file, with time-outs; None if it cannot be opened. `clock` is the monotonic
-    clock, in seconds; `form` FFmpeg's name of the format (None: it finds out)."""
+    clock, in seconds; `form` FFmpeg's name of a format without time stamps (None: it finds out)."""
     opened_s = clock()
-    options = _OPTIONS if "://" in uri else _SDP_OPTIONS
+    options = _RAW_OPTIONS if form else _OPTIONS if "://" in uri else _SDP_OPTIONS
     whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S), form)
     return StreamCapture(whole, clock, opened_s) if whole else None
 

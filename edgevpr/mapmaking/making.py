@@ -25,7 +25,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
 from edgevpr.runtime.recognise.evidence import MapCalibration, kinds_of
 from edgevpr.runtime.recognise.levelling import levelling_of
-from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_mask, technique_of
+from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_lens, say_other_mask, technique_of
 from edgevpr.runtime.recognise.recogniser import Preparation
 
 if TYPE_CHECKING:
@@ -116,15 +116,17 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, here, pictures = map_path(order.path), load_board("this"), order.pictures
     is_new = not (order.append and path.exists())
-    mask = None if isinstance(pictures, Cuttings) else mask_of(config.source.mask)
+    mask, lens = (None, None) if isinstance(pictures, Cuttings) else (mask_of(config.source.mask), config.source.lens)
     if is_new:
         source, technique = _opened(order, config, None, mask)
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256 if mask else None)
+        place_map.record_lens(lens)
     else:
         place_map = PlaceMap.open_for_adding(path)
         source, technique = _opened(order, config, place_map, mask)
         say_other_mask(place_map, mask)
+        say_other_lens(place_map, lens)
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):

@@ -87,6 +87,18 @@ class PlaceMap(MapConnection):
         self._record_beside(mapspec.MASK, sha256)
 
     @property
+    def lens(self) -> str | None:
+        """Name of the calibration by which the pictures of the places were straightened; None: they were not, or
+        unknown."""
+        return self._text_beside(mapspec.LENS)
+
+    def record_lens(self, path: str | None) -> None:
+        """Store the name of the calibration by which the pictures of the places are straightened. None: they are not,
+        and nothing is stored. Raises MapError."""
+        if path is not None:
+            self._record_beside(mapspec.LENS, Path(path).name)
+
+    @property
     def calibration(self) -> str | None:
         """The map's calibration of confidences (see `mapmaking.calibrate`), as the text stored in the file. None if the
         map was not calibrated, or if the stored value is not a text."""

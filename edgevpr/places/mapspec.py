@@ -20,7 +20,7 @@ _BEFORE_RELEASE = 4  # format version in maps made before the first release; the
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
-BESIDE = MASK, CALIBRATION = ("mask_sha256", "calibration")  # keys of texts that a map may lack
+BESIDE = MASK, LENS, CALIBRATION = ("mask_sha256", "lens", "calibration")  # keys of texts that a map may lack
 _MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
@@ -42,7 +42,7 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
-    """Return the values of edgevpr_map by key, without mask and calibration, and check the columns of `places`. Raises
+    """Return the values of edgevpr_map by key, without those of `BESIDE`, and check the columns of `places`. Raises
     MapError for a file that is not a place map or has an unknown format version, and sqlite3.Error."""
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
     # A view or virtual table, which has no page of its own in the file, is refused: a query of it may never end.
@@ -50,9 +50,9 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
     if application_id != geopackage.APPLICATION_ID or not {"edgevpr_map", "places"} <= tables:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
-        # Mask and calibration are read only when they are needed: a map can be used without them.
-        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?)", BESIDE).fetchmany(_MOST_STORED)
-        stored = {key: json.loads(value) for key, value in said}
+        # The others are read only when they are needed: a map can be used without them.
+        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?)", BESIDE)
+        stored = {key: json.loads(value) for key, value in said.fetchmany(_MOST_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format version {version}")

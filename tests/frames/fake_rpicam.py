@@ -1,7 +1,8 @@
 """Stands for rpicam-vid in tests: takes the flags that it documents and no others, waits for one reader on the address
 of --output, and sends it MJPEG until the reader goes or it is told to end.
 
-FAKE_RPICAM in the environment: `absent` ends at once as without a camera; `hangs` sends a few pictures and then none.
+With --list-cameras it lists one. FAKE_RPICAM in the environment: `absent` ends at once as without a camera, or lists
+none; `hangs` sends a few pictures and then none.
 """
 
 import argparse
@@ -17,7 +18,15 @@ FLAGS = ("camera", "timeout", "codec", "quality", "framerate", "width", "height"
 HANGS_AFTER = 8
 
 
+LISTED = (
+    "Available cameras\n-----------------\n0 : imx219 [3280x2464 10-bit RGGB] (/base/soc/i2c0mux/i2c@1/imx219@10)\n"
+)
+
+
 def main() -> None:
+    if sys.argv[1:] == ["--list-cameras"]:
+        print("No cameras available!" if os.environ.get("FAKE_RPICAM") == "absent" else LISTED)
+        return
     parser = argparse.ArgumentParser(allow_abbrev=False)
     for flag in FLAGS:
         parser.add_argument(f"--{flag}", required=True)

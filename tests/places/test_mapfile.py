@@ -198,6 +198,7 @@ def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
 def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_known_of_them(map_path, tmp_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         place_map.record_mask("m")
+        place_map.record_lens("/camera/lens.yaml")
         place_map.record_calibration("how sure")
     assert shrink(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
     with contextlib.closing(sqlite3.connect(map_path)) as db, db:
@@ -205,7 +206,7 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
     repair(map_path)
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
         for each in (repaired, small):
-            assert (each.mask_sha256, each.calibration) == ("m", "how sure")
+            assert (each.mask_sha256, each.lens, each.calibration) == ("m", "lens.yaml", "how sure")
             for place in each.places():
                 assert place.source_image == f"{place.place_id - 1:05d}.jpg"
         assert len(repaired) == 9

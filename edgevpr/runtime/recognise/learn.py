@@ -5,11 +5,11 @@ repeat our own fixes, its quality is low, the map has a place near it, or the fl
 """
 
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from edgevpr.core.config import Config
@@ -161,7 +161,7 @@ def _require_no_contradiction(followed: Followed | None, position: Position) -> 
 
 def check_positions(config: Config) -> None:
     """Raise UsageError if no frame can ever have a position: there is neither a link nor a folder of images."""
-    if config.mavlink.link is None and not Path(config.source.uri or "").is_dir():
+    if config.mavlink.link is None and not os.path.isdir(config.source.uri or ""):
         raise UsageError(
             "There is nothing to learn positions from: name the flight controller with --link, or a folder of images "
             "with positions (--positions, or EXIF)."

@@ -1,5 +1,6 @@
-"""The first step of recognising a frame: levels the picture of a camera that looks straight down, as if the aircraft
-flew level. Also computes the position of a place from the picture's position on the ground (`laid`).
+"""The first step of recognising a frame: takes the distortion of its lens away, and levels the picture of a camera that
+looks straight down, as if the aircraft flew level. Also computes the position of a place from the picture's position on
+the ground (`laid`).
 
 A wrong height scales a picture wrongly; a technique with `height_ratios` recognises it nevertheless.
 """
@@ -10,15 +11,18 @@ from dataclasses import replace
 from edgevpr.core.arrays import Mask
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
+from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import axes_of, moved
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
-from edgevpr.frames.level import Lens, Levelled, View, leaning, levelled
+from edgevpr.frames.lens import CalibratedLens, read_lens, sight_of
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, leaning, levelled, straightened
 from edgevpr.frames.source import is_live
 
 GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 UNTOLD_TILT = 0.04
+_FIELDS_AGREE_DEG = 5.0  # that of a data sheet is rounded
 
 _log = logging.getLogger(__name__)
 
@@ -61,18 +65,47 @@ class Levelling:
         return picture
 
 
+class Straightening:
+    """Takes the distortion of a lens from the pictures of a camera that looks ahead, which are not levelled."""
+
+    def __init__(self, lens: CalibratedLens) -> None:
+        self._lens = lens
+
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
+        """Straighten the picture of a frame; as `Levelling.prepare`."""
+        return straightened(frame.image, overlay, UNKNOWN_VIEW, self._lens)
+
+
 def levelling_of(
     config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
-) -> Levelling | None:
-    """Make the levelling for a configuration; None for a camera that looks ahead, or on a gimbal with unknown lens."""
+) -> Levelling | Straightening | None:
+    """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
+    with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
+    of view that contradicts it."""
+    calibrated = calibrated_lens(config)
     if technique.spec.parameters.get("camera") != "nadir":
-        return None
-    lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
+        return Straightening(calibrated) if calibrated else None
+    fov_deg = sight_of(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
+    lens = None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated)
     if lens is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal:
             return None
     return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now(config))
+
+
+def calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
+    """Read the calibration that the configuration names (None: it names none); raises as `levelling_of`."""
+    if config.lens is None:
+        return None
+    lens = read_lens(config.lens)
+    field_deg = sight_of(lens, lens.size_px).field_deg
+    if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _FIELDS_AGREE_DEG:
+        raise UsageError(
+            f"`source.fov_deg` is {config.fov_deg:g}, and {config.lens} says {field_deg:.0f} degrees: leave `fov_deg` "
+            "out, or name the calibration of this camera."
+        )
+    return lens
 
 
 def is_now(config: SourceConfig) -> bool:

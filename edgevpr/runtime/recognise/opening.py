@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from edgevpr import techniques
-from edgevpr.core.config import Config, SalienceConfig
+from edgevpr.core.config import Config, SalienceConfig, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, mask_of
@@ -74,7 +74,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
     path = map_path(config.map)
     require_regular(path)
     if new_technique and not has_map(path):
-        _make_map(path, made_for(board.threads, new_technique, _wanted(config)), mask_of(config.source.mask))
+        _make_map(path, made_for(board.threads, new_technique, _wanted(config)), config.source)
     place_map = PlaceMap.open_for_adding(path)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
@@ -173,6 +173,20 @@ def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
+def say_other_lens(place_map: PlaceMap, lens: str | None) -> None:
+    """Say if pictures are straightened by the calibration `lens` and the places of a map were not, or the other way
+    round, which is right where one of the two cameras has no distortion."""
+    built_with = place_map.lens
+    if len(place_map) and built_with and not lens:
+        _log.warning(
+            "%s was built with `source.lens` (%s): name the calibration of this camera too, unless it distorts nothing",
+            place_map.path,
+            built_with,
+        )
+    elif len(place_map) and lens and not built_with:
+        _log.info("%s was built without `source.lens`: right if its pictures had no distortion", place_map.path)
+
+
 def _in_flight(config: Config, technique: Technique) -> Prior:
     """Make what narrows the queries of a flight."""
     return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
@@ -193,6 +207,7 @@ def _recogniser(
     matcher = Matcher(technique, index, rule, search_of(length))
     mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
+    say_other_lens(place_map, config.source.lens)
     follower = None
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and kinds_of(technique.spec):
@@ -214,12 +229,14 @@ def _recogniser(
     return recogniser
 
 
-def _make_map(path: Path, technique: Technique, mask: Mask | None) -> None:
+def _make_map(path: Path, technique: Technique, source: SourceConfig) -> None:
     """Make an empty map, completely or not at all, so that a service killed at power-on can start again."""
     unfinished = path.with_name(path.name + ".new")
     remove(unfinished)
     with PlaceMap.create(unfinished, technique.spec) as place_map:
+        mask = mask_of(source.mask)
         place_map.record_mask(mask.sha256 if mask else None)
+        place_map.record_lens(source.lens)
     unfinished.replace(path)
 
 

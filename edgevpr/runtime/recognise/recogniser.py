@@ -34,7 +34,7 @@ from edgevpr.runtime.recognise.judge import (
     says_nothing,
 )
 from edgevpr.runtime.recognise.landmarks import describe, packed
-from edgevpr.runtime.recognise.levelling import Levelling, seen_as
+from edgevpr.runtime.recognise.levelling import Levelling, Straightening, seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
@@ -58,10 +58,10 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """Preparation of a frame before it is encoded: `levelling` levels its picture, `mask` excludes parts of it, and
-    `gate` rejects frames that are not memorable (None: neither is done)."""
+    """Preparation of a frame before it is encoded: `levelling` levels or straightens its picture, `mask` excludes parts
+    of it, and `gate` rejects frames that are not memorable (None: neither is done)."""
 
-    levelling: Levelling | None = None
+    levelling: Levelling | Straightening | None = None
     mask: Mask | None = None
     gate: Gate | None = None
 

@@ -4,14 +4,14 @@ closes it again."""
 import os
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 from edgevpr.core.config import Config, load_config
-from edgevpr.core.errors import EdgevprError, ImageError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.errors import EdgevprError, LinkError, MapError, UsageError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import Source, open_source, recorded_steps
+from edgevpr.frames.source import open_source, recorded_steps
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
@@ -25,12 +25,11 @@ from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
+from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.service.camera import frame_seen
 from edgevpr.runtime.service.doctor import silence
 from edgevpr.runtime.service.finding import Finding, fine, log_findings, looked_at, wrong
-
-_FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
-_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
 
 
 def check(
@@ -103,29 +102,14 @@ def _source(config: Config, offline: bool) -> str:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
     if config.mapping.learn:
         check_positions(config)
+    if not offline:
+        return frame_seen(config.source)
+    calibrated_lens(config.source)
     with closing(open_source(uri, live=True)) as source:
-        if not offline:
-            return f"{uri}, {_with_a_frame(source, uri)}"
         # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
         while source.condition is Condition.OPENING:
             time.sleep(0.05)
         return f"{uri}, {source.state}"
-
-
-def _with_a_frame(source: Source, uri: str) -> str:
-    """Wait for a frame, 15 s at most; return a text about source and frame. Raises SourceError if no frame comes."""
-    end_s = time.monotonic() + _FRAME_WAIT_S
-    is_hopeless = False
-    while not (is_hopeless or source.ended) and time.monotonic() < end_s:
-        is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
-        with suppress(ImageError):
-            if frame := source.read(0.25):
-                height, width = frame.image.shape[:2]
-                return f"{source.state}, {width} x {height} pixels"
-    raise SourceError(
-        f"{uri}: no frame comes ({source.state}): start the camera or the stream, correct `source: {{uri: ...}}`, or "
-        "check with --offline."
-    )
 
 
 def _link(config: Config, offline: bool) -> str:

@@ -5,12 +5,14 @@ from pathlib import Path
 
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkError
+from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import AutopilotReading, Inquiry, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.service.finding import Finding, FlightIntent, board_findings, fine, judged, wrong
+from edgevpr.runtime.service.camera import camera_findings, frame_seen
+from edgevpr.runtime.service.finding import Finding, FlightIntent, board_findings, fine, judged, looked_at, wrong
 from edgevpr.runtime.service.rules import RULES
 
 _SLOW_S = 0.25  # for a round trip: fixes would come as late
@@ -37,6 +39,12 @@ def doctor(
     settings = config.mavlink
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
     about_board = list(board_findings(config, address, root))
+    if (uri := config.source.uri) and is_live(uri):
+        about_camera = list(camera_findings(uri, root))
+        if all(finding.ok for finding in about_camera):
+            say(f"waiting for a frame of {uri}")
+            about_camera.append(looked_at("frames", lambda: frame_seen(config.source)))
+        about_board += about_camera
     intent = FlightIntent(settings.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
     say(f"asking the autopilot at {address}")
     reading = None

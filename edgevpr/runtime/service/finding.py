@@ -82,14 +82,12 @@ def board_findings(config: Config, address: LinkAddress | None, root: Path = Pat
     yield _memory(load_board(config.board).memory_max_mb, root)
     if address and address.kind == "serial":
         yield device("serial", address.where, root)
-    if config.source.uri and config.source.uri.startswith("/dev/"):
-        yield device("camera", config.source.uri, root)
     yield from log_findings(config.log, has_link=config.mavlink.link is not None)
 
 
 def device(what: str, path: str, root: Path = Path("/")) -> Finding:
-    """Check that a device file exists, that this user may use it, and that no console or other program holds it, if it
-    is a serial port. `what` names the check in the finding."""
+    """Check that a device file exists, that this user may use it, and that no other program holds it, nor a console if
+    it is a serial port. `what` names the check in the finding."""
     file = root / path.lstrip("/")
     try:
         status = file.stat()
@@ -102,9 +100,9 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
         group = grp.getgrgid(status.st_gid).gr_name
     mode = f"group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
     may_use, user = os.access(file, os.R_OK | os.W_OK), getpass.getuser()
-    held, changes = _held(file.resolve(), root) if what == "serial" else (None, ())
+    held, changes = _held(file.resolve(), root) if what == "serial" else _opened(file.resolve(), root)
     if held:
-        return wrong(what, f"{path} ({mode}) is not free for the link: {held}.", *changes)
+        return wrong(what, f"{path} ({mode}) is not free: {held}.", *changes)
     denied = f"{path} may not be used by {user} ({mode})"
     if not may_use and group in _NOBODYS_GROUPS:
         why = ": a login shell on it is the usual reason" if changes else ""
@@ -168,6 +166,12 @@ def _held(port: Path, root: Path) -> tuple[str | None, tuple[str, ...]]:
         return " and ".join(held) or None, (change,)
     changes = [f"remove console={console} from the kernel's command line (cmdline.txt), and reboot"] if console else []
     return " and ".join(held) or None, (*changes, f"sudo systemctl disable --now serial-getty@{console or port.name}")
+
+
+def _opened(file: Path, root: Path) -> tuple[str | None, tuple[str, ...]]:
+    """Return what has a device open (None: nothing is found), and the change that frees it."""
+    program, _ = _program_on(file, root)
+    return (f"{program} has it open", (f"stop {program}",)) if program else (None, ())
 
 
 def _console_on(port: Path, root: Path) -> str | None:

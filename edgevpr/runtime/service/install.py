@@ -163,4 +163,5 @@ def _reload_units(root: Path) -> None:
 
 def _reload_rules() -> None:
     command("udevadm", "control", "--reload")
-    command("udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=video4linux")
+    subsystems = ("tty", "video4linux", "media", "dma_heap")
+    command("udevadm", "trigger", *(f"--subsystem-match={name}" for name in subsystems))

@@ -69,7 +69,8 @@ def test_a_device_is_looked_at(root, tmp_path):
     name = os.ttyname(port)
     good = device("serial", name)
     assert (good.ok, good.message.startswith(f"{name}, group ")) == (True, True)
-    assert found(config(tmp_path, **{"source.uri": name}), Path("/"), f"serial:{name}:57600")["camera"].ok
+    assert found(config(tmp_path), Path("/"), f"serial:{name}:57600")["serial"].ok
+    assert device("camera", name).ok
     os.close(controller)
     os.close(port)
 
@@ -84,9 +85,9 @@ def test_the_console_of_the_kernel_is_no_place_for_a_link(root):
 
 
 def test_a_device_that_is_absent_or_none_is_wrong(root, tmp_path):
-    absent = found(config(tmp_path, **{"source.uri": "/dev/video99"}), root, "serial:/dev/ttyACM99:57600")
+    absent = found(config(tmp_path), root, "serial:/dev/ttyACM99:57600")
     assert absent["serial"].message.startswith("/dev/ttyACM99: No such file")
-    assert not absent["camera"].ok
+    assert not device("camera", "/dev/video99", root).ok
     (root / "dev/ttyS0").touch()
     assert not device("serial", "/dev/ttyS0", root).ok
 

@@ -406,6 +406,17 @@ def test_the_command_prints_json(link, capsys, tmp_path):
 
 @pytest.mark.network
 @pytest.mark.usefixtures("_quick")
+def test_the_command_waits_for_a_frame_of_the_camera(link, capsys, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text(f"source: {{uri: 'tcp://127.0.0.1:{free_port()}'}}\nlog: {{path: null}}\n")
+    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}):
+        assert main(["doctor", "--config", str(config), "--link", link]) == 1
+    found = findings_of(capsys.readouterr().out)
+    assert [what for what, (ok, _) in found.items() if not ok] == ["frames"]
+
+
+@pytest.mark.network
+@pytest.mark.usefixtures("_quick")
 def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, capsys):
     assert main(["doctor", "--link", link]) == 1
     found = findings_of(capsys.readouterr().out)

@@ -1,0 +1,91 @@
+"""Checks of the source of frames, for `edgevpr check` and `doctor`: the device or the program that reads the camera,
+the cable, and a frame that comes and fits the lens."""
+
+import os
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+from edgevpr.core.config import SourceConfig
+from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.frames.lens import sight_of
+from edgevpr.frames.shot import Condition
+from edgevpr.frames.source import Source, is_by_program, open_source
+from edgevpr.power import machine
+from edgevpr.runtime.recognise.levelling import calibrated_lens
+from edgevpr.runtime.service.finding import Finding, device, fine, looked_at, wrong
+
+_FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
+_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
+_LIST_S = 10.0  # for the program to list the cameras
+_LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
+_BY_LIBCAMERA = ("media*", "video*", "dma_heap/*")  # devices below /dev that it opens
+_BOOT = "boot/firmware/config.txt"
+
+
+def camera_findings(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
+    """Check what a live source is read with: its device, or the program and what that needs. Other sources have no
+    finding. `root` is the root of the file system with /dev and /boot."""
+    if uri.startswith("/dev/"):
+        yield device("camera", uri, root)
+    elif is_by_program(uri):
+        from edgevpr.frames.programs import require_program  # loads FFmpeg
+
+        found = looked_at("camera", lambda: require_program(uri))
+        if found.ok and not uri.startswith("gst:"):
+            found = _ribbon(uri, found.message, root)
+        yield found
+
+
+def _ribbon(uri: str, program: str, root: Path) -> Finding:
+    """Check the devices of a camera on a Raspberry Pi's ribbon, and whether `program` lists it."""
+    devices = [each for pattern in _BY_LIBCAMERA for each in sorted((root / "dev").glob(pattern))]
+    for each in devices:
+        if not os.access(each, os.R_OK | os.W_OK):
+            return device("camera", f"/{each.relative_to(root)}", root)
+    try:
+        listing = subprocess.run([program, "--list-cameras"], capture_output=True, text=True, timeout=_LIST_S)
+    except subprocess.TimeoutExpired:
+        return wrong("camera", f"{program} --list-cameras does not end: restart the board.")
+    cameras = dict(_LISTED.findall(listing.stdout + listing.stderr))
+    number = uri.partition(":")[2] or "0"
+    if number in cameras:
+        return fine("camera", f"{uri}: {cameras[number]}, read by {program}")
+    changes = ["both ends of the ribbon: the right way round, and pushed home, with the power off"]
+    if "camera_auto_detect=1" not in (machine.text(root / _BOOT) or ""):
+        changes.append(f"camera_auto_detect=1 in /{_BOOT}, or the dtoverlay= of your sensor, and reboot")
+    others = f"only {', '.join(cameras)}" if cameras else "none"
+    return wrong("camera", f"{uri} is not found: {program} --list-cameras lists {others}.", *changes)
+
+
+def frame_seen(config: SourceConfig) -> str:
+    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 15 s,
+    ImageError if it does not fit the lens, and ConfigError for a calibration that cannot be used."""
+    assert config.uri is not None
+    lens = calibrated_lens(config)
+    with closing(open_source(config.uri, live=True)) as source:
+        state, (width, height) = _frame(source, config.uri)
+    seen = f"{config.uri}, {state}, {width} x {height} pixels"
+    if lens is None:
+        return seen
+    sight = sight_of(lens, (width, height))
+    return f"{seen}, of which {lens.path} shows {sight.fov_deg:.0f} degrees"
+
+
+def _frame(source: Source, uri: str) -> tuple[str, tuple[int, int]]:
+    """Wait for a frame, 15 s at most; return the state of the source, and the frame's width and height."""
+    end_s = time.monotonic() + _FRAME_WAIT_S
+    is_hopeless = False
+    while not (is_hopeless or source.ended) and time.monotonic() < end_s:
+        is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
+        with suppress(ImageError):
+            if frame := source.read(0.25):
+                height, width = frame.image.shape[:2]
+                return source.state, (width, height)
+    raise SourceError(
+        f"{uri}: no frame comes ({source.state}): start the camera or the stream, or correct `source: {{uri: ...}}`; "
+        "`edgevpr check --offline` waits for none."
+    )

@@ -1,0 +1,138 @@
+"""Cameras that a program reads: on the ribbon cable of a Raspberry Pi, by a program that stands for rpicam-vid; and
+pipelines, by GStreamer itself where it is installed."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from live_sources import wait_for
+
+from edgevpr.core.errors import SourceError
+from edgevpr.frames.shot import Condition
+from edgevpr.frames.source import is_live, open_source
+
+pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
+
+
+GST = "gst: videotestsrc is-live=true pattern=ball ! video/x-raw,width=320,height=240,framerate=20/1"
+needs_gstreamer = pytest.mark.skipif(
+    not (shutil.which("gst-launch-1.0") and shutil.which("gst-inspect-1.0"))
+    or any(
+        subprocess.run(["gst-inspect-1.0", "--exists", name], capture_output=True).returncode
+        for name in ("videotestsrc", "jpegenc", "tcpserversink")
+    ),
+    reason="GStreamer is not on this machine (Debian: apt install gstreamer1.0-tools and its plugins base and good)",
+)
+
+
+@pytest.fixture
+def rpicam(tmp_path, monkeypatch, opened):
+    """rpicam-vid on the path, and a function that opens its camera."""
+    program = tmp_path / "rpicam-vid"
+    fake = Path(__file__).with_name("fake_rpicam.py")
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} {fake} "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    return lambda: opened("rpicam")
+
+
+def running(program="fake_rpicam.py"):
+    """The process ids of the programs that stand for rpicam-vid, or of another one."""
+    found = subprocess.run(["pgrep", "-f", program], capture_output=True, text=True).stdout.split()
+    return set(map(int, found))
+
+
+def test_its_pictures_come_whole_and_of_known_age_and_the_program_ends_with_the_source(rpicam):
+    before = running()
+    source = rpicam()
+    frames = [wait_for(lambda: source.read(1.0)) for _ in range(3)]
+    assert {frame.image.shape for frame in frames} == {(960, 1280, 3)}
+    assert frames[0].t_mono_s <= frames[1].t_mono_s <= frames[2].t_mono_s <= time.monotonic()
+    assert source.condition is Condition.RUNNING
+    assert running() - before
+    source.close()
+    wait_for(lambda: not running() - before)
+
+
+def test_a_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
+    monkeypatch.setenv("FAKE_RPICAM", "hangs")
+    source = rpicam()
+    wait_for(lambda: source.read(1.0))
+    wait_for(lambda: source.condition is Condition.LOST)
+    wait_for(lambda: source.read(1.0))
+
+
+def test_a_camera_that_is_not_there_is_said_and_looked_for_again(rpicam, monkeypatch, caplog):
+    monkeypatch.setenv("FAKE_RPICAM", "absent")
+    source = rpicam()
+    wait_for(lambda: source.condition is Condition.LOST)
+    assert "--list-cameras" in caplog.text
+    monkeypatch.delenv("FAKE_RPICAM")
+    wait_for(lambda: source.read(1.0))
+
+
+@pytest.mark.parametrize(
+    ("uri", "packages"), [("rpicam", "rpicam-apps"), ("rpicam:1", "rpicam-apps"), (GST, "gstreamer1.0-tools")]
+)
+def test_without_the_program_the_sentence_says_what_to_install(monkeypatch, tmp_path, uri, packages):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert is_live(uri)
+    assert not is_live("rpicam:x")
+    with pytest.raises(SourceError, match=f"apt install {packages}"):
+        open_source(uri, live=True)
+
+
+@pytest.mark.parametrize("pipeline", ["gst:", "gst: ! appsink", "gst: v4l2src device='/dev/video0"])
+def test_what_is_no_pipeline_is_refused(pipeline):
+    with pytest.raises(SourceError, match="is no pipeline"):
+        open_source(pipeline, live=True)
+
+
+@needs_gstreamer
+@pytest.mark.parametrize("end", ["", " ! videoconvert ! appsink drop=true"])
+def test_the_pictures_of_a_pipeline_come_and_it_ends_with_the_source(opened, end):
+    before = running("gst-launch-1.0 -q videotestsrc")
+    source = opened(GST + end)
+    frames = [wait_for(lambda: source.read(1.0)) for _ in range(3)]
+    assert {frame.image.shape for frame in frames} == {(240, 320, 3)}
+    assert frames[0].t_mono_s <= frames[1].t_mono_s <= frames[2].t_mono_s <= time.monotonic()
+    wait_for(lambda: source.read(1.0) and source.latency_s < 1)
+    source.close()
+    wait_for(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
+
+
+@needs_gstreamer
+def test_a_pipeline_that_ends_or_hangs_is_started_anew(opened):
+    before = running("gst-launch-1.0 -q videotestsrc")
+    source = opened(GST)
+    for how in (signal.SIGKILL, signal.SIGSTOP):
+        wait_for(lambda: source.condition is Condition.RUNNING)
+        (process,) = running("gst-launch-1.0 -q videotestsrc") - before
+        os.kill(process, how)
+        wait_for(lambda: source.condition is Condition.LOST)
+    wait_for(lambda: source.condition is Condition.RUNNING)
+
+
+@needs_gstreamer
+def test_a_pipeline_that_gives_nothing_is_said(opened, caplog):
+    source = opened(f"gst: filesrc location=/dev/null ! {'identity ! ' * 60} fakesink")
+    wait_for(lambda: source.condition is Condition.LOST)
+    assert "gst-launch-1.0 -v" in caplog.text
+
+
+@needs_gstreamer
+def test_no_pipeline_outlives_a_program_that_is_killed(tmp_path):
+    before = running("gst-launch-1.0 -q videotestsrc")
+    reading = (
+        f"from edgevpr.frames.source import open_source; s = open_source({GST!r}, live=True)\nwhile True: s.read(1)"
+    )
+    program = subprocess.Popen([sys.executable, "-c", reading])
+    wait_for(lambda: running("gst-launch-1.0 -q videotestsrc") - before)
+    program.kill()
+    program.wait()
+    wait_for(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)

@@ -1,0 +1,223 @@
+"""Lenses with distortion: their files, what is refused, and pictures that become those of a camera without it."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
+
+from edgevpr.core.errors import ConfigError, ImageError
+from edgevpr.core.types import Frame
+from edgevpr.frames.lens import CalibratedLens, read_lens, sight_of
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled, straightened
+
+PINHOLE = 400.0, 410.0, 322.0, 238.0
+K = ", ".join(map(str, (PINHOLE[0], 0, PINHOLE[2], 0, PINHOLE[1], PINHOLE[3], 0, 0, 1)))
+ROS = f"""\
+image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix: {{rows: 3, cols: 3, data: [{K}]}}
+distortion_model: MODEL
+distortion_coefficients: {{rows: 1, cols: NUMBER, data: [COEFFICIENTS]}}
+rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
+"""
+KALIBR = f"""\
+cam0:
+  cam_overlaps: []
+  camera_model: CAMERA
+  distortion_coeffs: [COEFFICIENTS]
+  distortion_model: MODEL
+  intrinsics: [{", ".join(map(str, PINHOLE))}]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+"""
+
+
+def written(path, text, **given):
+    for name, value in given.items():
+        text = text.replace(name.upper(), str(value))
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.mark.parametrize("name", ["lens.yaml", "lens.xml", "lens.json"])
+@pytest.mark.parametrize("camera", [wide(), fisheye()])
+def test_a_file_of_opencv_is_read_in_all_its_forms(tmp_path, name, camera):
+    path = camera.write(tmp_path / name)
+    path.write_text(path.read_text().replace("%YAML 1.2", "%YAML:1.0"))  # as OpenCV 4 writes it
+    lens = read_lens(str(path))
+    assert lens.size_px == SIZE_PX
+    assert (lens.focal_px[0], *lens.centre_px) == pytest.approx((camera.matrix[0, 0], *camera.matrix[:2, 2]))
+    assert lens.coefficients == pytest.approx(tuple(camera.coefficients))
+    assert lens.is_fisheye is camera.fisheye
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "is_fisheye"),
+    [
+        ("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0), False),
+        ("rational_polynomial", (-0.2, 0.05, 0.001, -0.001, 0.0, 0.1, 0.01, 0.0), False),
+        ("equidistant", (0.02, -0.01, 0.003, -0.0005), True),
+    ],
+)
+def test_a_file_of_ros_is_read(tmp_path, model, coefficients, is_fisheye):
+    text = ", ".join(map(str, coefficients))
+    lens = read_lens(written(tmp_path / "ros.yaml", ROS, model=model, number=len(coefficients), coefficients=text))
+    assert (*lens.focal_px, *lens.centre_px) == PINHOLE
+    assert (lens.coefficients, lens.is_fisheye) == (coefficients, is_fisheye)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "read"),
+    [
+        ("radtan", "-0.2, 0.05, 0.001, -0.001", (-0.2, 0.05, 0.001, -0.001)),
+        ("equidistant", "0.02, -0.01, 0.003, -0.0005", (0.02, -0.01, 0.003, -0.0005)),
+        ("none", "", (0.0,) * 4),
+    ],
+)
+def test_a_file_of_kalibr_is_read(tmp_path, model, coefficients, read):
+    path = written(tmp_path / "camchain.yaml", KALIBR, camera="pinhole", model=model, coefficients=coefficients)
+    lens = read_lens(path)
+    assert (*lens.focal_px, *lens.centre_px) == PINHOLE
+    assert (lens.coefficients, lens.is_fisheye) == (read, model == "equidistant")
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "says"),
+    [
+        (KALIBR, {"camera": "omni", "model": "radtan", "coefficients": "0,0,0,0"}, "model `omni`"),
+        (KALIBR, {"camera": "pinhole", "model": "fov", "coefficients": "0.9"}, "model `fov`"),
+        (KALIBR, {"camera": "pinhole", "model": "radtan", "coefficients": "0,0,0"}, "3 coefficients"),
+        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": ".nan,0,0,0,0"}, "no number"),
+        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": "-3,0,0,0,0"}, "no direction of their own"),
+        (ROS.replace("400.0", "-400.0"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "above zero"),
+        (ROS.replace("322.0", "3220"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "outside"),
+        (ROS.replace("400.0", "9e9"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "0.0 degrees"),
+        (ROS.replace("image_height: 480", ""), {"model": "plumb_bob", "coefficients": "0"}, "lacks `image_height`"),
+        ("camera_matrix: [400, 5, 320, 0, 400, 240, 0, 0, 1]\ndistortion_coefficients: [0]", {}, "skew"),
+        ("1: 2", {}, "lacks `camera_matrix`"),
+        ("camera_matrix: [1, 2]\ndistortion_coefficients: [0]", {}, "2 numbers"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n", {}, "lacks `data`"),
+        ("<?xml version='1.0'?>\n<opencv_storage><a>", {}, "is not valid XML"),
+        ("nothing: here", {}, "calibrate-camera"),
+    ],
+)
+def test_what_is_no_calibration_ends_with_one_sentence(tmp_path, text, given, says):
+    path = written(tmp_path / "lens.yaml", text, **given)
+    with pytest.raises(ConfigError, match=says) as error:
+        read_lens(path)
+    assert str(error.value).startswith(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_lens(str(tmp_path / "absent.yaml"))
+
+
+def lens_of(camera):
+    (focal_x, _, column), (_, focal_y, row) = camera.matrix[:2]
+    return CalibratedLens(
+        path="lens.yaml",
+        focal_px=(focal_x, focal_y),
+        centre_px=(column, row),
+        coefficients=tuple(camera.coefficients),
+        is_fisheye=camera.fisheye,
+        size_px=camera.size_px,
+    )
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """Ground that is smooth enough that a picture of a picture is hardly another; 0.5 m a pixel."""
+    rng = np.random.default_rng(1)
+    octaves = [rng.random((2**octave, 2**octave, 3), dtype=np.float32) / octave for octave in range(3, 8)]
+    smooth = sum(cv2.resize(each, (1600, 1600), interpolation=cv2.INTER_CUBIC) for each in octaves)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def taken(camera, ground, **pose):
+    pose = {"height_m": 100.0, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0} | pose
+    return Frame(image=camera.photograph(ground, 0.5, east_m=400, north_m=400, **pose), name="it", t_mono_s=0.0, **pose)
+
+
+def pinhole(focal_px, size_px):
+    return DistortedCamera(focal_px, (0,) * 4, centre_px=tuple((side - 1) / 2 for side in size_px), size_px=size_px)
+
+
+def off(one, other):
+    return np.abs(one.astype(float) - other).mean()
+
+
+CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "fisheye"])
+
+
+@CAMERAS
+def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, ground):
+    lens, frame = lens_of(camera), taken(camera, ground)
+    found = straightened(frame.image, None, UNKNOWN_VIEW, lens)
+    sight = sight_of(lens, SIZE_PX)
+    height, width = found.image.shape[:2]
+    assert (width, height) == sight.straight_px
+    assert max(width, height) == max(SIZE_PX)
+    other = pinhole(max(SIZE_PX) / 2 / math.tan(math.radians(sight.fov_deg / 2)), (width, height))
+    truth = taken(other, ground).image
+    shown = np.ones((height, width), bool) if found.mask is None else found.mask
+    assert shown.mean() > 0.95
+    assert off(found.image[shown], truth[shown]) < 1.5 < off(cv2.resize(frame.image, (width, height)), truth) / 3
+
+
+@CAMERAS
+@pytest.mark.parametrize(
+    "pose",
+    [
+        {"heading_deg": 37.0, "roll_deg": 12.0},
+        {"roll_deg": -9.0, "pitch_deg": 14.0, "heading_deg": 200.0, "height_m": 80.0},
+        {},
+    ],
+)
+def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose):
+    lens = lens_of(camera)
+    footprint_m = 150.0
+    found = levelled(
+        taken(camera, ground, **pose), None, Lens(sight_of(lens, SIZE_PX).fov_deg, 0.0, lens), footprint_m, below=True
+    )
+    assert (found.view.aside, found.view.footprint_m) == ((0.0, 0.0), pytest.approx(footprint_m))
+    side = found.image.shape[0]
+    straight = taken(pinhole(side * 100.0 / footprint_m, (side, side)), ground).image
+    shown = np.ones((side, side), bool) if found.mask is None else found.mask
+    assert shown.mean() > 0.5
+    assert off(found.image[shown], straight[shown]) < 1.5
+
+
+def test_a_mask_of_the_camera_follows_its_picture(ground):
+    camera = wide()
+    overlay = np.ones(SIZE_PX[::-1], bool)
+    overlay[:, :160] = False
+    grey = np.where(overlay, 255, 0).astype(np.uint8)
+    found = straightened(grey, overlay, UNKNOWN_VIEW, lens_of(camera))
+    assert found.mask is not None
+    assert 0.6 < found.mask.mean() < 0.95
+    sure = (found.image < 5) | (found.image > 250)
+    assert np.array_equal(found.mask[sure], found.image[sure] > 128)
+
+
+def test_what_lies_beyond_the_lens_shows_no_ground(ground):
+    """With strong barrel distortion alone, directions far outside of the picture have pixels inside of it too."""
+    camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
+    lens = lens_of(camera)
+    picture = levelled(
+        taken(camera, ground, pitch_deg=30.0), None, Lens(sight_of(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
+    )
+    assert picture.mask is not None
+    outline = cv2.findContours(picture.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    assert len(outline) == 1
+
+
+def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
+    camera = wide()
+    lens, frame = lens_of(camera), taken(camera, ground)
+    small = cv2.resize(frame.image, (320, 240), interpolation=cv2.INTER_AREA)
+    half = straightened(small, None, UNKNOWN_VIEW, lens).image
+    full = straightened(frame.image, None, UNKNOWN_VIEW, lens).image
+    assert off(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
+    with pytest.raises(ImageError, match=r"640x360 pixels, and lens\.yaml was calibrated with 640x480"):
+        straightened(frame.image[60:420], None, UNKNOWN_VIEW, lens)

@@ -1,0 +1,122 @@
+"""Lenses with distortion in the walk: positions in metres, where map and query were taken by different cameras."""
+
+import logging
+import math
+
+import cv2
+import numpy as np
+import pytest
+from distorted_cameras import DistortedCamera, fisheye, wide
+
+from edgevpr.api import Map
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Frame, Position
+from edgevpr.frames.images import write_png
+from edgevpr.frames.positions import GeoTag, write_positions
+from edgevpr.mapmaking.making import FlownPictures, MapOrder, make_map
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.opening import open_recogniser
+
+pytestmark = pytest.mark.slow
+
+ORIGIN = 50.0, 8.0
+M_PER_PX, SIDE_PX = 0.25, 2000
+FOCAL_PX = 493.0
+CAMERAS = {"straight": DistortedCamera(FOCAL_PX, (0,) * 4), "wide": wide(), "fisheye": fisheye()}
+SEEN_DEG = {"straight": 2 * math.degrees(math.atan(320 / FOCAL_PX)), "wide": 101.0, "fisheye": 136.0}
+STRAIGHT = {"height_m": 100.0, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
+ON_THE_WAY = [
+    (262.0, 196.0, {"heading_deg": 40.0}),
+    (240.0, 310.0, {"roll_deg": 10.0, "pitch_deg": -6.0, "heading_deg": 200.0}),
+    (255.0, 205.0, {"height_m": 80.0, "pitch_deg": 12.0}),
+]
+
+
+@pytest.fixture(scope="module")
+def ground():
+    rng = np.random.default_rng(3)
+    octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
+    rough = sum(cv2.resize(each, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_CUBIC) for each in octaves)
+    return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def lenses(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lenses")
+    return {name: str(camera.write(folder / f"{name}.yaml")) for name, camera in CAMERAS.items()}
+
+
+@pytest.fixture(scope="module")
+def maps(ground, lenses, tmp_path_factory):
+    """Maps of three places, made of pictures of each camera."""
+    made = {}
+    for name, camera in CAMERAS.items():
+        folder, tags = tmp_path_factory.mktemp(name), {}
+        for number, north_m in enumerate((100.0, 200.0, 300.0)):
+            image = camera.photograph(ground, M_PER_PX, east_m=250.0, north_m=north_m, **STRAIGHT)
+            write_png(folder / f"{number}.png", image)
+            tags[f"{number}.png"] = GeoTag(position=Position(*moved(*ORIGIN, 250.0, north_m)), **STRAIGHT)
+        write_positions(folder / "positions.csv", tags)
+        made[name] = str(folder / "map.gpkg")
+        order = MapOrder(
+            path=made[name],
+            pictures=FlownPictures(source=str(folder)),
+            technique="cohog",
+            parameters={"camera": "nadir"},
+            refine=False,
+            calibrate=False,
+        )
+        make_map(order, load_config(None, {"source.lens": lenses[name]}), pytest.fail, lambda all_, *_: all_)
+    return made
+
+
+def off_m(map_path, camera, ground, **source):
+    """How far off the positions of accepted queries are; None for one that is not accepted."""
+    settings = load_config(None, {"map": map_path, **{f"source.{key}": value for key, value in source.items()}})
+    recogniser, found = open_recogniser(settings, load_board("this")), []
+    with recogniser.place_map:
+        for east_m, north_m, changed in ON_THE_WAY:
+            pose = STRAIGHT | changed
+            image = camera.photograph(ground, M_PER_PX, east_m=east_m, north_m=north_m, **pose)
+            event = recogniser.step(Frame(image=image, name="it", t_mono_s=0.0, **pose))
+            assert not event.failed, event.reason
+            where = event.located.position if event.accepted else None
+            truth = moved(*ORIGIN, east_m, north_m)
+            found.append(where and math.hypot(*offset_m(*truth, where.lat_deg, where.lon_deg)))
+    return found
+
+
+@pytest.mark.parametrize("of", CAMERAS)
+@pytest.mark.parametrize("by", CAMERAS)
+def test_every_camera_finds_its_position_in_every_cameras_map(maps, lenses, ground, of, by):
+    assert max(off_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
+
+
+@pytest.mark.parametrize("by", ["wide", "fisheye"])
+def test_without_its_calibration_positions_would_be_off(maps, ground, by):
+    found = off_m(maps["straight"], CAMERAS[by], ground, fov_deg=SEEN_DEG[by])
+    assert max(each or math.inf for each in found) > 5.0
+
+
+def test_a_calibration_that_one_of_map_and_flight_has_is_said(maps, lenses, ground, caplog):
+    with caplog.at_level(logging.INFO):
+        off_m(maps["wide"], CAMERAS["straight"], ground, fov_deg=66.0)
+    assert "wide.yaml" in caplog.text
+
+
+def test_from_python_a_picture_through_a_lens_needs_a_height(maps, lenses, ground, tmp_path):
+    config = tmp_path / "flight.yaml"
+    config.write_text(f"source: {{lens: {lenses['wide']}}}\n")
+    image = CAMERAS["wide"].photograph(ground, M_PER_PX, east_m=250.0, north_m=200.0, **STRAIGHT)
+    with Map(maps["wide"], config=config) as opened:
+        with pytest.raises(UsageError, match="height_m"):
+            opened.match(image)
+        assert opened.match(image, height_m=100.0).accepted
+
+
+def test_a_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
+    with pytest.raises(UsageError, match=r"`source\.fov_deg` is 66"):
+        off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
+    assert off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])
