@@ -133,7 +133,12 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 places = len(place_map) if order.calibrate and kinds_of(technique.spec) else None
                 say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, source.total, places)
                 is_down = technique.spec.parameters.get("camera") == "nadir"
-                if is_down and config.source.fov_deg is None and Path(pictures.source).is_dir():
+                if (
+                    is_down
+                    and config.source.fov_deg is None
+                    and config.source.lens is None
+                    and Path(pictures.source).is_dir()
+                ):
                     say_what_lens(Path(pictures.source))
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
