@@ -87,6 +87,17 @@ def add_positions(parser: ArgumentParser) -> None:
     )
 
 
+def add_map_images(parser: ArgumentParser) -> None:
+    """Add the flag for the pictures that a map was made of, which a page shows."""
+    parser.add_argument(
+        "--map-images",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder with the pictures that the map was made of, repeatable; of a map of an orthophoto, that file",
+    )
+
+
 def add_known(parser: ArgumentParser) -> None:
     """Add the flag for what is known of recorded queries, which `hints.told_parts` reads."""
     parser.add_argument(

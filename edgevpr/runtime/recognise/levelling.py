@@ -67,12 +67,17 @@ def levelling_of(
     """Make the levelling for a configuration; None for a camera that looks ahead, or on a gimbal with unknown lens."""
     if technique.spec.parameters.get("camera") != "nadir":
         return None
-    lens = None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
+    lens = lens_of(config)
     if lens is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal:
             return None
     return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now(config))
+
+
+def lens_of(config: SourceConfig) -> Lens | None:
+    """Return the lens of a configuration's camera; None if it is unknown."""
+    return None if config.fov_deg is None else Lens(config.fov_deg, config.up_deg)
 
 
 def is_now(config: SourceConfig) -> bool:
