@@ -27,9 +27,9 @@ _HARDLY = 0.5  # mean confidence of a place that is hardly recognisable
 _AMISS = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
 _OF_MEDIAN = 1.1774  # of the length of a normally distributed vector, over the standard deviation of an axis
 _LEAST_AMISS_M = 5.0  # less is no more than the receiver's error
-_CELLS, _MOST_CELLS = 12, 2_000_000  # cells of a footprint; of the whole ground
+_CELLS, _MOST_CELLS = 24, 4_000_000  # cells of a footprint; of the whole ground
 _SURELY_SEEN = 0.75  # of a footprint: the short side of a picture of 4:3
-_THINNEST, _WIDEST = 0.15, 1.0  # footprints: less is no hole, and what is wider is not between places
+_THINNEST, _WIDEST = 0.15, 1.0  # footprints: less is no hole; what is wider and open to one side is outside the map
 _GAP = 3.0  # times the usual step between places
 
 
@@ -206,6 +206,8 @@ def holes_of(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]:
         for share in (_THINNEST, _WIDEST)
     }
     closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, disc[_WIDEST])
+    around, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(closed, around, -1, (1,), cv2.FILLED)  # what is surrounded, however wide
     between = cv2.morphologyEx(closed & (1 - shown), cv2.MORPH_OPEN, disc[_THINNEST])
     outlines, _ = cv2.findContours(between, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     holes = [[moved(*origin, *(low + cell_m * point)) for point in each[:, 0]] for each in outlines]

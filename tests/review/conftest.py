@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import cv2
 import pytest
+from browser import driven
 from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
 from pictures import textured
 
@@ -73,3 +74,10 @@ def flown(tmp_path_factory):
         )
         Flight(config, crew).run()
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A real browser, started once."""
+    with driven() as started:
+        yield started

@@ -1,0 +1,75 @@
+"""The ground of a page, laid of the map's own pictures; and small pictures within a budget."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in
+from logs import write_log
+
+from edgevpr.review import steps
+from edgevpr.review.album import Album, small_pictures
+from edgevpr.review.logged import read_flight
+from edgevpr.review.mosaic import Mosaic, mosaic_of
+from edgevpr.review.page import page_of
+
+
+def test_pictures_lie_where_their_poses_say(tmp_path):
+    found = mosaic_of(places_in(tmp_path), Album([tmp_path]), None, ORIGIN)
+    assert isinstance(found, Mosaic)
+    seen = cv2.imdecode(np.frombuffer(found.webp, np.uint8), cv2.IMREAD_UNCHANGED)
+    west, south, east, north = found.edges_m
+    assert seen.shape[0] / seen.shape[1] == pytest.approx((north - south) / (east - west), rel=0.01)
+    scale = (east - west) / seen.shape[1] * METRE_PX
+    way = np.array([[scale, 0, 280 + west * METRE_PX], [0, scale, 280 - north * METRE_PX]])
+    ground = cv2.warpAffine(landscape(), way, seen.shape[1::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    shown = seen[..., 3] == 255
+    assert 0.3 < shown.mean() < 0.9, "what no picture shows is transparent"
+    assert abs(seen[..., :3].astype(int) - ground)[shown].mean() < 12
+    assert shown[seen.shape[0] // 2, seen.shape[1] // 2]
+
+
+@pytest.mark.parametrize(
+    ("places", "folder", "said"),
+    [
+        (lambda places: places, False, "With --map-images"),
+        (lambda places: [replace(each, source_image="gone.png") for each in places], True, "No picture of the map is"),
+        (lambda places: [replace(each, pose=None) for each in places], True, "No place knows how its picture lies"),
+        (
+            lambda places: [
+                replace(each, pose=replace(each.pose, up_deg=(each.pose.up_deg * 3) % 360)) for each in places
+            ],
+            True,
+            "do not fit each other",
+        ),
+    ],
+)
+def test_where_there_can_be_no_picture_of_the_ground_it_is_said(tmp_path, places, folder, said):
+    found = mosaic_of(places(places_in(tmp_path)), Album([tmp_path] if folder else []), None, ORIGIN)
+    assert isinstance(found, str)
+    assert said in found
+
+
+def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
+    keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
+    albums = {"seen": Album([tmp_path])}
+    sizes = []
+    for room_bytes in (1e6, 3e4, 6e3):
+        found, left_out = small_pictures(keys, albums, room_bytes)
+        assert sum(map(len, found.values())) <= room_bytes
+        assert bool(left_out) == (len(found) < len(keys))
+        sizes.append(len(found))
+    assert sizes[0] == sizes[1] == len(keys) > sizes[2] > 0
+
+
+def test_a_page_of_many_queries_stays_below_its_limit(tmp_path, monkeypatch):
+    (tmp_path / "ref").mkdir()
+    places = places_in(tmp_path / "ref")
+    flight = read_flight(write_log(tmp_path / "log", *flown_over(places, 2000)))
+    monkeypatch.setattr(steps, "_MOST_TOLD_BYTES", 300_000)
+    monkeypatch.setattr(steps, "MOST_PAGE_BYTES", 1_500_000)
+    album = Album([tmp_path / "ref"])
+    made = page_of(flight, places, album, album)
+    assert len(made.encode()) <= 1_500_000
+    assert "shown is one query in" in made
