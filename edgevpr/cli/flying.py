@@ -20,6 +20,7 @@ from edgevpr.cli.shared import (
     group,
     leave_out,
     path_of,
+    require_out,
     show,
     write_out,
 )
@@ -89,7 +90,7 @@ def run_match(args: Namespace) -> int:
 
     config, known = config_of(args, args.config, map=args.map), told_parts(args.known)
     recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
-    pages = _MatchPage(args) if args.page else None
+    page = _MatchPage(args) if args.page else None
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)
@@ -102,8 +103,8 @@ def run_match(args: Namespace) -> int:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         found.append(match_of(event))
-        if pages:
-            pages.take(event)
+        if page:
+            page.take(event)
         if known:
             found[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(of_matches(found))
@@ -112,8 +113,8 @@ def run_match(args: Namespace) -> int:
     if weights := weights_of(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
-    if pages:
-        pages.write(recogniser, config)
+    if page:
+        page.write(recogniser, config)
     return exit_code(unusable)
 
 
@@ -124,6 +125,7 @@ class _MatchPage:
         from edgevpr.review.album import Album, album_of_map
         from edgevpr.review.overhead import read_ground
 
+        require_out(args.page, args.map)
         self._args, self._ground, self._lines = args, read_ground(args.map), list[dict[str, Any]]()
         self._albums = {"seen": Album([]), "place": album_of_map(args.map_images, self._ground)}
 

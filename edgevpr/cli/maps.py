@@ -22,6 +22,7 @@ from edgevpr.cli.shared import (
     parameters_of,
     path_of,
     positive,
+    require_out,
     show,
     write_out,
 )
@@ -175,6 +176,8 @@ def map_info(args: Namespace) -> int:
     from edgevpr.places.mapinfo import info_of
     from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE, calibration_of, not_calibrated
 
+    if args.page:
+        require_out(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
     each_bytes = bytes_per_place(info.spec)
@@ -196,7 +199,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     from edgevpr.mapmaking.lookalikes import look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import album_of_map
-    from edgevpr.review.mappage import MOST_ASKED, Examined, map_page_of
+    from edgevpr.review.mappage import MOST_ASKED, MapFindings, map_page_of
     from edgevpr.runtime.recognise.levelling import lens_of
 
     lens = lens_of(config_of(args, args.config).source)
@@ -206,10 +209,10 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
         asked = places[:: -(-len(places) // MOST_ASKED) or 1] if pictures else []
         laid = ((place.place_id, pictures.laid(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
         found = look_alikes(place_map, ((place_id, *each) for place_id, each in laid if each))
-        alike = [each for each in found if each] if pictures else None
+        alike = list(found)
     name = Path(args.map).name
-    examined = Examined(name=name, places=places, said=said, recognisable=recognisable, alike=alike)
-    page = map_page_of(examined, pictures, lens)
+    findings = MapFindings(name=name, places=places, said=said, recognisable=recognisable, alike=alike)
+    page = map_page_of(findings, pictures, lens)
     write_out(args.page, args.map, lambda out: out.write(page))
 
 

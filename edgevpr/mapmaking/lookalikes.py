@@ -30,10 +30,9 @@ class LookAlike:
 
 
 def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask | None]]) -> Iterator[LookAlike | None]:
-    """Look for each of the `pictures`, (number of a place, its picture as it was encoded, the
-    picture's mask), among the places elsewhere,
-    and yield what looks like it (None: nothing does, or it is another picture than the place was made of). Yields
-    nothing for a technique without a confidence. Raises MapError for a map that cannot be read."""
+    """Look for each of the `pictures` (number of a place, its picture as it was encoded, the picture's mask) among the
+    places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
+    not made of, nor for a technique without a confidence. Raises MapError for a map that cannot be read."""
     technique, config, board = technique_of(place_map), load_config(None, {}), load_board("this")
     if not kinds_of(technique.spec):
         return
@@ -45,7 +44,6 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         slot = slots.get(place_id)
         away = index.only(~same_ground(index, slot, near_m)) if slot is not None else index.first(0)
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
-            yield None
             continue
         matcher, meter = Matcher(technique, away, rule), meter_of(config, board)
         prepared = Preparation(mask=None if mask is None else MaskFile(mask, sha256=""))

@@ -21,7 +21,7 @@ from edgevpr.review.steps import Explored, Step, stepped
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MOST_ASKED = 200  # pictures of a map that are looked for among the places elsewhere: each takes half a second
+MOST_ASKED = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
 _QUALITIES = ((0.4, "low"), (0.6, "fair"), (0.8, "good"), (1.01, "best"))  # below which value it is called so
 _HARDLY = 0.5  # mean confidence of a place that is hardly recognisable
 _AMISS = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
@@ -34,23 +34,23 @@ _GAP = 3.0  # times the usual step between places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Examined:
-    """What is known of a map: `places`, `said` (lines of `map info`), `recognisable` (mean confidence of the right
-    matches of a place that calibration asked for, by its number), and `alike`, the places that look alike (None: not
-    looked for, since the pictures are not at hand)."""
+class MapFindings:
+    """Findings on a map: its `places`, `said` (lines of `map info`), `recognisable` (mean confidence of the right
+    matches of a place that calibration asked for, by its number), and `alike`, what looks like each of the places whose
+    picture was asked (None: nothing does)."""
 
     name: str
     places: Sequence[Place]
     said: Sequence[str]
     recognisable: Mapping[int, float]
-    alike: Sequence[LookAlike] | None
+    alike: Sequence[LookAlike | None]
 
 
-def map_page_of(examined: Examined, pictures: Album, lens: "Lens | None" = None) -> str:
+def map_page_of(found: MapFindings, pictures: Album, lens: "Lens | None" = None) -> str:
     """Return the whole page. `pictures` finds those of the map, `lens` is that of its camera (None: unknown)."""
-    ground = [place for place in examined.places if place.position]
-    amiss, alike = tags_amiss(ground), {each.place_id: each for each in examined.alike or ()}
-    weak = {place_id for place_id, sure in examined.recognisable.items() if sure < _HARDLY}
+    ground = [place for place in found.places if place.position]
+    amiss, alike = tags_amiss(ground), {each.place_id: each for each in found.alike if each}
+    weak = {place_id for place_id, sure in found.recognisable.items() if sure < _HARDLY}
     holes, covered_m2, holes_m2 = holes_of(ground)
     gaps = [] if any(place.pose for place in ground) else gaps_of(ground)
     positions = {place.place_id: at_of(place) for place in ground}
@@ -71,32 +71,35 @@ def map_page_of(examined: Examined, pictures: Album, lens: "Lens | None" = None)
         Layer("hardly recognisable", "weak", [[at_of(each) for each in ground if each.place_id in weak]]),
     ]
     known = {
-        "places": str(len(examined.places)),
+        "places": str(len(found.places)),
         "ground seen": figure(covered_m2 / 1e4 if covered_m2 else None, "ha"),
         "holes": figure(holes_m2 / 1e4 if covered_m2 else None, "ha"),
         "gaps": str(len(gaps)) if gaps else UNKNOWN,
         "tags amiss": str(len(amiss)),
-        "hardly recognisable": str(len(weak)) if examined.recognisable else UNKNOWN,
-        "look alike": UNKNOWN if examined.alike is None else str(len(alike)),
+        "hardly recognisable": str(len(weak)) if found.recognisable else UNKNOWN,
+        "look alike": f"{len(alike)} <small>of {len(found.alike)}</small>" if found.alike else UNKNOWN,
     }
     notes = [
         "Holes lie between pictures that do not meet, each taken as the square that its short side surely shows.",
         "A tag is amiss if its picture lies four times as far from it as is usual in this map.",
     ]
-    if examined.alike is None:
-        notes.append("Places that look alike are looked for with --map-images, in a map with a confidence.")
+    if not found.alike:
+        notes.append(
+            "Places that look alike are looked for with --map-images, in a map of `cohog`, if its places were made of "
+            "these pictures, with the lens of --config."
+        )
     explored = Explored(
         unit="place",
         ground=ground,
         layers=[layer for layer in layers if any(layer.ways)],
-        steps=[_step(place, examined, amiss, alike.get(place.place_id), positions) for place in examined.places],
+        steps=[_step(place, found, amiss, alike.get(place.place_id), positions) for place in found.places],
         albums={"place": pictures},
         lens=lens,
         notes=notes if ground else [],
     )
-    above = [heading(f"Map {examined.name}", [f"{len(examined.places)} places"]), section("", figures(known))]
-    said = "".join(f"<p>{foreign(line.strip())}</p>" for line in examined.said)
-    return stepped(f"Map {examined.name}", above, explored, [section("What it holds", said)])
+    above = [heading(f"Map {found.name}", [f"{len(found.places)} places"]), section("", figures(known))]
+    said = "".join(f"<p>{foreign(line.strip())}</p>" for line in found.said)
+    return stepped(f"Map {found.name}", above, explored, [section("What it holds", said)])
 
 
 def _quality(place: Place) -> str:
@@ -110,12 +113,12 @@ def _between(positions: Mapping[int, Point], alike: Iterable[LookAlike]) -> list
 
 def _step(
     place: Place,
-    examined: Examined,
+    found: MapFindings,
     amiss: Mapping[int, float],
     alike: LookAlike | None,
     positions: Mapping[int, Point],
 ) -> Step:
-    pose, sure = place.pose, examined.recognisable.get(place.place_id)
+    pose, sure = place.pose, found.recognisable.get(place.place_id)
     is_low = bool(place.salience and place.salience.is_low)
     known = {
         f"{_quality(place)} quality": True,
@@ -134,7 +137,7 @@ def _step(
         "" if sure is None else f"asked for it with changed pictures, matches are right with {nines(sure)} (mean)",
         f"looks like place {alike.other_id}: confidence {nines(alike.confidence)}" if alike else "",
     ]
-    images = {each.place_id: each.source_image for each in examined.places} if alike else {}
+    images = {each.place_id: each.source_image for each in found.places} if alike else {}
     own, at = positions.get(place.place_id), {}
     if alike and (other := positions.get(alike.other_id)):
         at["alike"] = other

@@ -29,7 +29,7 @@ _ACROSS = 1000.0  # units of the width of charts and lanes
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ByConfidence:
-    """How the confidence of a query was judged: its `confidence` and its `kind` of evidence; the probability by the
+    """Judgement of a query by its confidence: its `confidence` and its `kind` of evidence; the probability by the
     flight so far, `followed` (None: alone); whether it was `accepted`; and `off_m`, how far it is from GPS (None:
     unknown)."""
 
@@ -76,7 +76,7 @@ class Thresholds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explored:
-    """All that the ground section of a page is made of. `unit` is what a step is called. `albums` are those of the
+    """Content of the ground section of a page. `unit` is what a step is called. `albums` are those of the
     pictures, by the names that steps give them; "place" is that of the map, `lens` that of its camera (None: unknown).
     `named` are labels on the ground, `span_s` the length of the lanes, `thresholds` those of the precision slider
     (None: there is none)."""

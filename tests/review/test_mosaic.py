@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in
 from logs import write_log
+from rasters import HOME, textured_raster
 
+from edgevpr.core.types import Place, Pose
 from edgevpr.review import steps
-from edgevpr.review.album import Album, small_pictures
+from edgevpr.review.album import Album, album_of_map, small_pictures
 from edgevpr.review.logged import read_flight
 from edgevpr.review.mosaic import Mosaic, mosaic_of
 from edgevpr.review.page import page_of
@@ -49,6 +51,18 @@ def test_where_there_can_be_no_picture_of_the_ground_it_is_said(tmp_path, places
     found = mosaic_of(places(places_in(tmp_path)), Album([tmp_path] if folder else []), None, ORIGIN)
     assert isinstance(found, str)
     assert said in found
+
+
+def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
+    pytest.importorskip("rasterio")
+    pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+    places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
+    album = album_of_map([textured_raster(tmp_path / "town.tif")], places)
+    assert album.image("town.tif_r000_c000").std() > 10
+    assert album.image("town.tif_r000_c001") is None
+    found = mosaic_of(places, album, None, (HOME.lat_deg, HOME.lon_deg))
+    assert isinstance(found, Mosaic)
+    assert album_of_map([], places).image("town.tif_r000_c000") is None
 
 
 def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
