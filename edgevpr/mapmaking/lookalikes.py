@@ -4,6 +4,8 @@ What is found there is wrong, and the confidence says how likely it would be tak
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame
@@ -32,7 +34,8 @@ class LookAlike:
 def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask | None]]) -> Iterator[LookAlike | None]:
     """Look for each of the `pictures` (number of a place, its picture as it was encoded, the picture's mask) among the
     places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
-    not made of, nor for a technique without a confidence. Raises MapError for a map that cannot be read."""
+    not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
+    cannot be read."""
     technique, config, board = technique_of(place_map), load_config(None, {}), load_board("this")
     if not kinds_of(technique.spec):
         return
@@ -42,7 +45,9 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, image, mask in pictures:
         slot = slots.get(place_id)
-        away = index.only(~same_ground(index, slot, near_m)) if slot is not None else index.first(0)
+        if slot is None or np.isnan(index.lat_deg[slot]):
+            continue
+        away = index.only(~same_ground(index, slot, near_m))
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
             continue
         matcher, meter = Matcher(technique, away, rule), meter_of(config, board)

@@ -64,11 +64,11 @@ def map_page_of(found: MapFindings, pictures: Album, lens: "Lens | None" = None)
             [(recorded_at(place), at_of(place)) for place in ground if place.place_id in amiss],
             "line",
         ),
+        Layer("hardly recognisable", "weak", [[at_of(each) for each in ground if each.place_id in weak]]),
         *(
             Layer(f"{name} quality", name, [[at_of(place) for place in ground if _quality(place) == name]])
             for _, name in _QUALITIES
         ),
-        Layer("hardly recognisable", "weak", [[at_of(each) for each in ground if each.place_id in weak]]),
     ]
     known = {
         "places": str(len(found.places)),
