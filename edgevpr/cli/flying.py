@@ -145,6 +145,8 @@ class _MatchPage:
         name, sure = Path(self._args.map).name, recogniser.rule.sure
         page = match_page_of(self._lines, self._ground, self._albums, name, sure, lens_of(config.source))
         write_out(self._args.page, self._args.map, lambda out: out.write(page))
+        if not self._args.json:
+            print(f"{self._args.page}: {len(self._lines)} queries")
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:

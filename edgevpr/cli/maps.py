@@ -214,6 +214,8 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     findings = MapFindings(name=name, places=places, said=said, recognisable=recognisable, alike=alike)
     page = map_page_of(findings, pictures, lens)
     write_out(args.page, args.map, lambda out: out.write(page))
+    if not args.json:
+        print(f"{args.page}: {len(places)} places of {args.map}")
 
 
 def map_check(args: Namespace) -> int:

@@ -83,8 +83,13 @@ def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
     return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
 
 
+def _missed_at(query: LoggedQuery) -> Point | None:
+    """Return where the aircraft was when a query was refused; None if it was accepted, or that is unknown."""
+    return None if query.accepted else query.true_at or query.autopilot_at
+
+
 def steps_of(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
-    """Return a step for each query of a flight over the places of `ground`. The queries of `match` have no times."""
+    """Return a step for each query of a flight over the places of `ground`."""
     places = {place.place_id: place for place in ground}
     lane_of = {name: at for at, (name, *_) in enumerate(lanes_of(flight))}
     return [
@@ -97,7 +102,7 @@ def _step(query: LoggedQuery, place: Place | None, lanes: Sequence[int]) -> Step
     fix = query.fix
     known = {
         "found": query.place_at,
-        "missed": None if query.accepted else query.true_at,
+        "missed": _missed_at(query),
         "gps": query.gps_at,
         "autopilot": query.autopilot_at,
         **{colour: fix.at for outcome, _, colour in _FIXES if fix and fix.outcome is outcome},

@@ -60,7 +60,8 @@ def flown(tmp_path_factory):
     link.listener = Navigator(config.mavlink.min_accuracy_m, 1.0)
     source = FakeSource([Frame(image=each, name=name, t_mono_s=0.0) for name, each in pictures.items()], clock)
     with recogniser.place_map, FlightLog(folder / "flight.jsonl", clock=clock) as log:
-        log.write("start", **start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map))
+        start = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
+        log.write("start", **start, decided={"rule": recogniser.rule})
         crew = Crew(
             recogniser=recogniser,
             source=source,

@@ -6,7 +6,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browser import show
+from browser import Opened, show
 from logs import query, write_log
 
 from edgevpr.cli.main import main
@@ -185,6 +185,15 @@ def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
         shown = show(each)
         assert "match accepted" in shown.content
         assert (shown.console, shown.requests) == ([], [])
+
+
+@pytest.mark.process
+@pytest.mark.slow
+def test_the_page_judges_a_real_flight_as_it_was_judged(made, browser):
+    with Opened(browser, made) as page:
+        said = page.inner_text("#would")
+    assert said.startswith("0 more accepted, 0 fewer, of ")
+    assert "of 0 that" not in said
 
 
 def measured(made, folder, measure, width_px):
