@@ -3,6 +3,7 @@
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 _SIDES_PX = (480, 320, 240, 160, 112)  # of the small pictures: the largest with which all fit is taken
 _SAMPLES = 12  # pictures that say how many bytes one takes
 _CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
-_AS_TEXT = 4 / 3  # base64
+_AS_TEXT, _MARGIN = 4 / 3, 1.1  # base64; what others may take more
 
 Key = tuple[str, str]  # which album, and the name of a picture in it
 
@@ -154,13 +155,13 @@ def small_pictures(
         return {}, ""
     from edgevpr.frames.images import small_webp
 
-    samples = [
-        image for of, name in keys[:: max(1, len(keys) // _SAMPLES)] if (image := albums[of].image(name)) is not None
-    ]
+    spread = dict.fromkeys([*keys[:: max(1, len(keys) // _SAMPLES)], *keys])
+    images = (albums[of].image(name) for of, name in spread)
+    samples = list(islice((image for image in images if image is not None), _SAMPLES))
     if not samples:
         return {}, ""
     for side_px in _SIDES_PX:
-        each_bytes = sum(len(small_webp(image, side_px)) for image in samples) / len(samples) * _AS_TEXT
+        each_bytes = _MARGIN * _AS_TEXT * sum(len(small_webp(image, side_px)) for image in samples) / len(samples)
         if each_bytes * len(keys) <= room_bytes:
             break
     every = max(1, -(-int(each_bytes * len(keys)) // max(1, int(room_bytes))))

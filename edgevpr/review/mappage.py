@@ -80,7 +80,8 @@ def map_page_of(found: MapFindings, pictures: Album, lens: "Lens | None" = None)
         "look alike": f"{len(alike)} <small>of {len(found.alike)}</small>" if found.alike else UNKNOWN,
     }
     notes = [
-        "Holes lie between pictures that do not meet, each taken as the square that its short side surely shows.",
+        "Holes lie between pictures that do not meet: of each counts the square that it shows in any case, three "
+        "quarters of its longest side wide.",
         "A tag is amiss if its picture lies four times as far from it as is usual in this map.",
     ]
     if not found.alike:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _MOST_PIXELS, _MOST_SIDE_PX, _MOST_BYTES = 12_000_000, 12_000, 4_000_000
 _QUALITIES = (70, 50, 30, 15)  # of the WebP file: the first that makes it small enough
+_ROWS = 256
 _SEAM = 0.12  # width of a seam, as a share of a picture's half side
 # Median correlation of a picture with those under it: 0.49 (aerial_swindale) to 0.99 on generated flights and four sets
 # where they lie right, 0.12 at most where all are turned by 60 degrees.
@@ -110,12 +111,10 @@ class _Canvas:
         way[:, 2] -= low
         new = np.asarray(cv2.warpAffine(sheet, way, tuple((high - low).tolist())), np.uint8)
         there = slice(low[1], high[1]), slice(low[0], high[0])
-        here, weight = self._picture[there], self._weight[there]
-        self._compare(new, here, weight)
-        share = np.clip((new[..., 3] - weight.astype(np.float32)) / (255 * _SEAM) + 0.5, 0, 1)
-        share = np.where(weight == 0, 1, share) * (new[..., 3] > 0)
-        here[:] = np.rint(here + share[..., None] * (new[..., :3] - here.astype(np.float32)))
-        np.maximum(weight, new[..., 3], out=weight)
+        self._compare(new, self._picture[there], self._weight[there])
+        for top in range(0, len(new), _ROWS):  # the numbers of a large picture would take much memory
+            rows = slice(top, top + _ROWS)
+            _blend(new[rows], self._picture[there][rows], self._weight[there][rows])
 
     def _way(self, shape: tuple[int, ...], place: Place) -> Doubles:
         """Return the affine map (2, 3) from the pixels of a place's picture to those of the canvas."""
@@ -146,6 +145,14 @@ class _Canvas:
             if len(webp) <= _MOST_BYTES:
                 break
         return Mosaic(webp, self._edges_m)
+
+
+def _blend(new: Image, here: Image, weight: Image) -> None:
+    """Lay `new`, uint8 (H, W, 4) with its weight, over the picture `here` (H, W, 3) of the `weight` (H, W)."""
+    share = np.clip((new[..., 3] - weight.astype(np.float32)) / (255 * _SEAM) + 0.5, 0, 1)
+    share = np.where(weight == 0, 1, share) * (new[..., 3] > 0)
+    here[:] = np.rint(here + share[..., None] * (new[..., :3] - here.astype(np.float32)))
+    np.maximum(weight, new[..., 3], out=weight)
 
 
 def _with_weight(image: Image, mask: Mask | None) -> Image:

@@ -192,8 +192,10 @@
     for (const [what, several] of [["added", [...new Set([...far, ...added])]], ["lost", lost]]) {
       for (const step of several.slice(0, 20)) {
         const off = step.judged.off === null ? "" : `, ${step.judged.off} m from GPS`;
-        element("button", `${what}: ${step.title}${off}`, element("li", "", list), { type: "button", onclick: () => show(step) });
+        const row = element("li", "", list, { className: `key ${what}` });
+        element("button", `${what}: ${step.title}${off}`, row, { type: "button", onclick: () => show(step) });
       }
+      if (several.length > 20) element("li", `and ${several.length - 20} more ${what}`, list);
     }
     for (const mark of all(".would")) mark.remove();
     for (const [what, several] of [["added", added], ["lost", lost]]) {

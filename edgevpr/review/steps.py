@@ -5,7 +5,7 @@ the ground and beside their pictures. `page.js` moves it; without script the gro
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,10 +76,10 @@ class Thresholds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explored:
-    """Content of the ground section of a page. `unit` is what a step is called. `albums` are those of the
-    pictures, by the names that steps give them; "place" is that of the map, `lens` that of its camera (None: unknown).
-    `named` are labels on the ground, `span_s` the length of the lanes, `thresholds` those of the precision slider
-    (None: there is none)."""
+    """Content of the ground section of a page. `unit` is what a step is called. `albums` are those of the pictures, by
+    the names that steps give them; "place" is that of the map, `lens` that of its camera (None: unknown). `named` are
+    labels on the ground, `span_s` the length of the lanes, `thresholds` those of the precision slider (None: there is
+    none). `notes` are sentences below the ground."""
 
     unit: str
     ground: Sequence[Place]
@@ -90,7 +90,7 @@ class Explored:
     named: Sequence[tuple[str, Point]] = ()
     span_s: float = 0.0
     thresholds: Thresholds | None = None
-    notes: Sequence[str] = field(default=())
+    notes: Sequence[str] = ()
 
 
 def stepped(title: str, above: Sequence[str], explored: Explored, below: Sequence[str]) -> str:
@@ -142,8 +142,8 @@ def _explorer(explored: Explored, other_bytes: int) -> str:
     said += [left_out] if left_out else []
     numbers = {key: at for at, key in enumerate(found)}
     for step, each in zip(steps, told, strict=True):
-        pictures = [(shown(caption), numbers[of, name]) for of, name, caption in step.pictures if (of, name) in numbers]
-        each["pictures"] = pictures
+        there = [picture for picture in step.pictures if picture[:2] in numbers]
+        each["pictures"] = [(shown(caption), numbers[of, name]) for of, name, caption in there]
     known = {
         "steps": told,
         "pictures": list(found.values()),

@@ -78,6 +78,7 @@ def test_the_page_of_match_shows_queries_beside_places(browser, mapped, capsys):
         assert page.inner_text("#would").startswith("0 more accepted, 0 fewer")
 
 
+@pytest.mark.slow
 def test_a_page_is_never_written_over_the_map(mapped, capsys):
     before = (mapped / "valley.gpkg").read_bytes()
     assert main(["map", "info", str(mapped / "valley.gpkg"), "--page", str(mapped / "valley.gpkg")]) == 2

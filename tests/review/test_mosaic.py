@@ -77,6 +77,7 @@ def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
     assert sizes[0] == sizes[1] == len(keys) > sizes[2] > 0
 
 
+@pytest.mark.slow
 def test_a_page_of_many_queries_stays_below_its_limit(tmp_path, monkeypatch):
     (tmp_path / "ref").mkdir()
     places = places_in(tmp_path / "ref")
