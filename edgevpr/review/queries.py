@@ -67,9 +67,7 @@ def layers_of(ground: Sequence[Place], flight: LoggedFlight, gps: str = "GPS") -
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer(gps, "gps", _known_ways(query.gps_at for query in queries), "line"),
         Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), "line"),
-        Layer(
-            "refused there", "missed", [[query.true_at for query in queries if query.true_at and not query.accepted]]
-        ),
+        Layer("refused there", "missed", [[at for query in queries if (at := _missed_at(query))]]),
         Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
     ]
     for outcome, name, colour in _FIXES:
