@@ -118,8 +118,8 @@ def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
 
 
 def small_webp(image: Image, longest_px: int, quality: int = _WEBP_QUALITY) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP file, scaled as `small_jpeg` does. It takes about half as much
-    as that, at a lower quality, and can be transparent."""
+    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP file, scaled as `small_jpeg` does. It takes about half of
+    that, at a lower quality, and can be transparent."""
     return _encoded(".webp", at_most(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, quality))
 
 

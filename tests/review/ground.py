@@ -88,8 +88,10 @@ def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
 
 
 def write_positions(path: Path, places: list[Place]) -> None:
-    """Write the table of the positions of the places' pictures."""
+    """Write the table of the positions of the places' pictures, and of the headings of their tops."""
     with open(path, "w", newline="") as handle:
         table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon"))
-        table.writerows((each.source_image, each.position.lat_deg, each.position.lon_deg) for each in places)
+        table.writerow(("file", "lat", "lon", "yaw_deg"))
+        for each in places:
+            up_deg = each.pose.up_deg if each.pose else ""
+            table.writerow((each.source_image, each.position.lat_deg, each.position.lon_deg, up_deg))

@@ -5,11 +5,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in
+from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in, write_positions
 from logs import write_log
 from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
+from edgevpr.frames.level import Lens
 from edgevpr.review import steps
 from edgevpr.review.album import Album, album_of_map, small_pictures
 from edgevpr.review.logged import read_flight
@@ -17,8 +18,8 @@ from edgevpr.review.mosaic import Mosaic, mosaic_of
 from edgevpr.review.page import page_of
 
 
-def test_pictures_lie_where_their_poses_say(tmp_path):
-    found = mosaic_of(places_in(tmp_path), Album([tmp_path]), None, ORIGIN)
+def assert_is_the_ground(found):
+    """Hold the picture of the ground against the landscape."""
     assert isinstance(found, Mosaic)
     seen = cv2.imdecode(np.frombuffer(found.webp, np.uint8), cv2.IMREAD_UNCHANGED)
     west, south, east, north = found.edges_m
@@ -30,6 +31,19 @@ def test_pictures_lie_where_their_poses_say(tmp_path):
     assert 0.3 < shown.mean() < 0.9, "what no picture shows is transparent"
     assert abs(seen[..., :3].astype(int) - ground)[shown].mean() < 12
     assert shown[seen.shape[0] // 2, seen.shape[1] // 2]
+
+
+def test_pictures_lie_where_their_poses_say(tmp_path):
+    assert_is_the_ground(mosaic_of(places_in(tmp_path), Album([tmp_path]), None, ORIGIN))
+
+
+def test_a_map_of_levelled_pictures_is_laid_with_its_lens(tmp_path):
+    places = places_in(tmp_path)
+    write_positions(tmp_path / "positions.csv", places)
+    north_up = [replace(each, pose=replace(each.pose, up_deg=0.0)) for each in places]
+    assert_is_the_ground(mosaic_of(north_up, Album([tmp_path]), Lens(60.0), ORIGIN))
+    assert isinstance(mosaic_of(north_up, Album([tmp_path]), None, ORIGIN), str)
+    assert_is_the_ground(mosaic_of(places, Album([tmp_path]), Lens(60.0), ORIGIN))  # it was made without the lens
 
 
 @pytest.mark.parametrize(
