@@ -44,7 +44,7 @@ class Album:
         return bool(self._folders or self._recorded or self._kept)
 
     def keep(self, name: str, image: Image) -> None:
-        """Keep a small copy of the picture `name`, uint8 (H, W[, 3]), that no file holds."""
+        """Keep a small copy of the picture `name`, uint8 (H, W[, 3]): no file has to be read for it any more."""
         from edgevpr.frames.images import small_jpeg
 
         self._kept[name] = small_jpeg(image, _SIDES_PX[0])
@@ -87,6 +87,7 @@ class Album:
         if found is None:
             return None
         path, image = found
+        self.keep(place.source_image, image)  # photographs take long to decode
         tag = self._tags_beside(path.parent).get(path)
         if lens is None or tag is None:
             return image, None
@@ -153,11 +154,11 @@ def small_pictures(
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
     if not keys:
         return {}, ""
-    from edgevpr.frames.images import small_webp
+    from edgevpr.frames.images import at_most, small_webp
 
     spread = dict.fromkeys([*keys[:: max(1, len(keys) // _SAMPLES)], *keys])
     images = (albums[of].image(name) for of, name in spread)
-    samples = list(islice((image for image in images if image is not None), _SAMPLES))
+    samples = list(islice((at_most(image, _SIDES_PX[0]) for image in images if image is not None), _SAMPLES))
     if not samples:
         return {}, ""
     for side_px in _SIDES_PX:
