@@ -48,6 +48,7 @@ def test_every_module_and_nothing_else_travels(wheel):
     looks = {
         "edgevpr/py.typed",
         "edgevpr/review/page.css",
+        "edgevpr/review/page.js",
         "edgevpr/lab/evaluate/page.css",
         "edgevpr/review/common.css",
     }

@@ -23,7 +23,10 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     ),
     "map refine": (("after learning in flight", "valley.gpkg --images photos/"),),
     "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
-    "map info": (("what is in it", "valley.gpkg"),),
+    "map info": (
+        ("what is in it", "valley.gpkg"),
+        ("a page of it, with the ground", "valley.gpkg --page valley.html --map-images photos/"),
+    ),
     "map check": (("before a flight", "valley.gpkg"),),
     "map repair": (("after `map check` has named damage", "valley.gpkg"),),
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
@@ -32,6 +35,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "match": (
         ("where later pictures were taken", "valley.gpkg --images later/"),
         ("with what a flight knows beside them", "valley.gpkg --images later/ --known heading,height"),
+        ("a page of what was found", "valley.gpkg --images later/ --page found.html --map-images photos/"),
     ),
     "run": (
         (

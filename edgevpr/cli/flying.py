@@ -11,6 +11,7 @@ from edgevpr.cli.shared import (
     add_json,
     add_keys,
     add_known,
+    add_map_images,
     add_positions,
     add_recording,
     command,
@@ -19,14 +20,17 @@ from edgevpr.cli.shared import (
     group,
     leave_out,
     path_of,
+    require_out,
     show,
+    write_out,
 )
-from edgevpr.core.config import with_logs_in
+from edgevpr.core.config import Config, with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress, shown, waiting
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recogniser import Recogniser
+    from edgevpr.runtime.recognise.recognition import Recognition
     from edgevpr.runtime.service.finding import Finding
 
 _MATCHING_KEYS = (
@@ -46,6 +50,8 @@ def add(commands: Any) -> None:
     add_keys(match, *_MATCHING_KEYS)
     match.add_argument("--follow", action="store_true", help="the images are those of one flight, in order (cohog)")
     add_known(match)
+    match.add_argument("--page", metavar="FILE", help="write a page for any browser, offline (.html)")
+    add_map_images(match)
     add_json(match)
 
     run = command(commands, "run", run_flight, "recognise places in flight and tell the flight controller")
@@ -86,6 +92,7 @@ def run_match(args: Namespace) -> int:
 
     config, known = config_of(args, args.config, map=args.map), told_parts(args.known)
     recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
+    page = _MatchPage(args) if args.page else None
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)
@@ -98,6 +105,8 @@ def run_match(args: Namespace) -> int:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         found.append(match_of(event))
+        if page:
+            page.take(event)
         if known:
             found[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(of_matches(found))
@@ -106,7 +115,40 @@ def run_match(args: Namespace) -> int:
     if weights := weights_of(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
+    if page:
+        page.write(recogniser, config)
     return exit_code(unusable)
+
+
+class _MatchPage:
+    """The page of `match`, for which queries are collected as they come."""
+
+    def __init__(self, args: Namespace) -> None:
+        from edgevpr.review.album import Album, album_of_map
+        from edgevpr.review.overhead import read_ground
+
+        require_out(args.page, args.map)
+        self._args, self._ground, self._lines = args, read_ground(args.map), list[dict[str, Any]]()
+        self._albums = {"seen": Album([]), "place": album_of_map(args.map_images, self._ground)}
+
+    def take(self, event: "Recognition") -> None:
+        """Take the event of a query."""
+        from edgevpr.review.matchpage import line_of
+
+        self._lines.append(line_of(event, len(self._lines)))
+        if event.frame:
+            self._albums["seen"].keep(event.frame.name, event.frame.image)
+
+    def write(self, recogniser: "Recogniser", config: Config) -> None:
+        """Write the page."""
+        from edgevpr.review.matchpage import match_page_of
+        from edgevpr.runtime.recognise.levelling import lens_of
+
+        name, sure = Path(self._args.map).name, recogniser.rule.sure
+        page = match_page_of(self._lines, self._ground, self._albums, name, sure, lens_of(config.source))
+        write_out(self._args.page, self._args.map, lambda out: out.write(page))
+        if not self._args.json:
+            print(f"{self._args.page}: {len(self._lines)} queries")
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:

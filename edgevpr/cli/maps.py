@@ -2,7 +2,7 @@
 salience`: print how memorable, static and full of information a picture is."""
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
+    add_map_images,
     add_parameters,
     add_recording,
     command,
@@ -21,7 +22,9 @@ from edgevpr.cli.shared import (
     parameters_of,
     path_of,
     positive,
+    require_out,
     show,
+    write_out,
 )
 from edgevpr.cli.wording import of_check, of_info, of_made, of_refined
 from edgevpr.core.errors import ImageError, UsageError
@@ -52,7 +55,12 @@ def add(commands: Any) -> None:
     calibrate.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and precision")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
-    add_json(of_map("info", map_info, "say what a map holds"))
+    info = of_map("info", map_info, "say what a map holds, or show it on a page")
+    info.add_argument("--page", metavar="FILE", help="write a page for any browser, offline (.html)")
+    add_map_images(info)
+    info.add_argument("--config", metavar="FILE", help="that of the map's flight: its lens lays the pictures")
+    add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
+    add_json(info)
     add_json(of_map("check", map_check, "read everything in a map, and say what is damaged"))
     add_json(of_map("repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged"))
     merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
@@ -164,12 +172,14 @@ def map_calibrate(args: Namespace) -> int:
 
 
 def map_info(args: Namespace) -> int:
-    """Run `map info`: print what a map holds, and what it takes on disk and in RAM."""
+    """Run `map info`: print what a map holds, and what it takes on disk and in RAM; with --page, make a page of it."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
     from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE, calibration_of, not_calibrated
 
+    if args.page:
+        require_out(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = info_of(place_map), calibration_of(place_map)
     each_bytes = bytes_per_place(info.spec)
@@ -179,8 +189,35 @@ def map_info(args: Namespace) -> int:
         confidence = not_calibrated(info.places) if info.spec.name == WITH_CONFIDENCE else None
     ram_mb = info.places * each_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
-    show({**asdict(info), **known, "ram_mb": ram_mb}, args.json, of_info(info, confidence, ram_mb))
+    said = list(of_info(info, confidence, ram_mb))
+    show({**asdict(info), **known, "ram_mb": ram_mb}, args.json, said)
+    if args.page:
+        _write_page(args, said, calibration.recognisable if calibration else {})
     return 0
+
+
+def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, float]) -> None:
+    """Write the page of a map. `said` are the lines of `map info`."""
+    from edgevpr.mapmaking.lookalikes import look_alikes
+    from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.review.album import album_of_map
+    from edgevpr.review.mappage import MOST_ASKED, MapFindings, map_page_of
+    from edgevpr.runtime.recognise.levelling import lens_of
+
+    lens = lens_of(config_of(args, args.config).source)
+    with PlaceMap.open(args.map) as place_map:
+        places = list(place_map.places())
+        pictures = album_of_map(args.map_images, places)
+        asked = places[:: -(-len(places) // MOST_ASKED) or 1] if pictures else []
+        laid = ((place.place_id, pictures.laid(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
+        found = look_alikes(place_map, ((place_id, *each) for place_id, each in laid if each))
+        alike = list(found)
+    name = Path(args.map).name
+    findings = MapFindings(name=name, places=places, said=said, recognisable=recognisable, alike=alike)
+    page = map_page_of(findings, pictures, lens)
+    write_out(args.page, args.map, lambda out: out.write(page))
+    if not args.json:
+        print(f"{args.page}: {len(places)} places of {args.map}")
 
 
 def map_check(args: Namespace) -> int:

@@ -7,12 +7,12 @@ from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, command, path_of, show, write_out
+from edgevpr.cli.shared import add_json, add_map_images, command, path_of, show, write_out
 from edgevpr.cli.wording import of_replay, of_what_if
 from edgevpr.core.errors import EdgevprError
 
 if TYPE_CHECKING:
-    from edgevpr.review.overhead import Ground
+    from edgevpr.core.types import Place
 
 
 def add(commands: Any) -> None:
@@ -21,11 +21,14 @@ def add(commands: Any) -> None:
     report.add_argument("log", metavar="LOG")
     report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
-    for flag, text in (
-        ("--images", "frames of this flight (those of its recording need none)"),
-        ("--map-images", "the pictures that the map was made of"),
-    ):
-        report.add_argument(flag, action="append", default=[], metavar="DIR", help=f"folder with {text}; repeatable")
+    report.add_argument(
+        "--images",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder with frames of this flight (those of its recording need none); repeatable",
+    )
+    add_map_images(report)
     export = command(commands, "export", run_export, "write matches and fixes of a flight, for a map viewer")
     export.add_argument("log", metavar="LOG")
     form = export.add_mutually_exclusive_group(required=True)
@@ -43,15 +46,17 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.review.logged import read_flight, text
+    from edgevpr.review.album import Album, album_of_map
+    from edgevpr.review.logged import read_flight, text, value
+    from edgevpr.review.matchpage import thresholds_of
     from edgevpr.review.overhead import read_ground
-    from edgevpr.review.page import Album, page_of
+    from edgevpr.review.page import page_of
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     flight = read_flight(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
-    frames, references = Album(args.images, frames_of(folder) if folder else {}), Album(args.map_images)
-    ground: Ground = ()
+    frames = Album(args.images, frames_of(folder) if folder else {})
+    ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):
         try:
@@ -60,7 +65,9 @@ def run_report(args: Namespace) -> int:
             if args.map:
                 raise
             no_ground = f"The map of the flight is not drawn: {error} Its place can be given with --map."
-    page = page_of(flight, ground, frames, references, no_ground)
+    references = album_of_map(args.map_images, ground)
+    thresholds = thresholds_of(value(flight.start, "decided", "rule", "sure"))
+    page = page_of(flight, ground, frames, references, no_ground, thresholds)
     write_out(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0

@@ -87,6 +87,17 @@ def add_positions(parser: ArgumentParser) -> None:
     )
 
 
+def add_map_images(parser: ArgumentParser) -> None:
+    """Add the flag for the pictures that a map was made of, which a page shows."""
+    parser.add_argument(
+        "--map-images",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder with the pictures that the map was made of, repeatable; of a map of an orthophoto, that file",
+    )
+
+
 def add_known(parser: ArgumentParser) -> None:
     """Add the flag for what is known of recorded queries, which `hints.told_parts` reads."""
     parser.add_argument(
@@ -210,15 +221,24 @@ def count(text: str) -> int:
     return value
 
 
-def write_out(target: str, source: str, write: Callable[[TextIO], T]) -> T:
-    """Write the file `target`, whole or not at all: call `write` with the open text file, and return its result. Raises
-    UsageError if `target` is the file `source`, which was read, or if its folder does not exist."""
-    from edgevpr.core.files import require_folder, write_whole
+def require_out(target: str, source: str) -> Path:
+    """Return the path of the file `target`, to be written. Raises UsageError if it is the file `source`, which is read,
+    or if its folder does not exist."""
+    from edgevpr.core.files import require_folder
 
     path = Path(target)
-    if path.exists() and path.samefile(source):
+    if path.exists() and Path(source).exists() and path.samefile(source):
         raise UsageError(f"{target} is what was read: give another name.")
     require_folder(path)
+    return path
+
+
+def write_out(target: str, source: str, write: Callable[[TextIO], T]) -> T:
+    """Write the file `target`, whole or not at all: call `write` with the open text file, and return its result. Raises
+    as `require_out` does."""
+    from edgevpr.core.files import write_whole
+
+    path = require_out(target, source)
 
     def written(unfinished: Path) -> T:
         with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as out:

@@ -94,12 +94,12 @@ def ask(
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
     looks_down = technique.spec.cells is not None
-    near_m = max(rule.neighbour_m, place_map.footprint_m() or index.spacing_m() or 0.0)
+    near_m = overlap_m(place_map, index, rule)
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, picture in pictures:
         if (slot := slots.get(place_id)) is None:
             continue
-        may_be_same = _same_ground(index, slot, near_m)
+        may_be_same = same_ground(index, slot, near_m)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.only(~may_be_same)))
         for way, seen, among in (*ways, (MIRRORED, _mirrored(picture), index)):
             if not len(among):
@@ -270,7 +270,12 @@ def _mirrored(picture: Levelled) -> Levelled:
     return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
 
 
-def _same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:
+def overlap_m(place_map: PlaceMap, index: PlaceIndex, rule: AcceptRule) -> float:
+    """Return the distance in metres within which pictures of the map count as neighbours: at least a footprint."""
+    return max(rule.neighbour_m, place_map.footprint_m() or index.spacing_m() or 0.0)
+
+
+def same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:
     """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`. Pictures
     are `near_m` metres wide."""
     away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)

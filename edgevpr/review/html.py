@@ -1,5 +1,5 @@
-"""Parts of HTML pages that need no network and no script, in the light or dark colours that the reader has chosen: for
-the reports of flights (`review.page`) and of evaluations (`lab.evaluate.page`).
+"""Parts of HTML pages that need no network, in the light or dark colours that the reader has chosen: for the pages of
+flights, matches and maps (`review.page`) and of evaluations (`lab.evaluate.page`).
 
 Charts follow the width of the page, while their lines and dots keep their thickness. Their text is HTML beside the SVG,
 so that it is readable on a phone. A `colour` is a CSS class that sets the colour. Functions that return a str return
@@ -7,11 +7,14 @@ HTML, unless they say otherwise.
 """
 
 import base64
+import hashlib
+import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.text import shown
 
@@ -24,21 +27,32 @@ _LAST = 0.97  # share of an axis: a text centred on a point further right would 
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
 
-# Content security policy: the browser loads nothing from anywhere, even if a file name in the page contains HTML.
+# Content security policy: the browser loads nothing from anywhere and runs no script but the page's own, even if a file
+# name in the page contains HTML.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def page(title: str, style: Path, body: Iterable[str]) -> str:
-    """Return a whole page. `style` is a CSS file that is added to the style of all pages; `body` is HTML."""
+def page(title: str, style: Path, body: Iterable[str], script: Path | None = None) -> str:
+    """Return a whole page. `style` is a CSS file that is added to the style of all pages; `body` is HTML. `script` is a
+    file of JavaScript that runs when the page is there (None: none does)."""
     common = Path(__file__).with_name("common.css").read_text("utf-8")
+    code = script.read_text("utf-8") if script else ""
+    sha256 = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    policy = f"{_POLICY}; script-src 'sha256-{sha256}'" if script else _POLICY
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
         f"<title>{foreign(title)}</title><style>{common}{style.read_text('utf-8')}</style></head>\n"
-        f"<body>{''.join(body)}</body></html>\n"
+        f"<body>{''.join(body)}{f'<script>{code}</script>' if script else ''}</body></html>\n"
     )
+
+
+def data(name: str, value: Any) -> str:
+    """Return `value`, which `json.dumps` takes, as data of the page, for its script: nothing in it can end the data."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
 
 
 def foreign(text: str) -> str:
@@ -49,6 +63,12 @@ def foreign(text: str) -> str:
 def heading(title: str, known: Iterable[str]) -> str:
     """Return the title of a page, and below it the texts `known`, separated by commas."""
     return f'<h1>{foreign(title)}</h1><p class="soft">{foreign(", ".join(known))}</p>'
+
+
+def figures(known: Mapping[str, str]) -> str:
+    """Return figures by their names, as HTML each; those that are unknown are left out."""
+    rows = "".join(f"<div><dt>{name}</dt><dd>{each}</dd></div>" for name, each in known.items() if each != UNKNOWN)
+    return f'<dl class="figures">{rows}</dl>'
 
 
 def section(title: str, content: str) -> str:
@@ -139,9 +159,10 @@ def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> st
     """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number; "" without
     rows."""
     axis, lines = times(span_s), ""
-    for name, colour, times_s in rows:
+    for at, (name, colour, times_s) in enumerate(rows):
         marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times_s}))
-        drawing = _svg(f"{name}: {len(times_s)}", 20, f'{axis.grid(20)}<path class="mark {colour}" d="{marks}"/>')
+        path = f'<path class="mark {colour}" d="{marks}" data-lane="{at}"/>'
+        drawing = _svg(f"{name}: {len(times_s)}", 20, axis.grid(20) + path)
         lines += f"<span>{escape(name)} <b>{len(times_s)}</b></span>{drawing}"
     return f'<div class="lanes">{lines}<span></span>{axis.below()}</div>' if rows else ""
 

@@ -48,8 +48,8 @@ class LoggedQuery:
 
     `line` is its line of the log. `at` is the position of an accepted match, `place_at` that of the place found.
     `autopilot_at` and `gps_at` are the aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the
-    distance from the match to `autopilot_at` if the autopilot has GPS, else to `gps_at`. `has_link`: the autopilot was
-    heard."""
+    distance from the match to `true_at`: `autopilot_at` if the autopilot has GPS, else `gps_at`. `has_link`: the
+    autopilot was heard."""
 
     line: dict[str, Any]
     name: str
@@ -64,6 +64,7 @@ class LoggedQuery:
     place_at: Point | None
     autopilot_at: Point | None
     gps_at: Point | None
+    true_at: Point | None
     off_m: float | None
     fix: LoggedFix | None
     has_link: bool | None
@@ -162,6 +163,7 @@ def _query(line: dict[str, Any], t_s: float) -> LoggedQuery:
         place_at=point(line, "position"),
         autopilot_at=autopilot_at,
         gps_at=gps_at,
+        true_at=truth,
         off_m=float(distance_m(*truth, *at)) if truth and at else None,
         fix=_fix(line),
         has_link=is_heard if "vehicle" in line else None,

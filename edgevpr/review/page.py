@@ -1,4 +1,4 @@
-"""The report of a flight (`edgevpr report`): one HTML page with its pictures inside, without network or script.
+"""The report of a flight (`edgevpr report`): one HTML page with its pictures inside, without network.
 
 Functions that return a str return HTML.
 """
@@ -7,110 +7,106 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from html import escape
 from itertools import groupby
-from pathlib import Path
 from statistics import median
-from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import nines, shown
+from edgevpr.core.text import shown
+from edgevpr.core.types import Place
+from edgevpr.review.album import Album
 from edgevpr.review.html import (
-    UNKNOWN,
     Points,
     Series,
     chart,
     clock,
     figure,
+    figures,
     foreign,
     heading,
     lanes,
     notes,
-    page,
     picture,
     section,
     table,
     times,
 )
 from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, number, text, value
-from edgevpr.review.overhead import Ground, draw, layers_of
+from edgevpr.review.queries import found, lanes_of, layers_of, steps_of
+from edgevpr.review.steps import Explored, Thresholds, counts, stepped
+
+if TYPE_CHECKING:
+    from edgevpr.frames.level import Lens
 
 _MOST_REMARKS = 200
 _FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
 _LONG_S = 5.0
 _NEAR_S = 5.0  # of two moments that are closer in time only the first is shown
 _OF_A_KIND, _MOST = 2, 6  # moments at most, of one kind and in all
-_NUMBER = re.compile(r"\d+(\.\d+)?")
 _UNSENT = re.compile(r"^not sent( yet)?: ")  # so some reasons begin, and the outcome before them says it already
-_COLOURS = {
-    FixOutcome.TAKEN: "taken",
-    FixOutcome.REFUSED: "refused",
-    FixOutcome.UNANSWERED: "unanswered",
-    FixOutcome.CONTINUOUS: "taken",
-    FixOutcome.KEPT: "places",
-}
 _KNOWN = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 
 Moment = tuple[LoggedQuery, str]  # a query to show, and a sentence on why
 _Ranked = tuple[int, float, LoggedQuery, str]  # the kind of a moment and its rank, both the lower the worse; the moment
 
 
-class Album:
-    """Finds pictures by the names that the log gives them: in `recorded` (files of a recording by the names of their
-    frames) or else as files in `folders`. The flight and the map have an album each, since their pictures often have
-    equal names. Raises UsageError for a folder that does not exist."""
-
-    def __init__(self, folders: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
-        self._recorded = recorded
-        self._folders = [Path(folder).resolve() for folder in folders]
-        for folder in self._folders:
-            if not folder.is_dir():
-                raise UsageError(f"{folder}: there is no such folder: give one that holds pictures.")
-
-    def picture(self, name: str | None) -> bytes | None:
-        """Return the picture `name` as a small JPEG; None if there is none that can be read."""
-        if not name or not (self._folders or name in self._recorded):
-            return None
-        from edgevpr.frames.images import read_image, small_jpeg  # a page without pictures needs no OpenCV
-
-        # A log from somebody else may name any file of this machine: show only files in the folders.
-        paths = [folder / Path(name).name for folder in self._folders]
-        for path in [self._recorded[name], *paths] if name in self._recorded else paths:
-            with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
-                if path.is_file():
-                    return small_jpeg(read_image(path))
-        return None
-
-
-def page_of(flight: LoggedFlight, ground: Ground, frames: Album, references: Album, no_ground: str = "") -> str:
+def page_of(
+    flight: LoggedFlight,
+    ground: Sequence[Place],
+    frames: Album,
+    references: Album,
+    no_ground: str = "",
+    thresholds: Thresholds | None = None,
+) -> str:
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
-    `no_ground` is a sentence on why there is no `ground`."""
+    `no_ground` is a sentence on why there is no `ground`. `thresholds` are those of other precisions (None: unknown).
+    """
     queries, moments = flight.queries, list(enumerate(worst(flight.queries), start=1))
     positions = ((str(at), query.at or query.autopilot_at or query.gps_at) for at, (query, _) in moments)
-    named = [(name, at) for name, at in positions if at]
     time = text(flight.start, "time") or next((text(each.line, "time") for each in queries), None)
     title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
     start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
     refusals = (query.reason.partition(":")[0] for query in queries if not query.accepted)
     fixes = [query.fix for query in queries if query.fix and query.fix.outcome is not FixOutcome.CONTINUOUS]
-    body = [
+    above = [
         heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
         section("", _figures(queries)),
         notes(_notes(flight, bool(ground), no_ground)),
-        section("Over the ground", draw(ground, layers_of(ground, flight), named)),
-        section("What became of every query", _lanes(flight)),
+    ]
+    below = [
+        section("What became of every query", lanes(lanes_of(flight), flight.span_s)),
         section("Over time", _charts(flight)),
         section("Worst moments", "".join(_moment(at, *each, frames, references) for at, each in moments)),
-        section("Why matches were refused", _counts(refusals)),
+        section("Why matches were refused", counts(refusals)),
         section(
             "Why fixes were not sent, or not taken",
-            _counts(f"{fix.outcome.value}: {_UNSENT.sub('', fix.why)}" for fix in fixes if fix.why),
+            counts(f"{fix.outcome.value}: {_UNSENT.sub('', fix.why)}" for fix in fixes if fix.why),
         ),
         section("What was said", _remarks(flight)),
         section("How it was set", _settings(flight)),
     ]
-    return page(title, Path(__file__).with_name("page.css"), body)
+    explored = Explored(
+        unit="query",
+        ground=ground,
+        layers=layers_of(ground, flight),
+        steps=steps_of(ground, flight),
+        albums={"seen": frames, "place": references},
+        lens=lens_of(flight.start),
+        named=[(name, at) for name, at in positions if at],
+        span_s=flight.span_s,
+        thresholds=thresholds,
+    )
+    return stepped(title, above, explored, below)
+
+
+def lens_of(start: Mapping[str, Any]) -> "Lens | None":
+    """Return the lens of the flight's camera by the first line of its log; None if it is unknown."""
+    fov_deg, up_deg = (number(start, "config", "source", name) for name in ("fov_deg", "up_deg"))
+    if fov_deg is None or not 0 < fov_deg < 180:
+        return None
+    from edgevpr.frames.level import Lens  # with OpenCV
+
+    return Lens(fov_deg, up_deg or 0.0)
 
 
 def _figures(queries: Sequence[LoggedQuery]) -> str:
@@ -119,7 +115,7 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
     accepted = sum(query.accepted for query in queries)
     share = f" <small>{accepted / len(queries):.0%}</small>" if queries else ""
     off_m = [query.off_m for query in queries if query.off_m is not None]
-    figures = {
+    known = {
         "queries": str(len(queries)),
         "accepted": f"{accepted}{share}",
         "fixes sent": str(sent),
@@ -130,8 +126,7 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
         "RAM, most": figure(_most(queries, "costs", "rss_mb"), "MB"),
         "hottest": figure(_most(queries, "board", "temperature_c"), "°C"),
     }
-    known = [f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in figures.items() if value != UNKNOWN]
-    return f'<dl class="figures">{"".join(known)}</dl>'
+    return figures(known)
 
 
 def _most(queries: Sequence[LoggedQuery], *keys: str) -> float | None:
@@ -153,22 +148,6 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
         (not no_ground, no_ground),
     ]
     return [sentence for is_there, sentence in known if not is_there]
-
-
-def _lanes(flight: LoggedFlight) -> str:
-    queries = flight.queries
-    is_heard = any(query.has_link for query in queries)
-    rows = [
-        ("match accepted", "accepted", [query.t_s for query in queries if query.accepted]),
-        ("match refused", "refused", [query.t_s for query in queries if not query.accepted]),
-        ("frame not usable", "unusable", flight.unusable),
-        *(
-            (outcome.value, colour, [query.t_s for query in queries if query.fix and query.fix.outcome is outcome])
-            for outcome, colour in _COLOURS.items()
-        ),
-        ("autopilot silent", "refused", [query.t_s for query in queries if is_heard and query.has_link is False]),
-    ]
-    return lanes([row for row in rows if row[2]], flight.span_s)
 
 
 def _charts(flight: LoggedFlight) -> str:
@@ -251,11 +230,6 @@ def _silences(queries: Sequence[LoggedQuery]) -> Iterator[_Ranked]:
 
 
 def _moment(at: int, query: LoggedQuery, why: str, frames: Album, references: Album) -> str:
-    found = "no place was found"
-    if query.place is not None:
-        score = figure(number(query.line, "score"))
-        found = f"place {query.place} ({query.reference_image or 'without a name'}), score {score}"
-    sure = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
     verdict = f"{'accepted' if query.accepted else 'refused'}: {query.reason}"
     pictures = [("seen", query.name, frames), ("place found", query.reference_image, references)]
     pair = "".join(
@@ -265,16 +239,9 @@ def _moment(at: int, query: LoggedQuery, why: str, frames: Album, references: Al
     )
     return (
         f'<div class="moment" id="moment-{at}"><h3><i>{at}</i>{clock(query.t_s)} – {foreign(why)}</h3>'
-        f'<p class="soft">{foreign(f"{query.name}: {found}{sure}; {verdict}")}</p>'
+        f'<p class="soft">{foreign(f"{query.name}: {found(query)}; {verdict}")}</p>'
         + (f'<div class="pair">{pair}</div></div>' if pair else "</div>")
     )
-
-
-def _counts(reasons: Iterable[str]) -> str:
-    """Return a table of how often each reason was given. Numbers in reasons become "…", so that equal ones count
-    together."""
-    counted = Counter(_NUMBER.sub("…", reason) for reason in reasons)
-    return table(("times", "why"), [(str(count), why) for why, count in counted.most_common(20)]) if counted else ""
 
 
 def _remarks(flight: LoggedFlight) -> str:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import cv2
 import pytest
+from browser import driven
 from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
 from pictures import textured
 
@@ -59,7 +60,8 @@ def flown(tmp_path_factory):
     link.listener = Navigator(config.mavlink.min_accuracy_m, 1.0)
     source = FakeSource([Frame(image=each, name=name, t_mono_s=0.0) for name, each in pictures.items()], clock)
     with recogniser.place_map, FlightLog(folder / "flight.jsonl", clock=clock) as log:
-        log.write("start", **start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map))
+        start = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
+        log.write("start", **start, decided={"rule": recogniser.rule})
         crew = Crew(
             recogniser=recogniser,
             source=source,
@@ -73,3 +75,10 @@ def flown(tmp_path_factory):
         )
         Flight(config, crew).run()
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A real browser, started once."""
+    with driven() as started:
+        yield started

@@ -6,12 +6,13 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browser import show
+from browser import Opened, show
 from logs import query, write_log
 
 from edgevpr.cli.main import main
+from edgevpr.review.album import Album
 from edgevpr.review.logged import read_flight
-from edgevpr.review.page import Album, page_of
+from edgevpr.review.page import page_of
 
 NO_PICTURES = Album([])
 NASTY = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u202e\ud800"
@@ -82,7 +83,7 @@ def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     nasty = query(NASTY, reason=NASTY, reference_image=NASTY, accepted=False)
     log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": NASTY}))
     content = page(log)
-    assert "<script" not in content
+    assert content.count("<script") == 2, "the data and the script of the page"
     assert "<img" not in content
     assert "&lt;script&gt;" in content
     assert not {"\x1b", "\u202e"} & set(content)
@@ -184,6 +185,15 @@ def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
         shown = show(each)
         assert "match accepted" in shown.content
         assert (shown.console, shown.requests) == ([], [])
+
+
+@pytest.mark.process
+@pytest.mark.slow
+def test_the_page_judges_a_real_flight_as_it_was_judged(made, browser):
+    with Opened(browser, made) as page:
+        said = page.inner_text("#would")
+    assert said.startswith("0 more accepted, 0 fewer, of ")
+    assert "of 0 that" not in said
 
 
 def measured(made, folder, measure, width_px):

@@ -69,7 +69,11 @@ class Sureness:
 
     def threshold(self, evidence: Evidence) -> float:
         """Return the confidence needed to accept a match with this kind of evidence."""
-        return max(_LEAST_SURE, self.models[kind_of(evidence)].threshold(self.precision))
+        return self.needed(kind_of(evidence))
+
+    def needed(self, kind: str) -> float:
+        """Return the confidence needed to accept a match with evidence of this kind."""
+        return max(_LEAST_SURE, self.models[kind].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,16 +82,22 @@ def levelling_of(
     """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
     with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
     of view that contradicts it."""
-    calibrated = calibrated_lens(config)
     if technique.spec.parameters.get("camera") != "nadir":
+        calibrated = calibrated_lens(config)
         return Straightening(calibrated) if calibrated else None
-    fov_deg = sight_of(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
-    lens = None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated)
+    lens = lens_of(config)
     if lens is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal:
             return None
     return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now(config))
+
+
+def lens_of(config: SourceConfig) -> Lens | None:
+    """Return the lens of a configuration's camera; None if it is unknown. Raises as `levelling_of`."""
+    calibrated = calibrated_lens(config)
+    fov_deg = sight_of(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
+    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated)
 
 
 def calibrated_lens(config: SourceConfig) -> CalibratedLens | None:

@@ -1,0 +1,97 @@
+"""A map of pictures cut from one large picture of the ground, and a flight over it, for the tests of pages."""
+
+import csv
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+from logs import query
+
+from edgevpr.core.geodesy import axes_of, moved
+from edgevpr.core.types import Place, Pose, Position
+from edgevpr.runtime.recognise.confidence import prior
+from edgevpr.runtime.recognise.judge import Sureness
+
+ORIGIN = 50.0, 8.0
+SIDE_M, METRE_PX = 40.0, 4  # of a picture's longest side; pixels of the large picture
+ROWS, COLUMNS, STEP_M = 3, 4, 20.0
+SURE = Sureness({"down": prior("down")}, 0.999)
+
+
+def landscape() -> np.ndarray:
+    """The ground, BGR, a metre `METRE_PX` pixels, with ORIGIN in its middle and north up."""
+    rng = np.random.default_rng(7)
+    grey = np.zeros((560, 560), np.float32)
+    for cells in (35, 70, 140):
+        grey += cv2.resize(rng.random((cells, cells), np.float32), (560, 560), interpolation=cv2.INTER_CUBIC)
+    seen = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return np.dstack((seen, 255 - seen, seen // 2))
+
+
+def position(east_m: float, north_m: float) -> tuple[float, float]:
+    """A point on the ground (lat_deg, lon_deg)."""
+    return moved(*ORIGIN, east_m, north_m)
+
+
+def places_in(folder: Path, turned_deg: float = 0.0) -> list[Place]:
+    """Cut a picture for each place of a grid, each turned otherwise, and write it into a folder. The poses say
+    `turned_deg` more."""
+    ground, places = landscape(), []
+    for at in range(ROWS * COLUMNS):
+        middle_m = np.array([at % COLUMNS - (COLUMNS - 1) / 2, at // COLUMNS - (ROWS - 1) / 2]) * STEP_M
+        up_deg = 25.0 * at
+        width, height = int(SIDE_M * METRE_PX), int(0.75 * SIDE_M * METRE_PX)
+        corners = np.array([[-1, 1, 1], [1, 1, -1]]) * [[width / 2], [height / 2]] / METRE_PX
+        east, north = middle_m[:, None] + axes_of(up_deg) @ corners
+        seen = np.float32([280 + east * METRE_PX, 280 - north * METRE_PX]).T
+        way = cv2.getAffineTransform(seen, np.float32([[0, 0], [width, 0], [width, height]]))
+        name = f"{at:02d}.png"
+        cv2.imwrite(str(folder / name), cv2.warpAffine(ground, way, (width, height)))
+        pose = Pose(up_deg=(up_deg + turned_deg) % 360, footprint_m=SIDE_M, covariance_m2=(1.0, 0.0, 1.0))
+        at_deg = Position(*position(*middle_m.tolist()))
+        places.append(Place(place_id=at + 1, source_image=name, position=at_deg, pose=pose))
+    return places
+
+
+def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
+    """The lines of a flight over the places; every third query is refused for its confidence, every fifth for a low
+    score."""
+    needed = SURE.needed("down")
+    start = {"decided": {"rule": {"sure": asdict(SURE)}}}
+    lines = [("start", start)]
+    for number in range(count):
+        place, t_s = places[number % len(places)], 1001.0 + number
+        at = {"lat_deg": place.position.lat_deg, "lon_deg": place.position.lon_deg}
+        sure = needed - 10.0 ** -(1 + number % 4) if number % 3 == 2 else 1 - 10.0 ** -(4 + number % 6)
+        reason = f"confidence {sure:.12f}, {needed:.4f} needed: 30 landmarks agree"
+        refused = number % 3 == 2 or number % 5 == 4
+        if number % 5 == 4:
+            reason = "score 0.004 is below 0.010"
+        gps = {"lat_deg": at["lat_deg"] + 3e-5, "lon_deg": at["lon_deg"], "t_s": t_s}
+        found = {
+            "place": place.place_id,
+            "reference_image": place.source_image,
+            "position": at,
+            "located": None if refused else at,
+            "accepted": not refused,
+            "reason": reason,
+            "confidence": sure,
+            "evidence": {"lead": 1.0, "landmarks": 3.0},
+            "vehicle": {**at, "t_heard_s": t_s, "gps": gps},
+            "t_frame_s": t_s,
+        }
+        lines.append(("query", query(place.source_image if number < 8 else f"q{number}", **found, t_mono_s=t_s)))
+        if refused:
+            lines[-1][1]["fix"] = None
+    return lines
+
+
+def write_positions(path: Path, places: list[Place]) -> None:
+    """Write the table of the positions of the places' pictures, and of the headings of their tops."""
+    with open(path, "w", newline="") as handle:
+        table = csv.writer(handle)
+        table.writerow(("file", "lat", "lon", "yaw_deg"))
+        for each in places:
+            up_deg = each.pose.up_deg if each.pose else ""
+            table.writerow((each.source_image, each.position.lat_deg, each.position.lon_deg, up_deg))

@@ -1,0 +1,120 @@
+"""The page of a map, and that of what `match` finds in it."""
+
+import json
+import re
+from dataclasses import replace
+from shutil import copyfile
+
+import pytest
+from browser import Opened
+from ground import STEP_M, places_in, position, write_positions
+
+from edgevpr.cli.main import main
+from edgevpr.core.types import Position
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.review.mappage import gaps_of, holes_of, tags_amiss
+
+TWIN = "twin.png"
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    """A folder with valley.gpkg and its pictures `ref`; one of them is that of a place 300 m away again."""
+    folder = tmp_path_factory.mktemp("mapped")
+    (folder / "ref").mkdir()
+    places = places_in(folder / "ref")
+    copyfile(folder / "ref" / places[5].source_image, folder / "ref" / TWIN)
+    far = replace(places[5], source_image=TWIN, position=Position(*position(300.0, 0.0)), pose=None)
+    write_positions(folder / "ref" / "positions.csv", [*places, far])
+    argv = ["map", "build", folder / "valley.gpkg", "--images", folder / "ref", "--camera", "nadir", "--no-refine"]
+    assert main([*map(str, argv), "--no-calibrate", "--technique", "cohog"]) == 0
+    with PlaceMap.open_for_adding(folder / "valley.gpkg") as place_map, place_map.transaction():
+        for place in places:
+            recorded = Position(*position(9.0, 90.0)) if place.place_id == 3 else place.position
+            place_map.lay(place.place_id, place.position, replace(place.pose, recorded=recorded))
+    return folder
+
+
+def made(mapped, *argv):
+    """The page that a command writes, and its data."""
+    out = mapped / f"{argv[0]}.html"
+    assert main([*map(str, argv), "--page", str(out), "--map-images", str(mapped / "ref")]) == 0
+    return out, json.loads(re.search(r'id="steps">(.*?)</script>', out.read_text("utf-8"))[1])
+
+
+@pytest.mark.process
+@pytest.mark.slow
+def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser, mapped):
+    out, data = made(mapped, "map", "info", mapped / "valley.gpkg")
+    alike = {each["title"]: each["said"][-1] for each in data["steps"] if "looks like" in each["said"][-1]}
+    assert "looks like place 13: " in alike["Place 6: 05.png"]
+    assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
+    assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"
+    with Opened(browser, out) as page:
+        assert page.locator("image").count() == 1
+        page.focus("#step")
+        for _ in range(5):
+            page.keyboard.press("ArrowRight")
+        alts = page.eval_on_selector_all(".now img", "all => all.map(each => each.alt)")
+        assert alts == ["place 6: 05.png", f"looks alike: place 13: {TWIN}"]
+        assert page.locator(".spot.alike").count() == 1
+        page.click("summary:has-text('Show only some')")
+        page.locator("label:has([data-group])", has_text="tag amiss").locator("input").check()
+        assert page.inner_text(".now h3") == "Place 3: 02.png"
+        assert page.locator(".line.amiss").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.process
+@pytest.mark.slow
+def test_the_page_of_match_shows_queries_beside_places(browser, mapped, capsys):
+    out, data = made(mapped, "match", mapped / "valley.gpkg", "--images", mapped / "ref", "--accept-precision", "0.9")
+    accepted = int(re.search(r"(\d+) accepted", capsys.readouterr().out)[1])
+    assert len(data["steps"]) == 13
+    assert sum(each["title"].endswith(": accepted") for each in data["steps"]) == accepted
+    with Opened(browser, out, 1200) as page:
+        assert page.eval_on_selector_all(".now img", "all => all.map(each => each.naturalWidth > 0)") == [True, True]
+        assert page.inner_text("#asked") == "0.9 (as it was)"
+        assert page.inner_text("#would").startswith("0 more accepted, 0 fewer")
+
+
+@pytest.mark.slow
+def test_a_page_is_never_written_over_the_map(mapped, capsys):
+    before = (mapped / "valley.gpkg").read_bytes()
+    assert main(["map", "info", str(mapped / "valley.gpkg"), "--page", str(mapped / "valley.gpkg")]) == 2
+    assert "another name" in capsys.readouterr().err
+    assert (mapped / "valley.gpkg").read_bytes() == before
+
+
+def test_holes_lie_where_a_picture_is_missing_between_others(tmp_path):
+    places = [
+        replace(
+            place, pose=replace(place.pose, up_deg=0.0), position=Position(*position(east * STEP_M, north * STEP_M))
+        )
+        for east in range(5)
+        for north in range(5)
+        for place in places_in(tmp_path)[:1]
+    ]
+    holes, covered_m2, holes_m2 = holes_of(places)
+    assert (holes, holes_m2) == ([], 0.0)
+    assert covered_m2 == pytest.approx((4 * STEP_M + 30) ** 2, rel=0.1)
+    holes, _, holes_m2 = holes_of([place for at, place in enumerate(places) if at not in (7, 11, 12, 13, 17)])
+    assert len(holes) == 1
+    assert 500 < holes_m2 < 3000
+    assert holes_of([replace(place, pose=None) for place in places]) == ([], 0.0, 0.0)
+
+
+def test_tags_far_from_their_pictures_are_amiss(tmp_path):
+    places = [
+        replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
+        for at, place in enumerate(places_in(tmp_path))
+    ]
+    places = [replace(place, position=Position(*position(0.0, 0.0))) for place in places]
+    assert list(tags_amiss(places)) == [5]
+
+
+def test_a_gap_of_a_track_is_three_times_the_usual_step(tmp_path):
+    first = places_in(tmp_path)[0]
+    track = [replace(first, position=Position(*position(east_m, 0.0))) for east_m in (0, 10, 20, 70, 80, 90)]
+    (gap,) = gaps_of(track)
+    assert gap == [position(20, 0.0), position(70, 0.0)]
