@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with frames of this flight (those of its recording need none); repeatable",
+        help="folder with frames of this flight, repeatable, or its film (those of its recording need none)",
     )
     add_map_images(report)
     export = command(commands, "export", run_export, "write matches and fixes of a flight, for a map viewer")
@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.review.album import Album, album_of_map
+    from edgevpr.review.album import album_of, album_of_map
     from edgevpr.review.logged import read_flight, text, value
     from edgevpr.review.matchpage import thresholds_of
     from edgevpr.review.overhead import read_ground
@@ -55,7 +55,7 @@ def run_report(args: Namespace) -> int:
 
     flight = read_flight(args.log)
     folder = recording_of(text(flight.start, "recording"), args.log)
-    frames = Album(args.images, frames_of(folder) if folder else {})
+    frames = album_of(args.images, frames_of(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):

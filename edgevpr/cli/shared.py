@@ -94,7 +94,8 @@ def add_map_images(parser: ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with the pictures that the map was made of, repeatable; of a map of an orthophoto, that file",
+        help="folder with the pictures that the map was made of, repeatable, or its film; if it was cut from an "
+        "orthophoto, that file",
     )
 
 

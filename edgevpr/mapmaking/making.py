@@ -130,16 +130,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):
-                places = len(place_map) if order.calibrate and kinds_of(technique.spec) else None
-                say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, source.total, places)
-                is_down = technique.spec.parameters.get("camera") == "nadir"
-                if (
-                    is_down
-                    and config.source.fov_deg is None
-                    and config.source.lens is None
-                    and Path(pictures.source).is_dir()
-                ):
-                    say_what_lens(Path(pictures.source))
+                _say_beforehand(pictures, config, technique, source.total, len(place_map) if order.calibrate else None)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 technique,
@@ -173,6 +164,17 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             refined=refined,
             calibration=calibration,
         )
+
+
+def _say_beforehand(
+    pictures: FlownPictures, config: Config, technique: Technique, total: int, places: int | None
+) -> None:
+    """Say what the map will lack; `places` are those in a map that is to be calibrated."""
+    is_sure = kinds_of(technique.spec)
+    say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, total, places if is_sure else None)
+    is_down = technique.spec.parameters.get("camera") == "nadir"
+    if is_down and config.source.fov_deg is None and config.source.lens is None and Path(pictures.source).is_dir():
+        say_what_lens(Path(pictures.source))
 
 
 def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":

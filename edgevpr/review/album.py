@@ -1,8 +1,10 @@
 """The pictures of a page: found by the names that a log or a map gives them, and made small enough for one file."""
 
 import base64
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +24,8 @@ _SAMPLES = 12  # pictures that say how many bytes one takes
 _CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
 _AS_TEXT, _MARGIN = 4 / 3, 1.1  # base64; what others may take more
 
+_FRAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # as `VideoSource` names them
+
 Key = tuple[str, str]  # which album, and the name of a picture in it
 
 
@@ -37,7 +41,7 @@ class Album:
         self._tags: dict[Path, Mapping[Path, GeoTag]] = {}
         for folder in self._folders:
             if not folder.is_dir():
-                raise UsageError(f"{folder}: there is no such folder: give one that holds pictures.")
+                raise UsageError(f"{folder}: there is no such folder: give one that holds pictures, or a film.")
 
     def __bool__(self) -> bool:
         """Return True if there is anywhere to look for pictures."""
@@ -137,12 +141,58 @@ class CutAlbum(Album):
         return None
 
 
+class FilmAlbum(Album):
+    """The pictures of a film, by the names of its frames; those of a recording first. Raises EdgevprError for a file
+    that is no film, and for an unusable table of positions beside it."""
+
+    def __init__(self, film: Path, recorded: Mapping[str, Path] = MappingProxyType({})) -> None:
+        from edgevpr.frames.positions import find_track, read_track
+        from edgevpr.frames.source import open_source
+
+        super().__init__([], recorded)
+        self._film, table = film, find_track(film)
+        self._track = read_track(table) if table else None
+        self._open = partial(open_source, str(film), live=False)
+        self._source, self._passed = self._open(), ""
+        self._tag_of: dict[Path, GeoTag] = {}
+        self._tags[film] = self._tag_of
+
+    def __bool__(self) -> bool:
+        """Return True: there is a film."""
+        return True
+
+    def _found(self, name: str | None) -> tuple[Path, Image] | None:
+        if (recorded := super()._found(name)) or not (named := _FRAME.fullmatch(name or "")):
+            return recorded
+        from edgevpr.frames.source import read_to_end
+
+        if named[0] <= self._passed:  # names are in the order of the film, which is read forwards
+            self._source.close()
+            self._source, self._passed = self._open(), ""
+        for frame in filter(None, read_to_end(self._source, lambda error: None)):
+            self._passed = frame.name
+            if frame.name >= named[0]:
+                path = self._film / frame.name
+                if self._track:
+                    self._tag_of[path] = self._track.tag_at(float(named[1]))
+                return (path, frame.image) if frame.name == name else None
+        return None
+
+
+def album_of(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
+    """Return the album of the pictures in `sources`: folders, or one film. `recorded`: see `Album`. Raises EdgevprError
+    for a source that cannot be used."""
+    if len(sources) == 1 and Path(sources[0]).is_file():
+        return FilmAlbum(Path(sources[0]), recorded)
+    return Album(sources, recorded)
+
+
 def album_of_map(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
-    """Return the album of a map's pictures. `sources` are folders of pictures; of a map that was cut from an
+    """Return the album of a map's pictures. `sources` are folders of pictures, or a film; of a map that was cut from an
     orthophoto, the orthophoto. Raises EdgevprError for one that cannot be used."""
     if sources and any(place.pose and place.pose.is_surveyed for place in places):
         return CutAlbum(sources[0], places)
-    return Album(sources)
+    return album_of(sources)
 
 
 def small_pictures(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from films import film_of
 from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in, write_positions
 from logs import write_log
 from rasters import HOME, textured_raster
@@ -12,7 +13,7 @@ from rasters import HOME, textured_raster
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
 from edgevpr.review import steps
-from edgevpr.review.album import Album, album_of_map, small_pictures
+from edgevpr.review.album import Album, album_of, album_of_map, small_pictures
 from edgevpr.review.logged import read_flight
 from edgevpr.review.mosaic import Mosaic, mosaic_of
 from edgevpr.review.page import page_of
@@ -102,3 +103,14 @@ def test_a_page_of_many_queries_stays_below_its_limit(tmp_path, monkeypatch):
     made = page_of(flight, places, album, album)
     assert len(made.encode()) <= 1_500_000
     assert "shown is one query in" in made
+
+
+def test_the_pictures_of_a_film_are_found_by_the_names_of_its_frames(tmp_path):
+    greys = [40, 90, 140]
+    film_of(tmp_path / "f.mkv", [np.full((48, 64, 3), grey, np.uint8) for grey in greys], 1)
+    album = album_of([tmp_path / "f.mkv"])
+    for number in (1, 0, 2, 0):
+        image = album.image(f"frame {number:06d} t={number}.000 s")
+        assert image.mean() == pytest.approx(greys[number], abs=1)
+    assert album.image("frame 000009 t=9.000 s") is None
+    assert album.image("photo.jpg") is None
