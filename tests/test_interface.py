@@ -12,6 +12,7 @@ import pytest
 from pictures import textured
 
 import edgevpr
+from edgevpr.cli.main import main
 from edgevpr.core.errors import ImageError, MapError, SourceError, UsageError
 from edgevpr.core.types import Position
 
@@ -118,3 +119,19 @@ def test_the_examples_run(flight, valley, tmp_path, script, more, said):
     assert said in done.stdout
     if script == "build_and_match.py":
         assert len(json.loads((tmp_path / "m.geojson").read_text())["features"]) == PLACES
+
+
+@pytest.mark.process
+def test_the_example_of_a_film_makes_one_that_is_placed_by_its_subtitles(flight, tmp_path, capsys):
+    (tmp_path / "images").symlink_to(flight / "mapped")
+    lines = (flight / "mapped" / "positions.csv").read_text().splitlines()
+    (tmp_path / "positions.csv").write_text(
+        "\n".join([f"{lines[0]},alt,height_m", *(f"{x},250,80" for x in lines[1:])])
+    )
+    film = str(tmp_path / "DJI_0001")
+    subprocess.run([sys.executable, EXAMPLES / "film_with_subtitles.py", tmp_path, film], check=True)
+    assert main(["positions", f"{film}.SRT", "--images", f"{film}.MP4", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["placed"] == PLACES
+    assert main(["map", "build", f"{film}.gpkg", "--images", f"{film}.MP4", "--camera", "nadir", "--no-calibrate"]) == 0
+    with edgevpr.Map(f"{film}.gpkg") as ground:
+        assert len(ground) == PLACES
