@@ -90,7 +90,8 @@ def command_line() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")
     parser.add_argument("--version", action="version", version=f"edgevpr {__version__}")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    text = "show more of what happens, and the traceback of an error"
+    parser.add_argument("-v", "--debug", action="store_true", help=text)
     parser.add_argument(
         "-q", "--quiet", action="store_true", help="show no progress, and of what happens only warnings"
     )

@@ -54,7 +54,7 @@ def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
     description = "\n".join(wrap(text[0].upper() + text[1:] + ".", _HELP_COLUMNS))
     parser: ArgumentParser = commands.add_parser(name, help=text, description=description)
     # Accepted after the command too, where users type it.
-    parser.add_argument("--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
+    parser.add_argument("-v", "--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
     parser.add_argument("-q", "--quiet", action="store_true", default=SUPPRESS, help=SUPPRESS)
     return parser
 

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from edgevpr.core.errors import EdgevprError
@@ -18,31 +19,40 @@ from edgevpr.core.errors import EdgevprError
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
-def ask_child(module: str, job: Any, limit_s: float, what: str) -> Any:
-    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON).
+def ask_child(
+    module: str, job: Any, limit_s: float, what: str, turn: AbstractContextManager[object] | None = None
+) -> Any:
+    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON). The
+    child starts at once, and gets the job within `turn` (None: at once).
 
     Raises EdgevprError if the child takes longer or crashes, and for an error that the work itself raised. `what` names
     the work at the beginning of the message, such as "Trying hog".
     """
-    try:
-        process = subprocess.run(
-            [sys.executable, "-m", module],
-            input=json.dumps({"parent_pid": os.getpid(), "job": job}),
-            capture_output=True,
-            timeout=limit_s,
-            encoding="utf-8",
-            errors="replace",  # a library may print bytes of a damaged file
-            start_new_session=True,  # so that only the parent process receives Ctrl-C
-        )
-    except subprocess.TimeoutExpired:
-        raise EdgevprError(f"{what} took longer than {limit_s:g} s: it has no end, or is too slow here.") from None
+    with subprocess.Popen(
+        [sys.executable, "-m", module],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="replace",  # a library may print bytes of a damaged file
+        start_new_session=True,  # so that only the parent process receives Ctrl-C
+    ) as process:
+        try:
+            with turn or nullcontext():
+                out, err = process.communicate(json.dumps({"parent_pid": os.getpid(), "job": job}), limit_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise EdgevprError(f"{what} took longer than {limit_s:g} s: it has no end, or is too slow here.") from None
+        except BaseException:
+            process.kill()
+            raise
     if process.returncode < 0:
         hint = "memory ran out" if process.returncode == -signal.SIGKILL else "a library does not suit this processor"
         raise EdgevprError(f"{what} was ended by {signal.Signals(-process.returncode).name}: {hint}.")
     try:
-        reply = json.loads(process.stdout)
+        reply = json.loads(out)
     except ValueError:  # it failed, or a library has ended it
-        why = (process.stderr.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:200]
+        why = (err.strip().splitlines() or [f"exit code {process.returncode}"])[-1][:200]
         raise EdgevprError(f"{what} failed ({why}): install edgevpr and its packages again.") from None
     if reply["problem"]:
         raise EdgevprError(reply["problem"])

@@ -47,7 +47,7 @@ def tried(monkeypatch):
     """What was tried, by trials that take no time."""
     asked = []
 
-    def answer(module, job, limit_s, what):
+    def answer(module, job, limit_s, what, turn):
         asked.extend(each["label"] for each in job["trials"])
         if job["trials"][0]["name"] == "calc":
             raise EdgevprError("There is no model `calc`.")

@@ -30,7 +30,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _PICTURES = 2
 _PLACES = 6
-_TRIES = 8  # of each picture, at most
+_TRIES = 5  # of each picture, at most
 _STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded

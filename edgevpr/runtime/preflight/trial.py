@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import groupby
+from threading import Semaphore
 from typing import Any
 
 from edgevpr import techniques
@@ -68,19 +69,20 @@ def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
     Where cores and RAM allow, several techniques are tried at once, each with its own cores."""
     at_once = max(1, min(int(machine.cores()) // threads, int(machine.ram_limit_mb() // _TRIAL_MB)))
     of_each = [list(forms) for _, forms in groupby(wanted, lambda trial: trial.name)]
-    pool = ThreadPoolExecutor(at_once)
+    # The next child starts while another is measured: starting takes as long as measuring.
+    pool = ThreadPoolExecutor(at_once + (machine.cores() > 1))
     try:
-        for trials in pool.map(partial(_tried, threads), of_each):
+        for trials in pool.map(partial(_tried, threads, Semaphore(at_once)), of_each):
             yield from trials
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _tried(threads: int, forms: Sequence[Trial]) -> list[Trial]:
+def _tried(threads: int, turn: Semaphore, forms: Sequence[Trial]) -> list[Trial]:
     name = forms[0].name
     try:
         job = {"threads": threads, "trials": [asdict(each) for each in forms]}
-        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}")
+        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}", turn)
         return [build(Trial, each, "a trial") for each in answer]
     except EdgevprError as error:
         return [replace(forms[0], label=name, problem=str(error))]
