@@ -111,7 +111,8 @@ def probe(
         peak_is_new = machine.forget_peak()
         bench.fill(trial_map)
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
-        small = bench.tries(trial_map, index, 1)
+        # Of a technique with one stage the small map tells no more than how much memory a query takes.
+        small = bench.tries(trial_map, index, 1, _TRIES if spec.fine else 1)
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
         many = _many(technique, index)
         large = bench.tries(trial_map, many, candidates)
@@ -164,9 +165,9 @@ class _Bench:
         for _ in range(_PLACES):
             trial_map.add(self._frames[0], first.descriptor, landmarks=alone.landmarks(first))
 
-    def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> list[Steps]:
-        """Match each picture several times with `place_map`, of which `index` is in RAM and `candidates` places are
-        compared. Returns one `Steps` per picture: the least cost of every step."""
+    def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int, most: int = _TRIES) -> list[Steps]:
+        """Match each picture several times (`most` at most) with `place_map`, of which `index` is in RAM and
+        `candidates` places are compared. Returns one `Steps` per picture: the least cost of every step."""
         walk = self._walk(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
@@ -176,7 +177,7 @@ class _Bench:
         for _ in range(math.ceil((self.sequence - 1) / len(self._frames))):
             ask()  # the frames of the first rounds fill the sequence
         end_s, rounds = time.monotonic() + self._tried_s, [ask()]
-        while len(rounds) < _TRIES and time.monotonic() < end_s:
+        while len(rounds) < most and time.monotonic() < end_s:
             rounds.append(ask())
         return [
             Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in _STEPS})
