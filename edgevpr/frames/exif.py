@@ -18,8 +18,13 @@ Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSL
 
 _FILM_DIAGONAL_MM, _LONGEST_OF_DIAGONAL = 43.27, 0.82
 _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
-# A value in XMP, as an attribute or an element. The prefixes are those that DJI, Parrot and Pix4D write.
-_XMP = re.compile(rb"""((?:drone-dji|drone-parrot|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
+# A value in XMP, as an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
+_XMP = re.compile(rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
+_GIMBALS = (
+    "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree", "NED drone-skydio:{}"
+)  # fmt: skip
+# Skydio gives the same names to the angles of several frames: those against north, east and down count.
+_SKYDIO = re.compile(rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL)
 
 
 def read_exif(path: str | Path) -> GeoTag:
@@ -130,8 +135,8 @@ def _time_s(text: str) -> float:
 
 
 def read_xmp(path: str | Path) -> GeoTag:
-    """Read the XMP tags of DJI, Parrot and Pix4D from the first 300 KB of a file. Never raises: a value that is absent,
-    damaged or impossible is None.
+    """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
+    that is absent, damaged or impossible is None.
 
     The heading is that of the top of the picture, or if that is unknown, of the aircraft's nose. Roll and pitch are the
     deviation of the camera from straight down. The height is over the take-off point. Position and time are None.
@@ -139,9 +144,12 @@ def read_xmp(path: str | Path) -> GeoTag:
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)
-    values = {name.decode(): text for name, text in reversed(_XMP.findall(head))}  # the first of a name counts
-    height_m = _number(values, "drone-dji:RelativeAltitude", *ALT_M)
-    for name in ("drone-dji:Gimbal{}Degree", "drone-parrot:Camera{}Degree"):
+    values = _values(head)
+    if oriented := _SKYDIO.search(head):
+        values |= {f"NED {name}": text for name, text in _values(oriented[1]).items()}
+    heights = (_number(values, f"{maker}:RelativeAltitude", *ALT_M) for maker in ("drone-dji", "drone", "drone-skydio"))
+    height_m = next((known for known in heights if known is not None), None)
+    for name in _GIMBALS:
         # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
         if (angles := _yaw_pitch_roll(values, name)) and any(angles):
             heading_deg, roll_deg, pitch_deg = from_straight_down(*angles)
@@ -150,8 +158,13 @@ def read_xmp(path: str | Path) -> GeoTag:
     if (angles := _yaw_pitch_roll(values, "Camera:{}")) and any(angles):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    nose_deg = _number(values, "drone-dji:FlightYawDegree")
+    noses_deg = (_number(values, f"{maker}:FlightYawDegree") for maker in ("drone-dji", "drone"))
+    nose_deg = next((known for known in noses_deg if known is not None), None)
     return GeoTag(heading_deg=None if nose_deg is None else nose_deg % 360, height_m=height_m)
+
+
+def _values(packet: bytes) -> dict[str, bytes]:
+    return {name.decode(): text for name, text in reversed(_XMP.findall(packet))}  # the first of a name counts
 
 
 def _yaw_pitch_roll(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:

@@ -36,6 +36,12 @@ def read(tmp_path):
     return of
 
 
+def down(heading_deg, height_m):
+    """What is read of a camera that looks straight down."""
+    zero = pytest.approx(0, abs=1e-9)
+    return GeoTag(heading_deg=pytest.approx(heading_deg), roll_deg=zero, pitch_deg=zero, height_m=height_m)
+
+
 def gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
     return f'{maker}YawDegree="{yaw}" {maker}PitchDegree="{pitch}" {maker}RollDegree="{roll}"'
 
@@ -49,6 +55,28 @@ def test_a_photograph_of_dji(read, tmp_path):
     assert read_exif(tmp_path / "photo.jpg") == GeoTag(
         heading_deg=found.heading_deg, roll_deg=found.roll_deg, pitch_deg=found.pitch_deg, height_m=40.1
     )
+
+
+SKYDIO = {
+    "attributes": '<drone-skydio:CameraOrientationNED drone-skydio:Pitch="-90" drone-skydio:Roll="0" '
+    'drone-skydio:Yaw="75"/>',
+    "elements": '<drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Roll>0</drone-skydio:Roll>'
+    "<drone-skydio:Pitch>-90</drone-skydio:Pitch><drone-skydio:Yaw>75</drone-skydio:Yaw>"
+    "</drone-skydio:CameraOrientationNED>",
+}
+BODY = '<drone-skydio:CameraOrientationFLU drone-skydio:Pitch="1" drone-skydio:Roll="2" drone-skydio:Yaw="3"/>'
+
+
+@pytest.mark.parametrize("form", SKYDIO)
+def test_of_the_orientations_of_skydio_that_against_north_and_down_counts(read, form):
+    found = read(packet('drone-skydio:RelativeAltitude="42.5"', BODY + SKYDIO[form] + BODY))
+    assert found == down(75, 42.5)
+
+
+def test_autel_writes_what_dji_writes_under_another_name(read):
+    found = read(packet('drone:RelativeAltitude="51.2" ' + gimbal(75, -90, 0, "drone:Gimbal")))
+    assert found == down(75, 51.2)
+    assert read(packet('drone:FlightYawDegree="-60"')).heading_deg == 300
 
 
 @pytest.mark.parametrize(
