@@ -171,6 +171,9 @@ class FakeLink:
     def offer(self, wishes) -> None:
         self._offered = wishes
 
+    def take_between(self):
+        return []
+
     def take_wishes(self) -> tuple[Wished, ...]:
         wishes, self._wishes = tuple(self._wishes), []
         return wishes

@@ -75,12 +75,12 @@ _ODOMETRY = {
     "EK3_SRC2_VELZ": 0,
     "EK3_SRC2_YAW": 1,
 }
-_GIMBAL = {"source": {"gimbal": True}}
 
 SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),
+    "plane_rare": Scenario(wind_m_s=6.0, config={"source": {"rate_hz": 0.1}}, is_compared=False),
     "plane_still": Scenario(),
-    "plane_level": Scenario(wind_m_s=6.0, is_level=True, config=_GIMBAL),
+    "plane_level": Scenario(wind_m_s=6.0, is_level=True, config={"source": {"gimbal": True}}),
     "plane_mjpeg": Scenario(wind_m_s=6.0, is_stamped=False, is_compared=False),
     "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
     "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),

@@ -28,6 +28,7 @@ MESSAGES_MAX = 64
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
+BETWEEN_S = 1.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 
@@ -66,6 +67,7 @@ class Conversation:
         self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener)
         self.fixes, self.texts, self.requests = Fixes(settings.max_fix_age_s), Texts(), Requests()
         self.reader = PacketReader(settings.signing.admits, tap=settings.tap)
+        self.between: deque[Sending] = deque(maxlen=MESSAGES_MAX)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0
         self.copy_message: Callable[[Message], None] = lambda message: None
@@ -74,7 +76,7 @@ class Conversation:
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
-        self._heartbeat_due_s = self._state_due_s = clock()
+        self._heartbeat_due_s = self._state_due_s = self._between_due_s = clock()
         self._ask_position_s: float | None = None  # when to request its reports next; None: not wanted
         self._asked_for_state = False
         self._told_channel = self.channel  # the channel that the listener knows
@@ -101,7 +103,15 @@ class Conversation:
 
     def send_fix(self, fix: Fix) -> Sending:
         """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is heard, or never."""
-        return self.fixes.put(fix, self._clock())
+        now_s = self._clock()
+        self._between_due_s = now_s + BETWEEN_S
+        return self.fixes.put(fix, now_s)
+
+    def take_between(self) -> list[Sending]:
+        """Return the fixes sent between matches since the last call."""
+        taken = list(self.between)
+        self.between.clear()
+        return taken
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Queue a text for the people on the ground, one in five seconds. `topic`: what it is about (see `Texts`)."""
@@ -222,7 +232,7 @@ class Conversation:
                 return state, None
             if why := PAUSED if self.requests.is_paused else self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
-            elif sending := self.fixes.next(now_s):
+            elif sending := self.fixes.next(now_s) or self._between(now_s):
                 if self.channel is Channel.SENSOR:
                     return messages.position_sensor(sending.fix, now_s), sending
                 return messages.position_fix(sending.fix, now_s, system_id), sending
@@ -231,6 +241,17 @@ class Conversation:
         if text := self.texts.next(now_s):
             return text, None  # not by `send`, which copies to the ground's link: that has its own texts
         return (self._messages.popleft(), None) if self._messages else None
+
+    def _between(self, now_s: float) -> Sending | None:
+        """Return a fix that no match asks for, where one is due and helps. By it ArduPilot moves its position, and not
+        its velocity (NavEKF3, setLatLng). PX4 may move both: there a fix without a match would confirm itself."""
+        is_due = now_s >= self._between_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+        if not is_due or not (fix := self.settings.listener.fix_between(now_s)):
+            return None
+        self.send_fix(fix)
+        if sending := self.fixes.next(now_s):
+            self.between.append(sending)
+        return sending
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel, if any: a position or, once, the origin of its local frame."""

@@ -122,6 +122,7 @@ class Link:
     send_fix = _in_turn(Conversation.send_fix, sends=True)
     announce = _in_turn(Conversation.announce, sends=True)
     offer = _in_turn(Conversation.offer)
+    take_between = _in_turn(Conversation.take_between)
     take_wishes = _in_turn(Conversation.take_wishes)
     set_health = _in_turn(Conversation.set_health)
     want_position = _in_turn(Conversation.want_position)

@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
-from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, MotionState
+from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.vehicle import GPS_GONE_AFTER_S, GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -105,6 +105,10 @@ class Listener:
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
+        return None
+
+    def fix_between(self, now_s: float) -> Fix | None:
+        """Return a fix to be sent between two matches, where fixes are single; None: it would not help."""
         return None
 
 

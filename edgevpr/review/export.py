@@ -5,9 +5,9 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
-from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, text
+from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, point, text
 
-# A point to export: its `kind` ("match", "fix", "autopilot" or "gps"), position and properties.
+# A point to export: its `kind` ("match", "fix", "between", "autopilot" or "gps"), position and properties.
 Feature = dict[str, Any]
 
 _PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others are its properties
@@ -15,8 +15,13 @@ _PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others a
 
 def features_of(flight: LoggedFlight) -> list[Feature]:
     """Return the points of a flight: for every query the accepted match, the fix made from it, and the positions by
-    autopilot and GPS receiver."""
-    return [feature for query in flight.queries for feature in _of_query(query)]
+    autopilot and GPS receiver; and the fixes sent between matches."""
+    features = [feature for query in flight.queries for feature in _of_query(query)]
+    for line in flight.between:
+        if at := point(line):
+            known = {"time": text(line, "time") or "", "accuracy_m": number(line, "accuracy_m")}
+            features.append(_feature("between", at, known))
+    return features
 
 
 def _of_query(query: LoggedQuery) -> Iterator[Feature]:

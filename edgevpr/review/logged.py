@@ -74,8 +74,8 @@ class LoggedQuery:
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
-    `learnt` the positions of places learnt in flight. Times are seconds after its start; it is
-    `span_s` long."""
+    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
+    seconds after its start; it is `span_s` long."""
 
     path: Path
     start: dict[str, Any] = field(default_factory=dict)
@@ -84,6 +84,7 @@ class LoggedFlight:
     remarks: list[tuple[float, str, str]] = field(default_factory=list)
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
+    between: list[dict[str, Any]] = field(default_factory=list)
     span_s: float = 0.0
 
 
@@ -124,6 +125,8 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
             flight.unusable.append(t_s)
         elif kind == "learnt":
             flight.learnt += filter(None, [point(line, "position")])
+        elif kind == "between":
+            flight.between += [line] if point(line) else []
         else:
             flight.remarks.append((t_s, str(kind), _words(line)))
     return flight

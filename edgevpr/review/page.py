@@ -70,7 +70,7 @@ def page_of(
     fixes = [query.fix for query in queries if query.fix and query.fix.outcome is not FixOutcome.CONTINUOUS]
     above = [
         heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
-        section("", _figures(queries)),
+        section("", _figures(queries, len(flight.between))),
         notes(_notes(flight, bool(ground), no_ground)),
     ]
     below = [
@@ -109,7 +109,7 @@ def lens_of(start: Mapping[str, Any]) -> "Lens | None":
     return Lens(fov_deg, up_deg or 0.0)
 
 
-def _figures(queries: Sequence[LoggedQuery]) -> str:
+def _figures(queries: Sequence[LoggedQuery], between: int) -> str:
     outcomes = Counter(query.fix.outcome for query in queries if query.fix)
     sent = sum(outcomes[outcome] for outcome in (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED))
     accepted = sum(query.accepted for query in queries)
@@ -118,7 +118,7 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
     known = {
         "queries": str(len(queries)),
         "accepted": f"{accepted}{share}",
-        "fixes sent": str(sent),
+        "fixes sent": f"{sent} <small>and {between} between matches</small>" if between else str(sent),
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
         "from GPS, median": figure(median(off_m) if off_m else None, "m"),
         "from GPS, most": figure(max(off_m, default=None), "m"),

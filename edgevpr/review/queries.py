@@ -8,7 +8,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import nines
 from edgevpr.core.types import Place
 from edgevpr.review.html import clock, figure
-from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, Point, number, value
+from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, Point, number, point, value
 from edgevpr.review.overhead import Layer, at_of
 from edgevpr.review.steps import NUMBER, ByConfidence, Step
 
@@ -65,6 +65,7 @@ def layers_of(ground: Sequence[Place], flight: LoggedFlight, gps: str = "GPS") -
         Layer("places of the map", "places", [[at_of(place) for place in ground]]),
         Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
         Layer("places learnt", "learnt", [flight.learnt]),
+        Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
         Layer(gps, "gps", _known_ways(query.gps_at for query in queries), "line"),
         Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), "line"),
         Layer("refused there", "missed", [[at for query in queries if (at := _missed_at(query))]]),

@@ -1,13 +1,14 @@
 """The channel by which an autopilot is told positions: asked for, chosen, and used."""
 
 import struct
+from dataclasses import replace
 
 import pytest
 from conversing import Autopilot
 
 from edgevpr.core.types import Position
 from edgevpr.mavlink.channel import Channel, Kind, ardupilot_choice, px4_choice
-from edgevpr.mavlink.messages import MotionState
+from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.wire import mavlink
 
@@ -57,7 +58,7 @@ def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
 
 class Ear(Listener):
     def __init__(self):
-        self.channels, self.forces, self.state = [], [], STATE
+        self.channels, self.forces, self.state, self.between = [], [], STATE, None
 
     def hear_channel(self, channel):
         self.channels.append(channel)
@@ -67,6 +68,9 @@ class Ear(Listener):
 
     def state_at(self, t_s):
         return self.state
+
+    def fix_between(self, now_s):
+        return self.between and replace(self.between, t_frame_s=now_s)
 
 
 def interviewed(firmware=ARDUPILOT, parameters=None, seconds=10, **settings):
@@ -148,3 +152,23 @@ def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float():
     sending = autopilot.put_fix()
     assert "GLOBAL_POSITION_SENSOR" in {message.get_type() for message in autopilot.told()}
     assert sending.outcome.result is None
+
+
+def test_between_matches_a_fix_is_sent_where_none_has_been_for_a_second_and_a_half():
+    autopilot, ear = interviewed()
+    assert sent(autopilot, "COMMAND_INT", 3.0) == []
+    ear.between = Fix(47.0, 8.0, 9.0, 0.0)
+    autopilot.beat()
+    assert [each.x for each in sent(autopilot, "COMMAND_INT", 4.6)] == [470_000_000] * 4
+    assert len(autopilot.conversation.take_between()) == 4
+    assert autopilot.conversation.take_between() == []
+    autopilot.beat()
+    autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
+    assert [each.x for each in sent(autopilot, "COMMAND_INT", 1.4)] == [500_000_000], "a match has just been sent"
+
+
+def test_an_autopilot_whose_velocity_follows_a_fix_gets_none_between_matches():
+    autopilot, ear = interviewed(PX4)
+    ear.between = Fix(47.0, 8.0, 9.0, 0.0)
+    autopilot.beat()
+    assert sent(autopilot, "COMMAND_INT", 4.0) == []

@@ -39,6 +39,14 @@ def test_a_match_says_where_it_is_and_what_is_known_of_it(tmp_path):
     assert (row["lat_deg"], row["lon_deg"], row["score"]) == ("-33.50000000", "151.25000000", "0.5")
 
 
+def test_a_fix_between_matches_is_a_point_too(tmp_path):
+    between = {"lat_deg": 50.0, "lon_deg": 8.0, "accuracy_m": 4.5}
+    flight = read_flight(write_log(tmp_path / "log", ("query", query("a")), ("between", between), ("between", {})))
+    (found,) = [each for each in features_of(flight) if each["kind"] == "between"]
+    assert found.items() >= between.items()
+    assert not flight.remarks
+
+
 def test_a_name_of_any_characters_is_written(tmp_path):
     name = 'a\x00\x1b<b>&"\ud800'
     features = features_of(read_flight(write_log(tmp_path / "log", ("query", query(name)))))

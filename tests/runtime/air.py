@@ -11,6 +11,8 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
+from edgevpr.mavlink.conversation import BETWEEN_S
+from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -85,6 +87,7 @@ class Air:
         self.sees, self.takes_fixes, self.events = True, True, []
         self.advices: list[tuple[float, Advice]] = []
         self.errors_m, self.states = [], []  # of the autopilot once a second; of a continuous channel
+        self.between, self.between_due_s = [], 0.0  # fixes that no match asked for, and their errors
 
     @property
     def t_s(self) -> float:
@@ -128,6 +131,9 @@ class Air:
                 self.waiting.append((self.step, self.vehicle))
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
                 self.match(*self.waiting.popleft())
+            if self.t_s >= self.between_due_s and (fix := self.navigator.fix_between(self.t_s)):
+                self.between.append((fix, self.off(fix.lat_deg, fix.lon_deg)))
+                self.take(fix)
             if self.step % 50 == 0:
                 self.errors_m.append(self.off_m)
         return self
@@ -142,11 +148,16 @@ class Air:
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))
-        if advice.fix and self.takes_fixes:
-            fix = advice.fix
+        if advice.fix:
+            self.take(advice.fix)
+        return advice
+
+    def take(self, fix: Fix) -> None:
+        """Take a fix, as the autopilot does that gets it."""
+        self.between_due_s = self.t_s + BETWEEN_S
+        if self.takes_fixes:
             self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s
-        return advice
 
     def match_now(self, **changes) -> Advice:
         return self.match(self.step, self.vehicle, **changes)

@@ -11,6 +11,7 @@ from edgevpr.core.types import FixReport
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.messages import Fix
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
@@ -80,8 +81,12 @@ class ToAutopilot:
         time, or was given up before it was sent. Its fields that need a word:
         - result: name of a MAV_RESULT (null: no answer); why: the reason, in words (null: the fix was accepted)
         - latency_ms: from sending to answer (null: no answer); t_sent_s: time of sending, on the clock of t_mono_s.
+
+        And one of kind "between" for each fix sent between two matches, with its position.
         """
         with self._link.turn("answers"):
+            for sending in self._link.take_between():
+                self._herald.note("between", t_sent_s=sending.t_sent_s, **_place_of(sending.fix))
             # An answer can arrive a moment before the link has noted that the fix was sent.
             settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
             for query, sending in settled:
@@ -205,16 +210,18 @@ class SourceSets:
 
 
 def _reported(query: str, sending: Sending) -> FixReport:
-    fix = sending.fix
     return FixReport(
         query=query,
         sent=sending.sent,
         why=sending.why,
         answer=sending.answer,
-        lat_deg=round(fix.lat_deg, 7),
-        lon_deg=round(fix.lon_deg, 7),
-        accuracy_m=round(fix.accuracy_m, 2),
+        **_place_of(sending.fix),
     )
+
+
+def _place_of(fix: Fix) -> dict[str, float]:
+    at = {"lat_deg": round(fix.lat_deg, 7), "lon_deg": round(fix.lon_deg, 7)}
+    return {**at, "accuracy_m": round(fix.accuracy_m, 2)}
 
 
 def unsent(event: Recognition, why: str) -> FixReport:

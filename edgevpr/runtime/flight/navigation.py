@@ -184,6 +184,10 @@ class Consistency:
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
 
+    def is_contradicted(self, now_s: float) -> bool:
+        """Return True while the last fix contradicts what is expected, and another one may still agree with it."""
+        return self._held is not None and now_s - self._held.seen.t_s <= _GOOD_FOR_S
+
     def weighed(self, fix: ComparedFix, has_gps: bool) -> tuple[str | None, bool]:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Return why the fix is not
         believed (None: it is), and True if it contradicts the expected position but an earlier fix agrees with it."""

@@ -13,6 +13,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
@@ -64,7 +65,7 @@ class Navigator(Listener):
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False) -> None:
         self._is_muted = is_muted
         self._lock = Lock()
-        self._map_sd_m, self._every_s = map_sd_m, every_s
+        self._map_sd_m, self._next_s = map_sd_m, min(every_s, BETWEEN_S)  # from one fix to the next
         self._navigation = Navigation(RECKONED, map_sd_m)
         self._consistency = Consistency()
         self._slew = Slew()
@@ -132,6 +133,19 @@ class Navigator(Listener):
                 return Advice(None, objection, is_held=True)
             self._navigation.hear_fix(compared, is_against)
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
+
+    def fix_between(self, now_s: float) -> Fix | None:
+        """Return a fix by what the matches before have shown, for the time in which none is accepted; None where the
+        autopilot is no better off with it, or a match has contradicted what is known."""
+        with self._lock:
+            vehicle = self._vehicle
+            if self._is_muted or self._channel is not Channel.COMMAND or self._consistency.is_contradicted(now_s):
+                return None
+            if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
+                return None
+            if self._known(now_s) is None:
+                return None
+            return self._improved(vehicle, vehicle.velocity_m_s, now_s).fix
 
     def knows_position(self, now_s: float) -> bool:
         """Tell whether the position is known well enough to be sent through a continuous channel."""
@@ -206,7 +220,7 @@ class Navigator(Listener):
             )
         # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
         # is off by this lead, in one direction: half of its square is added to the variance of each axis.
-        ahead_m = [self._every_s / 2 * each for each in self._navigation.path_drift_m_s()]
+        ahead_m = [self._next_s / 2 * each for each in self._navigation.path_drift_m_s()]
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
 

@@ -66,4 +66,6 @@ def test_a_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
         assert not flown.heard_of("GPS_INPUT")
         flown.sees = False
         flown.fly(20)
+        assert flown.controller.error_m < 40, "the wind that matches have shown carries on"
+        flown.fly(60)
         assert flown.controller.error_m > 50, "alone it drifts away"
