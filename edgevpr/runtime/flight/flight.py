@@ -90,7 +90,8 @@ class Flight:
                 found = look_ahead(recogniser, config, world)
             flight_log.write("start", **say_start(config, world, recogniser, found))
             step_s = 1 / rate_hz(config, recogniser)
-            navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted=not config.mavlink.send_fixes)
+            is_muted, is_level = not config.mavlink.send_fixes, config.source.gimbal
+            navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted, is_level)
             link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
             source, source_uri = world.open_source(step_s), config.source.uri
             stack.callback(source.close)

@@ -43,13 +43,14 @@ class Whereabouts:
 class PositionedMatch:
     """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
     to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
-    from."""
+    from; `lean_s2`, how far an error of the attitude moves it (see `path._seen`)."""
 
     t_s: float
     position: Position
     accuracy_m: float
     covariance_m2: Doubles
     places: tuple[int, ...]
+    lean_s2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +121,7 @@ class Navigation:
         there = path.at(seen.t_s) if path else None
         if path is None or there is None:
             return None
-        expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s)
+        expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s, seen.lean_s2)
         off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
         return ComparedFix(
             seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
@@ -130,7 +131,7 @@ class Navigation:
         """Correct our position by a fix. `is_against`: it contradicts what was expected (see `Consistency`)."""
         if self._path:
             hear = self._filter.trust_fix if is_against else self._filter.hear_fix
-            hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s)
+            hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s, fix.seen.lean_s2)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:

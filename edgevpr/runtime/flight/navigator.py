@@ -26,7 +26,7 @@ from edgevpr.runtime.flight.navigation import (
     reckons_by_gps,
     worst_sd,
 )
-from edgevpr.runtime.flight.path import INERTIAL, RECKONED, over_ground
+from edgevpr.runtime.flight.path import GRAVITY_M_S2, INERTIAL, RECKONED, over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviations that are added to that of a fix: the attitude is known to half a degree, and the time of a frame
@@ -60,10 +60,10 @@ class Advice:
 class Navigator(Listener):
     """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
     standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
-    dry run, no continuous position is given."""
+    dry run, nothing is given but advice. `is_level`: the camera hangs in a gimbal, whatever the airframe's attitude."""
 
-    def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False) -> None:
-        self._is_muted = is_muted
+    def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
+        self._is_muted, self._is_level = is_muted, is_level
         self._lock = Lock()
         self._map_sd_m, self._next_s = map_sd_m, min(every_s, BETWEEN_S)  # from one fix to the next
         self._navigation = Navigation(RECKONED, map_sd_m)
@@ -123,7 +123,8 @@ class Navigator(Listener):
                 return self._unheard(fix, now_s)
             if vehicle.velocity_m_s is None:
                 return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
-            seen = replace(seen, covariance_m2=_covariance(seen, event.vehicle or vehicle))
+            told = event.vehicle or vehicle
+            seen = replace(seen, covariance_m2=_covariance(seen, told), lean_s2=self._lean_s2(event, told))
             compared = self._navigation.compared(seen)
             if compared is None:
                 self._navigation.begin(seen.position, worst_sd(seen.covariance_m2), seen.t_s, vehicle.t_heard_s)
@@ -189,6 +190,13 @@ class Navigator(Listener):
             return Advice(None, _UNHEARD)
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
         return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
+
+    def _lean_s2(self, event: Recognition, vehicle: Vehicle) -> float:
+        """Return how far an error of the attitude moves the fix of a match, see `path._seen`: not where the path rests
+        on no attitude, and not where the picture's lean comes from none."""
+        leans = event.view.aside or event.view.lean_m
+        is_apart = self._is_level or not self._channel.is_continuous or vehicle.roll_deg is None
+        return 0.0 if is_apart or not leans else (vehicle.height_m or 0.0) / GRAVITY_M_S2
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)

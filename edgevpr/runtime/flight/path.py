@@ -15,6 +15,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
+GRAVITY_M_S2 = 9.80665
 KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
 _LONGEST_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
@@ -168,21 +169,22 @@ class DriftFilter:
         look[:2, _C] = look[2:, _S] = _EYE
         self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
 
-    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
-        """Correct the state by a fix of covariance (2, 2) that lay `off_m` (2,) metres from the path `age_s` ago."""
-        self._correct(_seen(age_s), off_m, covariance_m2)
+    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float, lean_s2: float) -> None:
+        """Correct the state by a fix of covariance (2, 2) that lay `off_m` (2,) metres from the path `age_s` ago. See
+        `_seen` for `lean_s2`."""
+        self._correct(_seen(age_s, lean_s2), off_m, covariance_m2)
 
-    def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float) -> None:
+    def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float, lean_s2: float) -> None:
         """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
-        self.hear_fix(off_m, covariance_m2, age_s)
+        self.hear_fix(off_m, covariance_m2, age_s, lean_s2)
 
-    def expected_fix(self, age_s: float) -> tuple[Doubles, Doubles]:
+    def expected_fix(self, age_s: float, lean_s2: float) -> tuple[Doubles, Doubles]:
         """Predict a fix of a frame taken `age_s` seconds ago. Returns its offset (2,) from the path, metres, and the
-        covariance (2, 2) of this prediction, without that of the fix itself."""
-        look = _seen(age_s)
+        covariance (2, 2) of this prediction, without that of the fix itself. See `_seen` for `lean_s2`."""
+        look = _seen(age_s, lean_s2)
         return look @ self._x, look @ self._p @ look.T
 
     def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
@@ -206,6 +208,11 @@ class DriftFilter:
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
 
-def _seen(age_s: float) -> Doubles:
-    """Return the measurement matrix (2, 8) of a fix of a frame taken `age_s` seconds ago."""
-    return np.hstack([_EYE, -age_s * _EYE, age_s**2 / 2 * _EYE, _EYE])
+def _seen(age_s: float, lean_s2: float = 0.0) -> Doubles:
+    """Return the measurement matrix (2, 8) of a fix of a frame taken `age_s` seconds ago.
+
+    `lean_s2` is the height above the ground over gravity (0: the fix rests on no attitude). An error of the autopilot's
+    attitude turns a part of gravity into acceleration over the ground, which `b` makes up for, and moves the point that
+    is taken to be under the aircraft: by the height over gravity times as much, and the other way.
+    """
+    return np.hstack([_EYE, -age_s * _EYE, (age_s**2 / 2 - lean_s2) * _EYE, _EYE])
