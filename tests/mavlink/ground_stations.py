@@ -54,8 +54,9 @@ class Router:
                 self._pass(b"\n", self._autopilot)  # it listens, and speaks to who has spoken
             for ready in select.select([self._companion, self._autopilot, self._ground], [], [], 0.1)[0]:
                 try:
-                    data, sender = ready.recvfrom(CHUNK)
-                except ConnectionRefusedError:  # the ground station has not opened its port yet, or has ended
+                    # Without waiting: the error that made it ready may have gone to a `send` meanwhile.
+                    data, sender = ready.recvfrom(CHUNK, socket.MSG_DONTWAIT)
+                except (ConnectionRefusedError, BlockingIOError):  # the ground station is not there yet, or has ended
                     continue
                 if ready is self._companion:
                     self._to_companion = sender
