@@ -35,7 +35,8 @@ def killed(tmp_path_factory):
 def test_the_log_of_a_map_is_what_these_tests_take_it_for(killed):
     log = killed.with_name("killed.gpkg-wal").read_bytes()
     assert len(log) > HEADER + PLACES * FRAME
-    assert (len(log) - HEADER) % FRAME == 0
+    # By its own header: the process may have been killed within a page.
+    assert int.from_bytes(log[8:12], "big") + 24 == FRAME
 
 
 def cuts(length: int) -> Iterator[int]:
