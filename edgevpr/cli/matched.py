@@ -24,9 +24,9 @@ def match_of(event: "Recognition") -> dict[str, Any]:
     is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
     """
     from edgevpr.core.geodesy import distance_m
-    from edgevpr.runtime.recognise.recognition import fields_of
+    from edgevpr.runtime.recognise.recognition import unrounded_fields_of
 
-    fields = fields_of(event)
+    fields = unrounded_fields_of(event)
     number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
     accuracy_m, fix = fields.pop("accuracy_m"), fields.pop("located")
     tag, from_tag_m = event.frame and event.frame.position, None
@@ -43,9 +43,7 @@ def match_of(event: "Recognition") -> dict[str, Any]:
         "from_gps_tag_m": from_tag_m,
         "place": None if number is None else {"number": number, "image": image, **(at or nowhere)},
     }
-    # The log rounds it to six digits, which make 1 of what is nearly sure.
-    sure = {} if event.confidence is None else {"confidence": event.confidence}
-    return first | fields | sure
+    return first | fields
 
 
 def of_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -136,6 +136,15 @@ def resized(image: Image, size_px: tuple[int, int]) -> Image:
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
+def shrunk(image: Image, shrink: float) -> Image:
+    """Scale a picture down until `shrink` of its pixels along a side have become one: before a warp, whose
+    interpolation alone would ignore most pixels. Up to two it stays as it is."""
+    if shrink <= 2:
+        return image
+    height, width = image.shape[:2]
+    return resized(image, (max(1, round(width / shrink)), max(1, round(height / shrink))))
+
+
 def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
     return cv2.imencode(extension, image, options)[1].tobytes()
 

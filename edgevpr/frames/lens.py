@@ -20,7 +20,7 @@ from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.files import read_file
 from edgevpr.core.yamlfile import parsed_yaml
-from edgevpr.frames.images import resized
+from edgevpr.frames.images import shrunk
 
 _MOST_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
 # What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
@@ -136,15 +136,12 @@ class Remap:
 
     def picture(self, image: Image) -> Image:
         """Warp the camera's picture. Outside of it its edge is repeated, so that no gradient arises."""
-        pixels = self.pixels
-        if self.shrink > 2:  # averaged first, since interpolation alone would ignore most pixels
-            height, width = image.shape[:2]
-            small = max(1, round(width / self.shrink)), max(1, round(height / self.shrink))
-            image = resized(image, small)
+        small, pixels = shrunk(image, self.shrink), self.pixels
+        if small is not image:
             pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
-            pixels *= np.array([small[0] / width, small[1] / height], np.float32)
+            pixels *= np.array([small.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
-        return _remapped(image, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        return _remapped(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _remapped(image: Image, pixels: Singles, how: int, border: int) -> Image:

@@ -14,7 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.images import resized
+from edgevpr.frames.images import shrunk
 from edgevpr.frames.lens import CalibratedLens, Remap, sight_of
 
 MOST_TILT_DEG = 45.0
@@ -263,14 +263,11 @@ class _Homography:
         )
 
     def picture(self, image: Image) -> Image:
-        out_from_pixel = self._out_from_pixel
-        if self._shrink > 2:  # averaged first, since a warp alone would ignore most pixels
-            height, width = image.shape[:2]
-            small = max(1, round(width / self._shrink)), max(1, round(height / self._shrink))
-            across, along = width / small[0], height / small[1]
-            image = resized(image, small)
+        small, out_from_pixel = shrunk(image, self._shrink), self._out_from_pixel
+        if small is not image:
+            along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
         # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
-            image, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )

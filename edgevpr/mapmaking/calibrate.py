@@ -19,7 +19,8 @@ from datetime import date
 import numpy as np
 from scipy.optimize import minimize
 
-from edgevpr.core.arrays import Bools, Doubles
+from edgevpr.core.arrays import Bools, Doubles, Image
+from edgevpr.core.arrays import Mask as Shown
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
@@ -46,6 +47,7 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recognition import Recognition
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
@@ -105,14 +107,7 @@ def ask(
             if not len(among):
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
-            walk = Recogniser(
-                Matcher(technique, among, rule),
-                place_map,
-                meter,
-                WalkSettings(candidates=technique.candidates),
-                preparation=Preparation(mask=None if shown is None else Mask(shown, sha256="")),
-            )
-            event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
+            event = looked_for(place_id, image, shown, Matcher(technique, among, rule), place_map, meter)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
@@ -122,6 +117,17 @@ def ask(
                 continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
             yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
+
+
+def looked_for(
+    place_id: int, image: Image, shown: Shown | None, matcher: Matcher, place_map: PlaceMap, meter: QueryMeter
+) -> Recognition:
+    """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
+    shows no ground (None: it shows ground everywhere)."""
+    prepared = Preparation(mask=None if shown is None else Mask(shown, sha256=""))
+    settings = WalkSettings(candidates=matcher.technique.candidates)
+    walk = Recogniser(matcher, place_map, meter, settings, preparation=prepared)
+    return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
 
 def calibrate(

@@ -8,16 +8,14 @@ import numpy as np
 
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame
-from edgevpr.frames.mask import Mask as MaskFile
-from edgevpr.mapmaking.calibrate import overlap_m, same_ground
+from edgevpr.mapmaking.calibrate import looked_for, overlap_m, same_ground
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of, technique_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Matcher
 
 LEAST = 0.1  # confidence from which a place elsewhere looks alike
 
@@ -36,12 +34,12 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
     places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
     not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
     cannot be read."""
-    technique, config, board = technique_of(place_map), load_config(None, {}), load_board("this")
+    technique, config = technique_of(place_map), load_config(None, {})
     if not kinds_of(technique.spec):
         return
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     rule = accept_rule(technique, config.match, 1, calibration_of(place_map))
-    near_m = overlap_m(place_map, index, rule)
+    near_m, meter = overlap_m(place_map, index, rule), meter_of(config, load_board("this"))
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, image, mask in pictures:
         slot = slots.get(place_id)
@@ -50,12 +48,7 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         away = index.only(~same_ground(index, slot, near_m))
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
             continue
-        matcher, meter = Matcher(technique, away, rule), meter_of(config, board)
-        prepared = Preparation(mask=None if mask is None else MaskFile(mask, sha256=""))
-        walk = Recogniser(
-            matcher, place_map, meter, WalkSettings(candidates=technique.candidates), preparation=prepared
-        )
-        event = walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
+        event = looked_for(place_id, image, mask, Matcher(technique, away, rule), place_map, meter)
         if event.best is None or event.confidence is None or event.confidence < LEAST:
             yield None
         else:

@@ -248,10 +248,8 @@ class Conversation:
         is_due = now_s >= self._between_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         if not is_due or not (fix := self.settings.listener.fix_between(now_s)):
             return None
-        self.send_fix(fix)
-        if sending := self.fixes.next(now_s):
-            self.between.append(sending)
-        return sending
+        self.between.append(self.send_fix(fix))
+        return self.fixes.next(now_s)
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel, if any: a position or, once, the origin of its local frame."""

@@ -144,7 +144,7 @@ class Navigator(Listener):
                 return None
             if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
                 return None
-            if self._known(now_s) is None:
+            if reckons_by_gps(vehicle) or self._known(now_s) is None:
                 return None
             return self._improved(vehicle, vehicle.velocity_m_s, now_s).fix
 

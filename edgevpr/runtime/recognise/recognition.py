@@ -70,6 +70,11 @@ class Recognition:
         return self.descriptor is not None
 
 
+def unrounded_fields_of(event: Recognition) -> dict[str, Any]:
+    """Return the fields of `fields_of`, with the confidence as it is: six digits make 1 of what is nearly sure."""
+    return fields_of(event) | ({} if event.confidence is None else {"confidence": event.confidence})
+
+
 def fields_of(event: Recognition) -> dict[str, Any]:
     """Return the event as a dict for the flight log (kind "query"). `edgevpr match --json` is made of it too.
 
