@@ -1,6 +1,7 @@
 """`edgevpr calibrate-camera`: the calibration of a lens with distortion, from pictures of a chequerboard."""
 
-from argparse import Namespace
+import re
+from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -64,11 +65,13 @@ def calibrate_camera(args: Namespace) -> int:
 
 
 def _board(text: str) -> tuple[int, int]:
-    """Read "9x6", as the `type` of a flag. Raises ValueError for other texts, and fewer corners than can be found."""
-    columns, rows = map(int, text.split("x"))
-    if min(columns, rows) < 3:
-        raise ValueError
-    return columns, rows
+    """Read "9x6", as the `type` of a flag. Raises ArgumentTypeError for other texts, and fewer corners than can be
+    found."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    board = (int(found[1]), int(found[2])) if found else (0, 0)
+    if min(board) < 3:
+        raise ArgumentTypeError(f"`{text}` is no number of inner corners: write for example 9x6, at least 3x3")
+    return board
 
 
 def _frames(args: Namespace, unusable: list[ImageError]) -> "Iterator[Frame]":
