@@ -245,7 +245,7 @@ class FakeLink:
             return
         while (sending := self._waiting.next(self._clock())) is not None:
             self._fixes.append(sending.fix)
-            self._waiting.note_sent(sending, self._clock(), has_answer=True)
+            self._waiting.note_sent(sending, self._clock())
             sending.settle(True)
             self._waiting.hear(self.answer, Readiness(gps_s=0.0).why(self.answer, 0.0), self._clock())
             self._acks[self.answer] += 1

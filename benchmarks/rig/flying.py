@@ -13,15 +13,15 @@ from typing import Any
 import base
 import ground
 from camera import Camera
+from px4 import COMPANION_PORTS, GROUND_ALT_M, Px4
 from recording import Recorder
-from relay import Relay
+from relay import DatagramRelay, Relay
 from scenarios import (
     CIRCUIT_M,
     CLIMB_M,
     COPTER_CIRCUIT_M,
     COPTER_HOME_M,
     COPTER_SPEED_M_S,
-    HEIGHT_M,
     HOME_M,
     VEHICLE_PARAMETERS,
     WIND_FROM_DEG,
@@ -45,7 +45,7 @@ class Run:
         self._folder = work / "runs" / (f"{name}-control" if is_control else name)
         shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True)
-        self._truth = Truth()
+        self._truth = Truth(GROUND_ALT_M if scenario.is_px4 else ground.GROUND_ALT_M)
         self._recorder = Recorder(self._truth, self._folder / "track.csv")
         self._edgevpr: subprocess.Popen | None = None
         self._marks_s: dict[str, float] = {}
@@ -55,18 +55,22 @@ class Run:
         """Fly the scenario. Raises RuntimeError where that cannot be done."""
         scenario, folder, own = self._scenario, self._folder, {} if self._is_control else self._scenario.with_edgevpr
         home_m = COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M
-        parameters = {**VEHICLE_PARAMETERS[scenario.vehicle], **scenario.parameters, **own}
+        parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters, **own}
         listeners = [self._truth.listen, self._recorder.listen]
-        place_map = ground.place_map(self._work)
+        place_map = ground.place_map(self._work, scenario.height_m)
+        make = Px4 if scenario.is_px4 else Simulator
         with ExitStack() as stack:
             stack.callback(self._recorder.close)
-            simulator = Simulator(scenario.vehicle, folder / "simulator", home_m, parameters, listeners)
+            simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners)
             self._simulator = stack.enter_context(simulator)
             if not self._is_control:
                 lit, stream = ground.lit_ground(self._work, "later"), (scenario.is_level, scenario.is_stamped)
                 camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", *stream))
-                relay = stack.enter_context(Relay(self._truth, folder / "sent.csv", COMPANION_PORT, home_m))
-                config = self._config(folder / "learnt.gpkg" if scenario.learns else place_map, camera.uri, relay.port)
+                between = DatagramRelay, COMPANION_PORTS, "udpin"
+                relay_of, ports, kind = between if scenario.is_px4 else (Relay, COMPANION_PORT, "tcp")
+                relay = stack.enter_context(relay_of(self._truth, folder / "sent.csv", ports, home_m))
+                link = f"{kind}:127.0.0.1:{relay.port}"
+                config = self._config(folder / "learnt.gpkg" if scenario.learns else place_map, camera.uri, link)
                 (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
             stack.callback(self._end_edgevpr)
             if scenario.starts_early:
@@ -102,12 +106,12 @@ class Run:
                 self._edgevpr.kill()
                 self._edgevpr.wait()
 
-    def _config(self, place_map: Path, uri: str, port: int) -> dict[str, Any]:
+    def _config(self, place_map: Path, uri: str, link: str) -> dict[str, Any]:
         config: dict[str, Any] = {
             "map": str(place_map),
             "source": {"uri": uri, "camera": "nadir", "rate_hz": 1.0, "fov_deg": ground.FOV_DEG},
-            "mavlink": {"link": f"tcp:127.0.0.1:{port}", "min_accuracy_m": 1.0},
-            "log": {"path": str(self._folder / "flight.jsonl")},
+            "mavlink": {"link": link, "min_accuracy_m": 1.0},
+            "log": {"path": str(self._folder / "flight.jsonl"), "tlog": str(self._folder / "flight.tlog")},
         }
         if self._scenario.learns:
             config |= {"technique": "cohog", "mapping": {"learn": True}}
@@ -117,14 +121,18 @@ class Run:
 
     def _take_off(self) -> None:
         simulator = self._simulator
+        if self._scenario.is_px4:
+            simulator.take_off(self._scenario.height_m)
+            self._recorder.is_on = True
+            return
         simulator.wait_ready()
         if self._scenario.vehicle == "plane":
-            simulator.link.upload(mission(HOME_M, CLIMB_M, CIRCUIT_M, HEIGHT_M))
+            simulator.link.upload(mission(HOME_M, CLIMB_M, CIRCUIT_M, self._scenario.height_m))
             simulator.arm("AUTO")
         else:
             simulator.arm("GUIDED")
-            simulator.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT_M)
-        simulator.wait_height(0.95 * HEIGHT_M)
+            simulator.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, self._scenario.height_m)
+        simulator.wait_height(0.95 * self._scenario.height_m)
         self._recorder.is_on = True
 
     def _lose(self) -> None:
@@ -153,13 +161,17 @@ class Run:
         """Let the flight go on for so long; a copter is steered meanwhile, and ends where it has landed."""
         began_s = time.monotonic()
         while (now_s := time.monotonic()) < began_s + seconds:
-            if self._scenario.vehicle == "copter" and self._steer():
+            if self._scenario.vehicle == "copter" and (self._is_down() if self._scenario.is_px4 else self._steer()):
                 return
             if self._scenario.glitch_m_s and "loss" in self._marks_s:
                 away_m = self._scenario.glitch_m_s * (now_s - self._marks_s["loss"])
                 north_deg = at_degrees(0.0, away_m)[0] - at_degrees(0.0, 0.0)[0]
                 self._simulator.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
             time.sleep(_STEP_S)
+
+    def _is_down(self) -> bool:
+        at = self._truth.at(time.monotonic())
+        return at is not None and at.height_m < 1.0
 
     def _steer(self) -> bool:
         """Send a copter on towards the next corner as a pilot who sees it would, by velocity; tell whether it has
@@ -173,7 +185,7 @@ class Run:
         if away_m < 3 * COPTER_SPEED_M_S:
             self._corner += 1
         east, north = (COPTER_SPEED_M_S * each / away_m for each in (east_m, north_m))
-        down = max(-2.0, min(2.0, 0.5 * (at.height_m - HEIGHT_M)))
+        down = max(-2.0, min(2.0, 0.5 * (at.height_m - self._scenario.height_m)))
         target = (0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, _ONLY_VELOCITY, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0)
         self._simulator.link.send(mavlink.MAVLink_set_position_target_local_ned_message(*target))
         return at.height_m < 1.0

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import rasterio
 
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
 from edgevpr.lab.simulate.generated import ORIGIN, to_position
@@ -16,7 +17,7 @@ from edgevpr.lab.simulate.landscape import make_scene
 REPOSITORY = Path(__file__).resolve().parents[2]
 WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16
 GROUND_ALT_M = ORIGIN.alt_m
-MAPPED_FROM_M, SPACING_M, EDGE_M = 100.0, 30.0, 50.0
+SPACING_M, EDGE_M = 30.0, 50.0
 CAMERAS = {"mapping": Camera(), "later": Camera(noise_sigma=3.0, blur_px=2.0)}
 LIGHTS = {
     "mapping": Light(sun_azimuth_deg=52, sun_elevation_deg=50, exposure=1.1),
@@ -40,10 +41,28 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
     return np.load(files[day], mmap_mode="r")
 
 
+def from_rasters(work: Path, mapped: Path, later: Path, height_m: float) -> Path:
+    """Return the folder of a ground of two pictures from space, of the map's day and of the flight's, in metres and of
+    the same place, to be flown over at a height. Its south-west corner is theirs; beyond them there is nothing."""
+    folder = work / f"{mapped.stem}-{later.stem}-{height_m:g}m"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, path in (("mapping", mapped), ("later", later)):
+        if not (folder / f"ground-{name}.npy").exists():
+            with rasterio.open(path) as raster:
+                high, wide = (round(size * raster.res[0] / METRES_PER_PIXEL) for size in raster.shape)
+                seen = raster.read((3, 2, 1), out_shape=(3, high, wide), resampling=rasterio.enums.Resampling.cubic)
+            ground = np.zeros((round(DEPTH_M / METRES_PER_PIXEL), round(WIDTH_M / METRES_PER_PIXEL), 3), np.uint8)
+            rows, columns = min(high, len(ground)), min(wide, ground.shape[1])
+            ground[len(ground) - rows :, :columns] = seen.transpose(1, 2, 0)[high - rows :, :columns]
+            np.save(folder / f"ground-{name}.npy", ground)
+    return folder
+
+
 def picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Generator) -> bytes:
     """Take a picture with the camera of that day, as a JPEG."""
     camera = CAMERAS[day]
-    frame = photograph(ground, METRES_PER_PIXEL, pose, camera, LIGHTS[day], rng)
+    # Beyond its edge there is nothing: mirrored ground would be recognised, turned by 180 degrees.
+    frame = photograph(ground, METRES_PER_PIXEL, pose, camera, LIGHTS[day], rng, cv2.BORDER_CONSTANT)
     return cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality))[1].tobytes()
 
 
@@ -52,9 +71,9 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1"}
 
 
-def place_map(work: Path) -> Path:
+def place_map(work: Path, height_m: float) -> Path:
     """Return the map of the ground: `edgevpr map build` makes it of the pictures of a mapping flight, a gimbal's, with
-    their true positions."""
+    their true positions, from the height of the flight."""
     path, folder = work / "ground.gpkg", work / "mapping"
     if path.exists():
         return path
@@ -64,7 +83,7 @@ def place_map(work: Path) -> Path:
     with open(folder / "positions.csv", "w", newline="", encoding="utf-8") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon", "alt", "height_m", "yaw_deg"))
-        for number, pose in enumerate(_mapping_poses(rng)):
+        for number, pose in enumerate(_mapping_poses(rng, height_m)):
             name, at = f"{number:05d}.jpg", to_position(pose)
             (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
             where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
@@ -79,13 +98,13 @@ def place_map(work: Path) -> Path:
     return path
 
 
-def _mapping_poses(rng: np.random.Generator) -> list[CameraPose]:
+def _mapping_poses(rng: np.random.Generator, height_m: float) -> list[CameraPose]:
     """Plan legs to the east and back, a picture every SPACING_M, over all of the ground."""
     east_m = np.arange(EDGE_M, WIDTH_M - EDGE_M + 1, SPACING_M)
     poses = []
     for leg, north_m in enumerate(np.arange(EDGE_M, DEPTH_M - EDGE_M + 1, SPACING_M)):
         for east in east_m if leg % 2 == 0 else east_m[::-1]:
-            planned = (east, north_m, MAPPED_FROM_M, 90 if leg % 2 == 0 else 270)
+            planned = (east, north_m, height_m, 90 if leg % 2 == 0 else 270)
             flown = (planned + rng.normal(0, (1.0, 1.0, 0.7, 1.0))).tolist()
             poses.append(CameraPose(**dict(zip(("east_m", "north_m", "height_m", "heading_deg"), flown, strict=True))))
     return poses

@@ -3,12 +3,12 @@
 import contextlib
 import math
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 
-from edgevpr.mavlink.wire import Message, PacketReader, mavlink
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
 
 GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
 # SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
@@ -24,14 +24,14 @@ Listener = Callable[[Message, float], None]
 
 class Link:
     """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197"
-    of another component), and when it came; tells every message to the listeners, with its time. Raises RuntimeError
-    where nobody answers at `port`."""
+    of another component), and when it came; tells every message to the listeners, with its time. `connected` is a
+    socket; with `bytewise`, as PX4 has it, a whole number goes in a parameter's bytes."""
 
-    def __init__(self, port: int, listeners: list[Listener]) -> None:
+    def __init__(self, connected: socket.socket, listeners: list[Listener], bytewise: bool = False) -> None:
         self.last: dict[str, Message] = {}
         self.came_s: dict[str, float] = {}
         self._listeners = listeners
-        self._socket = _connected(port)
+        self._socket, self._bytewise = connected, bytewise
         self._mav = mavlink.MAVLink(self, *GROUND_STATION)
         self._is_open, self._lock = True, threading.Lock()
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._beat)]
@@ -76,14 +76,20 @@ class Link:
     def put_parameter(self, name: str, value: float) -> None:
         """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
         kind = mavlink.MAV_PARAM_TYPE_REAL32
+        if self._bytewise and isinstance(value, int):
+            kind, value = mavlink.MAV_PARAM_TYPE_INT32, struct.unpack("<f", struct.pack("<i", value))[0]
         self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT, name.encode(), float(value), kind))
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
-        near = partial(math.isclose, rel_tol=1e-5, abs_tol=1e-6)  # a parameter is a float of 32 bits
+
+        def is_taken(told: Message) -> bool:
+            held = parameter_value(told, self._bytewise) if told.param_id == name else None
+            return held is not None and math.isclose(held, value, rel_tol=1e-5, abs_tol=1e-6)  # floats of 32 bits
+
         for _ in range(4):
             self.put_parameter(name, value)
-            if self.wait_for("PARAM_VALUE", lambda told: told.param_id == name and near(told.param_value, value), 1.5):
+            if self.wait_for("PARAM_VALUE", is_taken, 1.5):
                 return
         raise RuntimeError(f"the autopilot does not take {name} {value}")
 
@@ -111,7 +117,7 @@ class Link:
         while self._is_open:
             try:
                 data = self._socket.recv(65536)
-            except TimeoutError:
+            except (TimeoutError, ConnectionRefusedError):  # refused: datagrams to one that is still to start
                 continue
             except OSError:
                 data = b""
@@ -136,7 +142,8 @@ class Link:
             time.sleep(0.5)
 
 
-def _connected(port: int) -> socket.socket:
+def connected(port: int) -> socket.socket:
+    """Return a connection to a port of this machine. Raises RuntimeError where nobody answers there."""
     give_up_s = time.monotonic() + 30
     while True:
         try:

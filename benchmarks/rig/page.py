@@ -8,6 +8,7 @@ import base
 import cv2
 import ground
 import numpy as np
+import px4
 from base import RESULTS, Row
 from figures import by_second, figures_of, read_table, worse_by
 from scenarios import SCENARIOS
@@ -86,10 +87,10 @@ def page(result: Row) -> str:
     found = result["scenarios"]
     return f"""# Flights with a real ArduPilot
 
-A real ArduPilot (4.7-dev, commit 90700977) flies in its own simulator, 100 m above ground that edgevpr generates; the
-map was made on another day, from pictures every 30 m. A camera is rendered from the true pose, fixed to the airframe,
-and edgevpr runs as a process between it and the autopilot. Then GPS is taken away. Each flight is made with and without
-edgevpr. The scenarios are in benchmarks/rig/scenarios.py.
+A real ArduPilot (4.7-dev, commit 90700977) or PX4 (px4_...) flies in its own simulator, 100 m above ground that edgevpr
+generates; the map was made on another day, from pictures every 30 m. A camera is rendered from the true pose, fixed to
+the airframe, and edgevpr runs as a process between it and the autopilot. Then GPS is taken away. Each flight is made
+with and without edgevpr. The scenarios are in benchmarks/rig/scenarios.py.
 
 The autopilot's estimate against the true position, metres, from the loss on: median, 90 %, largest, and so many seconds
 after the loss. Worse: the second at which the estimate was worst in comparison with the flight without edgevpr.
@@ -126,7 +127,9 @@ def _commits(found: dict[str, dict[str, Row]]) -> str:
 def _rows(found: dict[str, dict[str, Row]], only: str | None = None) -> Iterator[Row]:
     """Yield the runs (`only` those with or without edgevpr), with words for their modes and answers."""
     for name, runs in found.items():
-        names = {number: word for word, number in VEHICLES[SCENARIOS[name].vehicle].modes.items()}
+        scenario = SCENARIOS[name]
+        modes = px4.MODES if scenario.is_px4 else VEHICLES[scenario.vehicle].modes
+        names = {number: word for word, number in modes.items()}
         for which, run in runs.items():
             if only in (None, which):
                 modes = (names.get(m, str(m)) + (f" at {t_s:.0f} s" if t_s > 1 else "") for t_s, m in run["modes"])

@@ -81,16 +81,48 @@ class Relay:
             self._log.write(f"{now_s:.4f},{message.get_type()}," + ",".join(f"{each:.3f}" for each in figures) + "\n")
 
 
+class DatagramRelay(Relay):
+    """The same between a PX4, which sends to a port of its choice, and edgevpr, which listens at `port`."""
+
+    def __init__(self, truth: Truth, log: Path, ports: tuple[int, int], origin_m: tuple[float, float]) -> None:
+        self._autopilot, self._heard = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self._autopilot.bind(("127.0.0.1", ports[0]))
+        self._autopilot.connect(("127.0.0.1", ports[1]))
+        super().__init__(truth, log, ports[1], origin_m)
+        self._heard.connect(("127.0.0.1", self.port))
+
+    def _serve(self) -> None:
+        back = threading.Thread(target=self._carry, args=(self._autopilot, self._heard, None))
+        back.start()
+        self._carry(self._heard, self._autopilot, PacketReader())
+        back.join()
+        for each in (self._autopilot, self._heard):
+            each.close()
+
+    def _carry(self, source: socket.socket, sink: socket.socket, receiver: PacketReader | None) -> None:
+        source.settimeout(0.2)
+        while self._is_open:
+            with contextlib.suppress(OSError):  # nothing comes, or the other one does not listen yet
+                data = source.recv(65536)
+                sink.send(data)
+                for message in receiver.feed(data) if receiver else ():
+                    self._note(message, time.monotonic())
+
+
 def _sent(message: Message, origin_m: tuple[float, float]) -> Sent | None:
     """Return what a message says of the position: its age, the position, and the 1-sigma accuracy of an axis; None
     where it says nothing."""
     kind = message.get_type()
     if kind == "COMMAND_INT" and message.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
         return message.param2, *to_metres(message.x / 1e7, message.y / 1e7), message.param3
+    if kind == "GLOBAL_POSITION_SENSOR":
+        return 0.0, *to_metres(message.lat / 1e7, message.lon / 1e7), message.eph
     if kind == "GPS_INPUT" and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
         return 0.0, *to_metres(message.lat / 1e7, message.lon / 1e7), message.horiz_accuracy
-    if kind in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
-        covariance = message.pose_covariance if kind == "ODOMETRY" else message.covariance
-        accuracy_m = max(covariance[0], covariance[6], 0.0) ** 0.5
+    if kind == "ODOMETRY":
+        of_axes = [message.pose_covariance[each] for each in (0, 6)]
+        accuracy_m = max(of_axes) ** 0.5
+        if message.frame_id == mavlink.MAV_FRAME_LOCAL_FRD:  # as ArduPilot reads it (see messages.odometry)
+            accuracy_m = sum(each**2 for each in of_axes) ** (1 / 3)
         return 0.0, origin_m[0] + message.y, origin_m[1] + message.x, accuracy_m
     return None

@@ -1,7 +1,7 @@
 """Flights of edgevpr with a real ArduPilot, plane and copter, in ArduPilot's own simulator: `make rig` flies every
 scenario, with and without edgevpr, and writes benchmarks/results/rig.md. README.md says how, and how it is built.
 
-python benchmarks/rig/rig.py [SCENARIO ...] [--seconds S] [--report]
+python benchmarks/rig/rig.py [SCENARIO ...] [--seconds S] [--ground FILE --later FILE --height M] [--report]
 """
 
 import argparse
@@ -14,10 +14,12 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import base
+import ground
+import px4
 from figures import figures_of
 from flying import Run
 from page import write_page
-from scenarios import SCENARIOS
+from scenarios import HEIGHT_M, SCENARIOS
 from simulator import VARIABLE, tree
 
 WORK = Path.home() / ".cache" / "edgevpr-rig"
@@ -30,23 +32,32 @@ def main() -> None:
         "scenarios", nargs="*", metavar="SCENARIO", help=f"of {', '.join(SCENARIOS)}; none: all, and the page"
     )
     parser.add_argument("--seconds", type=float, help="after the loss of GPS (the scenario's)")
+    over = {"type": Path, "metavar": "FILE", "help": "a picture from space: of the map's day, and another's"}
+    parser.add_argument("--ground", **over)
+    parser.add_argument("--later", **over)
+    parser.add_argument("--height", type=float, help=f"above that ground, metres ({HEIGHT_M:.0f})")
     parser.add_argument("--report", action="store_true", help="write the page of the flights that were made")
     arguments = parser.parse_args()
     if unknown := set(arguments.scenarios) - set(SCENARIOS):
         parser.error(f"no scenario {', '.join(unknown)}")
+    if (arguments.ground is None) != (arguments.later is None) or (arguments.height and not arguments.ground):
+        parser.error("--ground and --later go together, and --height only with them")
+    height_m = arguments.height or HEIGHT_M
+    work = ground.from_rasters(WORK, arguments.ground, arguments.later, height_m) if arguments.ground else WORK
     if not arguments.report:
-        if tree() is None:
-            sys.exit(f"rig: build ArduPilot's simulator, and name its folder in {VARIABLE}.")
         for name in arguments.scenarios or SCENARIOS:
             scenario = SCENARIOS[name]
-            shown = replace(scenario, off_s=arguments.seconds or scenario.off_s)
+            if (px4.build if scenario.is_px4 else tree)() is None:
+                whose, variable = ("PX4", px4.VARIABLE) if scenario.is_px4 else ("ArduPilot", VARIABLE)
+                sys.exit(f"rig: build {whose}'s simulator, and name its folder in {variable}.")
+            shown = replace(scenario, off_s=arguments.seconds or scenario.off_s, height_m=height_m)
             for is_control in (False, True)[: 1 + scenario.is_compared]:
                 try:
-                    folder = Run(WORK, name, shown, is_control).fly()
+                    folder = Run(work, name, shown, is_control).fly()
                     print(f"{folder.name}: {json.dumps(figures_of(folder))}", flush=True)
                 except RuntimeError as error:  # one that does not arm, for example: the page has the others
                     print(f"rig: {name}: {error}", file=sys.stderr, flush=True)
-    if arguments.report or not arguments.scenarios:
+    if arguments.report or not (arguments.scenarios or arguments.ground):
         write_page(WORK)
 
 

@@ -25,6 +25,8 @@ class Scenario:
     without edgevpr says something."""
 
     vehicle: str = "plane"
+    is_px4: bool = False
+    height_m: float = HEIGHT_M
     gps_s: float = 60.0
     off_s: float = 300.0
     loses_gps: bool = True
@@ -76,6 +78,8 @@ _ODOMETRY = {
     "EK3_SRC2_YAW": 1,
 }
 
+_AGP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}  # PX4: positions of message 296
+
 SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),
     "plane_rare": Scenario(wind_m_s=6.0, config={"source": {"rate_hz": 0.1}}, is_compared=False),
@@ -87,6 +91,8 @@ SCENARIOS = {
     "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=_ODOMETRY, starts_early=True),
     "plane_glitch": Scenario(loses_gps=False, glitch_m_s=5.0, off_s=60.0),
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
+    "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=_AGP),
+    "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=_AGP),
     "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
     "reboot": Scenario(gps_s=30.0, off_s=60.0, reboots=True, is_compared=False),
 }

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground import GROUND_ALT_M
-from link import STREAMS_HZ, Link, Listener
+from link import STREAMS_HZ, Link, Listener, connected
 
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.lab.simulate.generated import to_position
@@ -90,7 +90,7 @@ class Simulator:
         with open(self._folder / "simulator.txt", "ab") as said:
             streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
             self._process = subprocess.Popen([*map(str, command)], cwd=self._folder, start_new_session=True, **streams)
-        self.link = Link(OWN_PORT, self._listeners)
+        self.link = Link(connected(OWN_PORT), self._listeners)
         if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
             raise RuntimeError(f"the simulator says nothing: see {self._folder}/simulator.txt")
         for number, rate_hz in STREAMS_HZ.items():

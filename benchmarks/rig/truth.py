@@ -9,25 +9,28 @@ from ground import GROUND_ALT_M
 
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.lab.simulate.generated import to_metres
-from edgevpr.mavlink.wire import Message
+from edgevpr.mavlink.wire import Message, quaternion
 
 _KEPT = 240  # states, six seconds: a fix is 5 s old at the most
 _AHEAD_S = 0.3  # the farthest that a state is carried on
 
 
 class Truth:
-    """Listens for SIM_STATE, and tells the pose `at` a time: the state before it, carried on at steady rates. Kept of a
-    state are metres east, north and up, and roll, pitch and yaw (radians); then the rates of these six a second."""
+    """Listens for SIM_STATE (ArduPilot) or HIL_STATE_QUATERNION (PX4), and tells the pose `at` a time: the state before
+    it, carried on at steady rates. Kept of a state are metres east, north and up, and roll, pitch and yaw (radians);
+    then the rates of these six a second."""
 
-    def __init__(self) -> None:
+    def __init__(self, ground_alt_m: float = GROUND_ALT_M) -> None:
+        self._ground_alt_m = ground_alt_m
         self._states: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=_KEPT)
         self._lock = threading.Lock()
 
     def listen(self, message: Message, now_s: float) -> None:
         """Take note of a message."""
-        if message.get_type() == "SIM_STATE":
+        state = _STATES.get(message.get_type())
+        if state:
             with self._lock:
-                self._states.append((now_s, *_state(message)))
+                self._states.append((now_s, *state(message, self._ground_alt_m)))
 
     def at(self, t_mono_s: float) -> CameraPose | None:
         """Return the true pose at a time; None where nothing is known of it."""
@@ -42,13 +45,27 @@ class Truth:
         return CameraPose(east_m=east_m, north_m=north_m, height_m=height_m, **attitude)
 
 
-def _state(message: Message) -> tuple[np.ndarray, np.ndarray]:
-    east_m, north_m = to_metres(message.lat_int / 1e7, message.lon_int / 1e7)
-    roll, pitch = message.roll, message.pitch
-    p, q, r = message.xgyro, message.ygyro, message.zgyro
+def _ardupilot(message: Message, ground_alt_m: float) -> tuple[np.ndarray, np.ndarray]:
+    place = (*to_metres(message.lat_int / 1e7, message.lon_int / 1e7), message.alt - ground_alt_m)
+    angles, turns = (message.roll, message.pitch, message.yaw), (message.xgyro, message.ygyro, message.zgyro)
+    return _state(place, (message.ve, message.vn, -message.vd), angles, turns)
+
+
+def _px4(message: Message, ground_alt_m: float) -> tuple[np.ndarray, np.ndarray]:
+    place = (*to_metres(message.lat / 1e7, message.lon / 1e7), message.alt / 1e3 - ground_alt_m)
+    velocity = (message.vy / 100, message.vx / 100, -message.vz / 100)
+    angles = quaternion.QuaternionBase(message.attitude_quaternion).euler
+    return _state(place, velocity, angles, (message.rollspeed, message.pitchspeed, message.yawspeed))
+
+
+def _state(place_m, velocity_m_s, angles, turns) -> tuple[np.ndarray, np.ndarray]:
+    roll, pitch, _ = angles
+    p, q, r = turns
     about_down = q * math.sin(roll) + r * math.cos(roll)  # what turns the nose sideways, seen by a level observer
     cos_pitch = max(math.cos(pitch), 0.1)
     roll_rate = p + about_down * math.sin(pitch) / cos_pitch
     pitch_rate, yaw_rate = q * math.cos(roll) - r * math.sin(roll), about_down / cos_pitch
-    state = (east_m, north_m, message.alt - GROUND_ALT_M, roll, pitch, message.yaw)
-    return np.array(state), np.array((message.ve, message.vn, -message.vd, roll_rate, pitch_rate, yaw_rate))
+    return np.array((*place_m, *angles)), np.array((*velocity_m_s, roll_rate, pitch_rate, yaw_rate))
+
+
+_STATES = {"SIM_STATE": _ardupilot, "HIL_STATE_QUATERNION": _px4}

@@ -49,6 +49,7 @@ class View:
     longest side. `zoom`: factor by which the picture was enlarged; its longest side shows that many times less ground.
     `lean_m`: offset on the ground (east, north) in metres from the point in the picture's middle to the point straight
     under the camera. Set only for a picture that was not warped because its lens is unknown.
+    `focal`: focal length in shares of the longest side.
     `reason`: words that say why a tilted picture was not warped (None: it was, or needed no warp)."""
 
     up_deg: float | None = None
@@ -56,6 +57,7 @@ class View:
     aside: tuple[float, float] | None = None
     zoom: float = 1.0
     lean_m: tuple[float, float] | None = None
+    focal: float | None = None
     reason: str | None = None
 
     def fields(self) -> dict[str, Any]:
@@ -113,7 +115,8 @@ def levelled(
         zoom = 1.0
     turn_deg = abs(((taking.top_deg or 0.0) + 180) % 360 - 180)
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
-        view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=taking.aside(taking.straight, 1.0))
+        aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
+        view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=aside, focal=focal)
         return straightened(frame.image, overlay, view, lens.calibrated)
 
     side = min(taking.longest_px, _LONGEST_PX)
@@ -133,6 +136,7 @@ def levelled(
         up_deg=None if taking.heading_deg is None else 0.0,
         footprint_m=taking.own_m and taking.own_m / zoom,
         zoom=zoom,
+        focal=out_px / side,
         aside=(0.0, 0.0) if below and taking.is_attitude_known else taking.aside(turned, zoom),
     )
     return _warped(frame.image, overlay, warp, view)

@@ -120,7 +120,8 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
         if self._port.connected and now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + HEARTBEAT_S
-            self._put(messages.heartbeat(Health.BOOT))
+            # Of no kind: PX4 warns of a lost companion when one that has only asked falls silent.
+            self._put(messages.heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
         # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
         data = self._port.read() if readable else b""

@@ -26,22 +26,27 @@ _GPS_LAG_S = 0.2
 
 # PX4
 FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
-CONTROL = "EKF2_AGP0_CTRL"  # since 1.17, as is message 296
+CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
 
 log = logging.getLogger(__name__)
 
 
 class Channel(Enum):
-    """A way to tell an autopilot a position. COMMAND and SENSOR carry single fixes, which may be rare and late; the
-    other two are continuous: they need an estimate ten times a second without a gap."""
+    """A way to tell an autopilot a position. COMMAND carries single fixes, which may be rare and late; the others are
+    continuous: they carry the estimate, ten times a second without a gap."""
 
     COMMAND = auto()  # 43003, EXTERNAL_POSITION_ESTIMATE
-    SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR
-    GPS_INPUT = auto()  # message 232, as a GPS receiver
-    ODOMETRY = auto()  # message 331
+    SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR (PX4)
+    GPS_INPUT = auto()  # message 232, as a GPS receiver (ArduPilot)
+    ODOMETRY = auto()  # message 331 (ArduPilot)
 
     @property
     def is_continuous(self) -> bool:
+        return self is not Channel.COMMAND
+
+    @property
+    def is_beside_gps(self) -> bool:
+        """True if positions are sent while the autopilot has GPS too."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
 
@@ -110,7 +115,7 @@ def receiver_name(parameters: Mapping[str, float], number: int) -> str:
 def px4_choice(_kind: Kind, parameters: Mapping[str, float]) -> Choice:
     """Choose the channel for a PX4: message 296 if its parameter CONTROL lets it fuse positions, else command 43003."""
     if CONTROL not in parameters:
-        return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.17 has)")
+        return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.18 has)")
     if int(parameters[CONTROL]) & FUSES_POSITION:
         return Choice(Channel.SENSOR, f"message 296, as its {CONTROL} fuses positions")
     return Choice(Channel.COMMAND, f"command 43003, as its {CONTROL} fuses no positions of message 296")

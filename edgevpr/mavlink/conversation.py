@@ -26,8 +26,8 @@ from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
 
 MESSAGES_MAX = 64
 HEARTBEAT_S = 1.0
-STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
+STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 BETWEEN_S = 1.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
@@ -167,7 +167,7 @@ class Conversation:
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             if sending:
-                self.fixes.note_sent(sending, self._clock(), has_answer=message.get_type() == "COMMAND_INT")
+                self.fixes.note_sent(sending, self._clock())
             else:
                 self.sent[message.get_type()] += 1
             return packet, sending
@@ -233,8 +233,6 @@ class Conversation:
             if why := PAUSED if self.requests.is_paused else self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif sending := self.fixes.next(now_s) or self._between(now_s):
-                if self.channel is Channel.SENSOR:
-                    return messages.position_sensor(sending.fix, now_s), sending
                 return messages.position_fix(sending.fix, now_s, system_id), sending
         else:
             self.fixes.drop_stale(now_s)
@@ -257,11 +255,13 @@ class Conversation:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
         choice, autopilot = self.autopilot.interview.choice, self.autopilot
-        t_s = now_s - choice.lag_s
-        state = self.settings.listener.state_at(t_s)
+        state = self.settings.listener.state_at(t_s := now_s - choice.lag_s)
         if choice.channel is Channel.GPS_INPUT:
             t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
             return messages.gps_input(state, choice.receiver, t_s, t_unix_s)
+        if choice.channel is Channel.SENSOR:
+            autopilot.px4.note_sent(now_s if state else -math.inf)
+            return state and messages.position_sensor(state)
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")
             here, self._origin = self._origin, None

@@ -131,16 +131,11 @@ class Fixes:
             return "not sent: the autopilot has only just begun to answer again"
         return None
 
-    def note_sent(self, sending: Sending, now_s: float, has_answer: bool) -> None:
-        """Note that a fix was handed to the port. Without `has_answer` its message is one that is never answered."""
-        sending.t_sent_s = now_s
-        if has_answer:
-            self._row += 1
-            self._sent_s = now_s
-            self._under_way.append((now_s, sending))
-        else:
-            self._taken_s = now_s
-            sending.outcome = FixAnswer(None, "its message has no answer", None)
+    def note_sent(self, sending: Sending, now_s: float) -> None:
+        """Note that a fix was handed to the port."""
+        sending.t_sent_s = self._sent_s = now_s
+        self._row += 1
+        self._under_way.append((now_s, sending))
 
     def note_lost(self, count: int) -> None:
         """Note that `count` fixes were thrown away with the port: they do not count as unanswered in a row, unless the

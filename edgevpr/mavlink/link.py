@@ -36,6 +36,7 @@ class LinkStats:
     from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
     `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link,
     `refused_signatures` refusals by reason. `reopened` is how often the port was; `bad_bytes` belong to no message.
+    `used_share` is that of `Px4Use`.
     """
 
     connected: bool
@@ -56,10 +57,16 @@ class LinkStats:
     dropped_queue_full: int
     bad_bytes: int
     reopened: int
+    used_share: float | None = None
 
     @property
     def fixes_sent(self) -> int:
         return self.sent.get("COMMAND_INT", 0)
+
+    @property
+    def positions_sent(self) -> int:
+        """The number of positions sent to a PX4 by message 296."""
+        return self.sent.get("GLOBAL_POSITION_SENSOR", 0)
 
 
 def _in_turn(
@@ -161,6 +168,7 @@ class Link:
                 dropped_queue_full=said.dropped_queue_full,
                 bad_bytes=said.reader.bad_bytes,
                 reopened=reopened,
+                used_share=autopilot.px4.used_share,
             )
 
     def close(self) -> None:

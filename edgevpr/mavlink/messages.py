@@ -72,9 +72,9 @@ class MotionState:
     attitude: tuple[float, float, float] | None = None
 
 
-def heartbeat(health: Health) -> Message:
-    """Make the HEARTBEAT (0) of an onboard computer."""
-    kind, autopilot = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+def heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> Message:
+    """Make the HEARTBEAT (0) of an onboard computer, or of another `kind` (MAV_TYPE)."""
+    autopilot = mavlink.MAV_AUTOPILOT_INVALID
     return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, system_status=health, mavlink_version=3)
 
 
@@ -98,21 +98,21 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
     )
 
 
-def position_sensor(fix: Fix, t_sent_s: float) -> Message:
+def position_sensor(state: MotionState) -> Message:
     """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 goes by the time of its arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
         target_component=0,
         id=SENSOR_ID,
-        time_usec=round(t_sent_s * 1e6),
+        time_usec=round(state.t_mono_s * 1e6),
         processing_time=0,
         source=mavlink.GLOBAL_POSITION_SRC_VISION,
         flags=0,
-        lat=round(fix.lat_deg * 1e7),
-        lon=round(fix.lon_deg * 1e7),
+        lat=round(state.lat_deg * 1e7),
+        lon=round(state.lon_deg * 1e7),
         alt=math.nan,
         alt_ellipsoid=math.nan,
-        eph=fix.accuracy_m,
+        eph=state.accuracy_m,
         epv=math.nan,
     )
 

@@ -11,6 +11,7 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
+from edgevpr.mavlink.px4 import Px4Use
 from edgevpr.mavlink.vehicle import GPS_GONE_AFTER_S, GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -131,6 +132,7 @@ class Autopilot:
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
+        self.px4 = Px4Use()
         self._gps: dict[str, tuple[int, Receiver]] = {}  # receivers with a fix, each with the time stamp of its report
 
     @property
@@ -188,8 +190,10 @@ class Autopilot:
                 self._heights.hear(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
                 self._hear_gps(message, now_s)
-            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
+            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
                 self.certainty.hear(message, now_s)
+                if name == "ESTIMATOR_STATUS":
+                    self.px4.hear(message, now_s, self._best_gps(now_s) is not None)
             case "GLOBAL_POSITION_INT":
                 self._hear_position(message, now_s)
             case "ATTITUDE":
@@ -205,7 +209,8 @@ class Autopilot:
     def _hear_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
         gps, lat_deg, lon_deg = self._best_gps(now_s), message.lat / 1e7, message.lon / 1e7
-        has_gps = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
+        is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
+        has_gps = is_near and self.px4.uses_gps
         if gps and has_gps:
             self.certainty.note_known(gps.sd_m, now_s)
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:

@@ -110,7 +110,9 @@ class Certainty:
 
     def hear(self, message: Message, now_s: float) -> None:
         """Process a report of the autopilot's position filter, one of the `FILTER_REPORTS`."""
-        if message.flags & mavlink.EKF_CONST_POS_MODE or not message.flags & _HAS_POSITION:
+        # PX4 calls it constant too while it stands still with GPS.
+        is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and message.get_type() == "EKF_STATUS_REPORT"
+        if is_constant or not message.flags & _HAS_POSITION:
             self._known = self._own = None  # the position is still reported, but is an old one
         elif message.get_type() == "ESTIMATOR_STATUS":
             # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.

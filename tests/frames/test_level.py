@@ -13,6 +13,7 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 
 CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))
+LENS_FOCAL = CAMERA.focal_px / 640
 LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=60)
 HEIGHT_M = 100.0
 FOOTPRINT_M = HEIGHT_M * 640 / CAMERA.focal_px
@@ -124,7 +125,9 @@ def test_without_a_height_it_is_untilted_and_not_scaled(ground):
 
 def test_without_an_attitude_it_counts_as_level_and_nothing_is_said_of_the_point_below(ground):
     found = levelled(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
-    assert found.view == View(up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), aside=None)
+    assert found.view == View(
+        up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), aside=None, focal=pytest.approx(LENS_FOCAL)
+    )
     assert off(found.image, from_above(ground, replace(found.view, aside=(0, 0))), found.mask) < 0.5
 
 
@@ -161,7 +164,7 @@ def test_what_is_no_number_is_unknown(ground, wrong):
     odd = replace(frame, roll_deg=wrong, pitch_deg=wrong, heading_deg=wrong, height_m=wrong)
     found = levelled(odd, None, LENS, FOOTPRINT_M)
     assert found.image is frame.image
-    assert found.view == View()
+    assert found.view == View(focal=pytest.approx(LENS_FOCAL))
 
 
 @pytest.mark.parametrize(

@@ -149,9 +149,55 @@ def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float():
     one = struct.unpack("<f", struct.pack("<i", 1))[0]
     autopilot, _ = interviewed(PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)})
     assert autopilot.conversation.channel is Channel.SENSOR
-    sending = autopilot.put_fix()
-    assert "GLOBAL_POSITION_SENSOR" in {message.get_type() for message in autopilot.told()}
-    assert sending.outcome.result is None
+
+
+def px4_that_fuses(seconds=10):
+    one = struct.unpack("<f", struct.pack("<i", 1))[0]
+    return interviewed(PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)}, seconds)
+
+
+def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_known():
+    autopilot, ear = px4_that_fuses()
+    said = sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0)
+    assert len(said) == pytest.approx(30, abs=1)
+    assert said[0].lat == round(STATE.lat_deg * 1e7)
+    ear.state = None
+    assert sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
+
+
+ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+
+
+def test_what_a_px4_uses_of_ours_is_counted_by_its_reports():
+    autopilot, _ = px4_that_fuses()
+    assert autopilot.conversation.autopilot.px4.used_share is None
+    for flags in (GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL):
+        sent(autopilot, "GLOBAL_POSITION_SENSOR", 0.5)
+        autopilot.px4_filter(2.0, flags)
+    assert autopilot.conversation.autopilot.px4.used_share == 0.75
+
+
+def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
+    """With EKF2_GPS_CTRL=0 the receiver goes on, near where the aircraft is."""
+    autopilot, ear = px4_that_fuses()
+    ear.state = None
+
+    def has_gps_after(seconds, flags):
+        for _ in range(seconds * 5):
+            autopilot.wait(0.2)
+            autopilot.beat()
+            autopilot.gps(h_acc=800)
+            autopilot.px4_filter(2.0, flags)
+        return autopilot.position().has_gps
+
+    assert has_gps_after(5, GLOBAL | FUSES)
+    assert has_gps_after(1, GLOBAL), "it may just have begun"
+    assert not has_gps_after(3, GLOBAL)
+    assert has_gps_after(1, GLOBAL | FUSES), "it uses it again"
+    assert not has_gps_after(4, GLOBAL)
+    ear.state = STATE
+    sent(autopilot, "GLOBAL_POSITION_SENSOR")
+    assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
 
 
 def test_between_matches_a_fix_is_sent_where_none_has_been_for_a_second_and_a_half():

@@ -27,11 +27,11 @@ def fixes():
     return Fixes()
 
 
-def sent(fixes, *times_s, has_answer=True):
+def sent(fixes, *times_s):
     """Send a fix at each time; give the last."""
     for t_s in times_s:
         sending = Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
-        fixes.note_sent(sending, t_s, has_answer=has_answer)
+        fixes.note_sent(sending, t_s)
         sending.settle(True)
     return sending
 
@@ -86,11 +86,6 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
     sent(fixes, 15.0)
     fixes.break_off("the link was lost")
     assert fixes.t_fix_s == 15.0
-
-
-def test_a_message_without_answers_is_waited_for_by_nobody_and_may_be_taken(fixes):
-    assert sent(fixes, 5.0, has_answer=False).outcome.result is None
-    assert (len(fixes), fixes.unanswered, fixes.t_fix_s) == (0, 0, 5.0)
 
 
 def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop(fixes):

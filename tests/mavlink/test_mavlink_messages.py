@@ -1,6 +1,7 @@
 """Messages that we send, as they are read at the other end."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,7 +155,7 @@ def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airfram
 
 
 def test_a_sensor_says_accuracy_and_no_altitude():
-    heard = sent_and_received(messages.position_sensor(Fix(47.5, 8.25, 4.0, 99.0), 100.0))
+    heard = sent_and_received(messages.position_sensor(replace(STATE, lat_deg=47.5, lon_deg=8.25, accuracy_m=4.0)))
     assert (heard.lat, heard.lon, heard.eph) == (475_000_000, 82_500_000, 4.0)
     assert math.isnan(heard.alt)
     assert math.isnan(heard.epv)

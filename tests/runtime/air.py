@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
-from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -31,7 +31,7 @@ _NO_COST = QueryCost(
 
 
 def match_at(
-    position: Position, t_s: float, vehicle: Vehicle | None, sd_m: float, places, view: View | None = None
+    position: Position, t_s: float, vehicle: Vehicle | None, sd_m: float, places, view: View | None = None, lean=None
 ) -> Recognition:
     """An accepted match of a frame taken at `t_s`."""
     return Recognition(
@@ -41,7 +41,7 @@ def match_at(
         best=Candidate(Place(place_id=places[0], source_image="", position=position), FineMatch(0.5)),
         accepted=True,
         reason="",
-        located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places)),
+        located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
         accuracy_m=sd_m,
         steps=Steps(),
         cost=_NO_COST,
@@ -127,6 +127,7 @@ class Air:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
                 self.states.append((self.t_s, self.navigator.state_at(self.t_s)))
+                self.hear_state(self.states[-1][1])
             if self.step % self.every_steps == 0 and self.sees:
                 self.waiting.append((self.step, self.vehicle))
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
@@ -141,10 +142,11 @@ class Air:
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
 
-    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None) -> Advice:
+    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None, lean=None) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
         place = round(step * _STEP_S)
-        event = match_at(Position(*moved(*HOME, *seen_m)), step * _STEP_S, vehicle, self.said_sd_m, (place,), view)
+        where = Position(*moved(*HOME, *seen_m))
+        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, (place,), view, lean)
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))
@@ -158,6 +160,9 @@ class Air:
         if self.takes_fixes:
             self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s
+
+    def hear_state(self, state: MotionState | None) -> None:
+        """Do as the autopilot does that is sent a position on a continuous channel: here nothing."""
 
     def match_now(self, **changes) -> Advice:
         return self.match(self.step, self.vehicle, **changes)

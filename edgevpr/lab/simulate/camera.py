@@ -132,13 +132,15 @@ def photograph(
     camera: Camera,
     light: Light,
     rng: np.random.Generator,
+    border: int = cv2.BORDER_REFLECT,
 ) -> np.ndarray:
-    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise."""
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise.
+    `border` is what OpenCV shows beyond the ground: its mirror image, or nothing (BORDER_CONSTANT)."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])
     view = ground_to_pixel(pose, camera) @ metres_from_pixel
-    frame = cv2.warpPerspective(ground, view, (camera.width, camera.height), borderMode=cv2.BORDER_REFLECT)
+    frame = cv2.warpPerspective(ground, view, (camera.width, camera.height), borderMode=border)
     if camera.blur_px >= 1:
         frame = cv2.blur(frame, (1, round(camera.blur_px) + 1))  # the ground runs down the picture
     tone = np.linspace(0, 1, 256, dtype=np.float32) ** light.gamma * light.exposure

@@ -1,6 +1,7 @@
-"""The simulated PX4: the rules of 1.17-alpha (February 2026) for its filter EKF2, command 43003 and message 296. Used
-by `controller`. They are from EKF2.cpp, ekf.cpp (resetGlobalPosToExternalObservation), ekf_helper.cpp
-(updateHorizontalDeadReckoningstatus) and aux_global_position.cpp."""
+"""The simulated PX4: the rules of 1.18-beta1 for its filter EKF2, command 43003 and message 296, with
+the flags of a real one in its own simulator. Used by `controller`. They are from EKF2.cpp, ekf.cpp
+(resetGlobalPosToExternalObservation), ekf_helper.cpp (updateHorizontalDeadReckoningstatus) and
+aux_global_position.cpp. A 1.17.0 and a 1.18-beta1 were held beside it (test_px4_contract)."""
 
 import math
 
@@ -20,7 +21,7 @@ class Px4(Firmware):
     """A copter or a plane with PX4."""
 
     number = mavlink.MAV_AUTOPILOT_PX4
-    version = 1 << 24 | 17 << 16 | mavlink.FIRMWARE_VERSION_TYPE_ALPHA
+    version = 1 << 24 | 18 << 16 | mavlink.FIRMWARE_VERSION_TYPE_BETA
     filter_report = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
     default_hz = {  # noqa: RUF012 - of a link in the mode "onboard"
         mavlink.MAVLINK_MSG_ID_ATTITUDE: 20.0,
@@ -66,12 +67,17 @@ class Px4(Firmware):
         if self._is_valid():
             flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
             flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS
+        has_ours = self._other_s > -math.inf and self.now_s - self._other_heard_s <= _SILENT_AFTER_S
+        if has_ours or self.now_s - self._fused_s < _AIDING_GONE_S:
+            flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+        if not self.motion.is_flying:  # at rest, whatever it knows
+            flags |= mavlink.ESTIMATOR_CONST_POS_MODE
         return flags | (mavlink.ESTIMATOR_GPS_GLITCH if self.test_ratio > 1 else 0)
 
     def take_fix(self, command: Message) -> int:
-        """Process command 43003 and return a MAV_RESULT. The command's time of sending and frame are ignored."""
-        since_s = self._fused_s if self.motion.is_flying else self._passed_s  # dead-reckons; landed: lacks GPS
-        if self.now_s - since_s < _AIDING_GONE_S or not math.isfinite(command.param2):
+        """Process command 43003 and return a MAV_RESULT. The command's time of sending and frame are ignored. It is
+        taken while there is GPS too, in the releases 1.17.0 and 1.18-beta1."""
+        if not math.isfinite(command.param2):
             return NOT_NOW
         lat_deg, lon_deg = command.x / 1e7, command.y / 1e7
         if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):

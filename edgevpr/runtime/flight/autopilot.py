@@ -49,6 +49,11 @@ class ToAutopilot:
         """Counts of fixes so far, and of refused messages from other systems, in a few words."""
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
+        if stats.positions_sent:
+            told = "does not say whether it uses them"
+            if stats.used_share is not None:
+                told = f"used them by {stats.used_share:.0%} of its reports"
+            taken = f"{stats.positions_sent} positions sent, the autopilot {told}"
         sent = taken if self._send_fixes else DRY_RUN
         counts = (
             (sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0), f"refused ({stats.refused_why})"),

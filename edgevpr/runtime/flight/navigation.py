@@ -3,6 +3,7 @@ check of fixes against it. `navigator` uses both."""
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.runtime.flight.path import INERTIAL, RECKONED, Drift, DriftFilter, Path
 from edgevpr.runtime.recognise.locate import in_sd, matrix_of
+from edgevpr.runtime.recognise.perspective import Lean
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _GPS_EVERY_S = 1.0
@@ -25,6 +27,8 @@ _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
 _DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
+_TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
+_IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +47,8 @@ class Whereabouts:
 class PositionedMatch:
     """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
     to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
-    from; `lean_s2`, how far an error of the attitude moves it (see `path._seen`)."""
+    from; `lean_s2`, how far an error of the attitude moves it (see `DriftFilter` in `path`); `lean`, what its picture
+    shows of that error; and `turn_deg`, by how much the heading that it shows exceeds the autopilot's."""
 
     t_s: float
     position: Position
@@ -51,6 +56,14 @@ class PositionedMatch:
     covariance_m2: Doubles
     places: tuple[int, ...]
     lean_s2: float = 0.0
+    lean: Lean | None = None
+    turn_deg: float | None = None
+
+    def is_turned_like(self, turn_deg: float | None) -> bool:
+        """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
+        if self.turn_deg is None or turn_deg is None:
+            return True
+        return abs((self.turn_deg - turn_deg + 180) % 360 - 180) <= _TURNED_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +77,18 @@ class ComparedFix:
     off_m: Doubles
     expected_m: Doubles
     covariance_m2: Doubles
+
+
+class Weighed(NamedTuple):
+    """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
+    and other fixes agree with it; `is_lost`: the path's velocity is wrong too."""
+
+    why: str | None = None
+    is_against: bool = False
+    is_lost: bool = False
+
+
+BELIEVED = Weighed()
 
 
 class Navigation:
@@ -127,11 +152,15 @@ class Navigation:
             seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
         )
 
-    def hear_fix(self, fix: ComparedFix, is_against: bool = False) -> None:
-        """Correct our position by a fix. `is_against`: it contradicts what was expected (see `Consistency`)."""
-        if self._path:
-            hear = self._filter.trust_fix if is_against else self._filter.hear_fix
+    def hear_fix(self, fix: ComparedFix, verdict: Weighed = BELIEVED) -> None:
+        """Correct our position by a fix of which `Consistency` has given a verdict."""
+        if self._path and verdict.is_lost and self._drift is INERTIAL:
+            self.begin(fix.seen.position, worst_sd(fix.seen.covariance_m2), fix.seen.t_s, self._path.now.t_s)
+        elif self._path:
+            hear = self._filter.trust_fix if verdict.is_against else self._filter.hear_fix
             hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s, fix.seen.lean_s2)
+            if fix.seen.lean_s2 and (lean := fix.seen.lean):
+                self._filter.hear_lean(np.array(lean.over_height), lean.sd)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
@@ -180,33 +209,47 @@ class Consistency:
     GPS, a contradicting fix is never believed.
 
     The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
-    right fixes have the same offset from the path, and two wrong ones hardly ever do."""
+    right fixes have the same offset from the path, and two wrong ones hardly ever do. A path that is wrong by more
+    than a drift has no such fixes: there, several in a row that an aircraft can have flown through are believed. So
+    are several whose pictures are suddenly turned against the compass, of which one alone is wrong."""
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
+        self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
+        self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
 
     def is_contradicted(self, now_s: float) -> bool:
         """Return True while the last fix contradicts what is expected, and another one may still agree with it."""
         return self._held is not None and now_s - self._held.seen.t_s <= _GOOD_FOR_S
 
-    def weighed(self, fix: ComparedFix, has_gps: bool) -> tuple[str | None, bool]:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed. Return why the fix is not
-        believed (None: it is), and True if it contradicts the expected position but an earlier fix agrees with it."""
-        step_m = fix.off_m - fix.expected_m
-        if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS:
-            self._held = None
-            return None, False
+    def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""
+        step_m, is_turned = fix.off_m - fix.expected_m, not fix.seen.is_turned_like(self._turn_deg)
+        if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
+            return self._believed(fix, BELIEVED)
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
+        turned = f"held back: its picture is turned by {fix.seen.turn_deg or 0:.0f} degrees against the compass"
         if has_gps:
-            self._held = None
-            return f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is", False
+            self._held, self._row = None, []
+            there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
+            return Weighed(turned if is_turned else there)
+        self._row = [*(each for each in self._row[1 - _IN_A_ROW :] if _could_follow(each, fix)), fix]
+        if len(self._row) == _IN_A_ROW:
+            return self._believed(fix, Weighed(is_against=True, is_lost=True))
+        if is_turned:
+            return Weighed(turned)
         if self._held is None or _differ(self._held, fix) > _AGREES:
             self._held = fix
         elif _is_independent(self._held, fix):
-            self._held = None
-            return None, True
+            return self._believed(fix, Weighed(is_against=True))
         there = "where the aircraft is by the autopilot's reckoning and the fixes before"
-        return f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree", False
+        return Weighed(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
+
+    def _believed(self, fix: ComparedFix, verdict: Weighed) -> Weighed:
+        self._held, self._row = None, []
+        if fix.seen.turn_deg is not None:
+            self._turn_deg = fix.seen.turn_deg
+        return verdict
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:
@@ -223,12 +266,17 @@ def positioned(event: Recognition) -> PositionedMatch | None:
     """Return the positioned match of an event; None if no match with a position was accepted."""
     if event.frame is None or event.best is None or event.located is None or event.accuracy_m is None:
         return None
+    turn_deg, shown_deg, told_deg = None, event.located.heading_deg, event.view.up_deg
+    if shown_deg is not None and told_deg is not None:
+        turn_deg = (shown_deg - told_deg + 180) % 360 - 180
     return PositionedMatch(
         t_s=event.frame.t_mono_s,
         position=event.located.position,
         accuracy_m=event.accuracy_m,
         covariance_m2=matrix_of(event.located.covariance_m2),
         places=event.located.places or (event.best.place.place_id,),
+        lean=event.located.lean,
+        turn_deg=turn_deg,
     )
 
 
@@ -236,6 +284,16 @@ def _differ(one: ComparedFix, other: ComparedFix) -> float:
     """Return by how many standard deviations the offsets of two fixes differ; infinity if they are 30 s apart."""
     apart_s = abs(other.seen.t_s - one.seen.t_s)
     return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
+
+
+def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
+    """Tell whether an aircraft can have flown from one fix to another one, of other places, within some seconds."""
+    apart_s = other.seen.t_s - one.seen.t_s
+    is_other = set(one.seen.places).isdisjoint(other.seen.places) and other.seen.is_turned_like(one.seen.turn_deg)
+    if not 0 < apart_s <= _ROW_WITHIN_S or not is_other:
+        return False
+    flown_m = float(np.hypot(*(other.path_m + other.off_m - one.path_m - one.off_m)))
+    return flown_m <= _FASTEST_M_S * apart_s
 
 
 def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:

@@ -38,7 +38,7 @@ _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-_ALIKE = math.sqrt(50)
+_ALIKE, _PX4_ALIKE, _LEAN_GOOD_FOR_S = math.sqrt(50), 1.5, 5.0
 _FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
@@ -71,7 +71,7 @@ class Navigator(Listener):
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._appeared_s = -math.inf
+        self._appeared_s = self._lean_s = -math.inf
         self._channel, self._believes_gps = Channel.COMMAND, True
 
     @property
@@ -129,10 +129,12 @@ class Navigator(Listener):
             if compared is None:
                 self._navigation.begin(seen.position, worst_sd(seen.covariance_m2), seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            objection, is_against = self._consistency.weighed(compared, self.has_gps)
-            if objection:
-                return Advice(None, objection, is_held=True)
-            self._navigation.hear_fix(compared, is_against)
+            verdict = self._consistency.weighed(compared, self.has_gps)
+            if verdict.why:
+                return Advice(None, verdict.why, is_held=True)
+            self._navigation.hear_fix(compared, verdict)
+            if seen.lean:
+                self._lean_s = seen.t_s
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
 
     def fix_between(self, now_s: float) -> Fix | None:
@@ -166,21 +168,22 @@ class Navigator(Listener):
             return None
         with self._lock:
             vehicle, estimate = self._vehicle, self._known(t_s)
-            if estimate is None or vehicle is None:
+            is_apart = vehicle is not None and reckons_by_gps(vehicle) and not self._channel.is_beside_gps
+            if estimate is None or vehicle is None or is_apart:
                 self._slew.forget()
                 return None
             lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
             east, north = estimate.velocity_m_s
-            attitude = self._attitude
+            attitude, alike = self._attitude, self._alike(t_s)
             return MotionState(
                 t_mono_s=t_s,
                 lat_deg=lat_deg,
                 lon_deg=lon_deg,
                 alt_m=vehicle.alt_m,
                 velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-                accuracy_m=_ALIKE * math.hypot(self._claimed_m(estimate), behind_m),
+                accuracy_m=alike * math.hypot(self._claimed_m(estimate), behind_m),
                 alt_accuracy_m=_ALT_SD_M,
-                speed_accuracy_m_s=_ALIKE * estimate.speed_accuracy_m_s,
+                speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
                 attitude=None if attitude is None else _in_radians(attitude),
             )
 
@@ -192,10 +195,10 @@ class Navigator(Listener):
         return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
 
     def _lean_s2(self, event: Recognition, vehicle: Vehicle) -> float:
-        """Return how far an error of the attitude moves the fix of a match, see `path._seen`: not where the path rests
-        on no attitude, and not where the picture's lean comes from none."""
+        """Return how far an error of the attitude moves the fix of a match, see `DriftFilter` in `path`: not where the
+        picture's lean comes from none."""
         leans = event.view.aside or event.view.lean_m
-        is_apart = self._is_level or not self._channel.is_continuous or vehicle.roll_deg is None
+        is_apart = self._is_level or vehicle.roll_deg is None
         return 0.0 if is_apart or not leans else (vehicle.height_m or 0.0) / GRAVITY_M_S2
 
     def _known(self, t_s: float) -> Whereabouts | None:
@@ -214,8 +217,6 @@ class Navigator(Listener):
         if estimate is None:
             return Advice(None, _UNHEARD)
         here, claimed_m = estimate.position, self._claimed_m(estimate)
-        if self._channel is Channel.SENSOR:  # PX4 fuses it, and gives up its position after some seconds without one
-            return Advice(Fix(here.lat_deg, here.lon_deg, claimed_m, now_s))
         east_m_s, north_m_s = velocity_m_s
         since_s = now_s - vehicle.t_heard_s
         there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
@@ -231,6 +232,12 @@ class Navigator(Listener):
         ahead_m = [self._next_s / 2 * each for each in self._navigation.path_drift_m_s()]
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
+
+    def _alike(self, t_s: float) -> float:
+        """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
+        how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
+        is_apart = self._is_level or t_s - self._lean_s <= _LEAN_GOOD_FOR_S
+        return _PX4_ALIKE if self._channel is Channel.SENSOR and is_apart else _ALIKE
 
     def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""

@@ -114,16 +114,19 @@ class Drift:
     position_noise: float
     velocity_noise: float
     acceleration_noise: float
+    is_of_attitude: bool  # the path rests on the attitude, so that an error of it is one of the path's acceleration
 
 
 # Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
 # plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
 RECKONED = Drift(
-    velocity_sd=4.0, acceleration_sd=0.0, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.0
+    velocity_sd=4.0, acceleration_sd=0.1, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.03,
+    is_of_attitude=False,
 )  # fmt: skip
 # Accelerations, rotated into east and north by the autopilot's attitude: an error of half a degree is 0.09 m/s2.
 INERTIAL = Drift(
-    velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02
+    velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.1,
+    is_of_attitude=True,
 )  # fmt: skip
 
 
@@ -132,8 +135,10 @@ class DriftFilter:
     deviation, of one axis, of the error that all fixes share.
 
     The state has four parts, each east and north: `c` (m), the offset from the path to the aircraft; `s` (m/s), by how
-    much the aircraft is faster than the path; `b` (m/s2), the rate of change of `s`; and `m` (m), the offset from GPS
-    positions to fixes. A fix may be of a frame taken seconds ago: it is compared with the path at that time.
+    much the aircraft is faster than the path; `b` (m/s2), the part of gravity that an error of the attitude takes for
+    acceleration, the other way round, which for a path of accelerations is the rate of change of `s`; and `m` (m), the
+    offset from GPS positions to fixes. A fix may be of a frame taken seconds ago: it is compared with the path at that
+    time.
     """
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
@@ -151,8 +156,9 @@ class DriftFilter:
         """Predict the state `step_s` seconds later."""
         move = np.eye(8)
         move[_C, _S] = step_s * _EYE
-        move[_C, _B] = step_s**2 / 2 * _EYE
-        move[_S, _B] = step_s * _EYE
+        if self._drift.is_of_attitude:
+            move[_C, _B] = step_s**2 / 2 * _EYE
+            move[_S, _B] = step_s * _EYE
         drift = self._drift
         noise = drift.position_noise, drift.velocity_noise, drift.acceleration_noise, 0.0
         self._x = move @ self._x
@@ -172,7 +178,13 @@ class DriftFilter:
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float, lean_s2: float) -> None:
         """Correct the state by a fix of covariance (2, 2) that lay `off_m` (2,) metres from the path `age_s` ago. See
         `_seen` for `lean_s2`."""
-        self._correct(_seen(age_s, lean_s2), off_m, covariance_m2)
+        self._correct(self._seen(age_s, lean_s2), off_m, covariance_m2)
+
+    def hear_lean(self, over_height: Doubles, sd: float) -> None:
+        """Correct the state by the error of the attitude that a picture shows (see `recognise.perspective`)."""
+        look = np.zeros((2, 8))
+        look[:, _B] = _EYE / GRAVITY_M_S2
+        self._correct(look, over_height, sd**2 * _EYE)
 
     def trust_fix(self, off_m: Doubles, covariance_m2: Doubles, age_s: float, lean_s2: float) -> None:
         """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
@@ -184,7 +196,7 @@ class DriftFilter:
     def expected_fix(self, age_s: float, lean_s2: float) -> tuple[Doubles, Doubles]:
         """Predict a fix of a frame taken `age_s` seconds ago. Returns its offset (2,) from the path, metres, and the
         covariance (2, 2) of this prediction, without that of the fix itself. See `_seen` for `lean_s2`."""
-        look = _seen(age_s, lean_s2)
+        look = self._seen(age_s, lean_s2)
         return look @ self._x, look @ self._p @ look.T
 
     def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
@@ -194,9 +206,9 @@ class DriftFilter:
         - covariance (4, 4) of both.
         """
         look = np.zeros((4, 8))
-        look[:2] = _seen(age_s)
+        look[:2] = self._seen(age_s)
         look[:2, _M] = 0.0
-        look[2:, _S], look[2:, _B] = _EYE, -age_s * _EYE
+        look[2:, _S], look[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
         off = look @ self._x
         return off[:2], off[2:], look @ self._p @ look.T
 
@@ -207,12 +219,12 @@ class DriftFilter:
         kept = np.eye(8) - gain @ look
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
+    def _seen(self, age_s: float, lean_s2: float = 0.0) -> Doubles:
+        """Return the measurement matrix (2, 8) of a fix of a frame taken `age_s` seconds ago.
 
-def _seen(age_s: float, lean_s2: float = 0.0) -> Doubles:
-    """Return the measurement matrix (2, 8) of a fix of a frame taken `age_s` seconds ago.
-
-    `lean_s2` is the height above the ground over gravity (0: the fix rests on no attitude). An error of the autopilot's
-    attitude turns a part of gravity into acceleration over the ground, which `b` makes up for, and moves the point that
-    is taken to be under the aircraft: by the height over gravity times as much, and the other way.
-    """
-    return np.hstack([_EYE, -age_s * _EYE, (age_s**2 / 2 - lean_s2) * _EYE, _EYE])
+        `lean_s2` is the height above the ground over gravity (0: the fix rests on no attitude). An error of the
+        autopilot's attitude moves the point that is taken to be under the aircraft: by the height over gravity times
+        the part of gravity that it turns into acceleration over the ground, which `b` makes up for, and the other way.
+        """
+        by_acceleration = age_s**2 / 2 * self._drift.is_of_attitude - lean_s2
+        return np.hstack([_EYE, -age_s * _EYE, by_acceleration * _EYE, _EYE])

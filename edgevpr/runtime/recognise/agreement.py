@@ -12,7 +12,7 @@ The way that most of all matches follow is taken. Nothing is random: the same pi
 
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -91,7 +91,7 @@ class Agreement:
     taken from higher up), and its middle is moved from the place's middle by `shift_share` (dx to the right, dy down),
     as shares of the place's longest side. It then lies over the place. `covariance_share2` (var x, cov xy, var y) is
     that of the shift. All four are None without inliers. `is_expected` is False if the landmarks agree, but on another
-    overlay than the one that was expected.
+    overlay than the one that was expected. `coinciding` are the points of the inliers in query and place, complex (n,).
     """
 
     inliers: int
@@ -102,6 +102,7 @@ class Agreement:
     scale: float | None = None
     covariance_share2: Covariance | None = None
     is_expected: bool = True
+    coinciding: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
 
     @property
     def is_at_rest(self) -> bool:
@@ -163,6 +164,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
         rotation_deg=float(np.angle(turn_scale, deg=True)) % 360,
         scale=float(abs(turn_scale)),
         covariance_share2=(variance, 0.0, variance),
+        coinciding=(asked[along], known[along]),
     )
 
 

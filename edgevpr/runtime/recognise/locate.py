@@ -17,6 +17,7 @@ from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
+from edgevpr.runtime.recognise.perspective import Lean, lean_shown
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
@@ -36,7 +37,8 @@ class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
     pictures, and `footprint_m` the length on the ground of the longest side (None: unknown). `places` are the numbers
-    of the places that agree on it. `objection` is the reason not to trust the position (None: no reason)."""
+    of the places that agree on it. `objection` is the reason not to trust the position (None: no reason). `lean` is
+    what the picture shows of an error of the reported attitude, which the position is computed with."""
 
     position: Position
     covariance_m2: Covariance
@@ -45,6 +47,7 @@ class Located:
     footprint_m: float | None = None
     places: tuple[int, ...] = ()
     objection: str | None = None
+    lean: Lean | None = None
 
     @property
     def accuracy_m(self) -> float:
@@ -96,7 +99,7 @@ def located(
     and the first five with at least half of the best one's score determine the position. Those with such a score whose
     position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
     """
-    best, pose, aside = found[0].place, found[0].place.pose, view.aside or (0.0, 0.0)
+    best, pose, aside, lean = found[0].place, found[0].place.pose, view.aside or (0.0, 0.0), None
     first = _said(found[0], best, cells, aside)
     if first is None or best.position is None or pose is None:
         return None
@@ -105,6 +108,8 @@ def located(
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
         first = _said(found[0], best, cells, aside, proof) or first
         said.insert(0, (found[0].match.score, first))
+        if proof.coinciding:
+            lean = lean_shown(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
     least = _LIKE_THE_BEST * found[0].match.score
     agreeing = [(score, each) for score, each in said if first.agrees_with(each)]
     at_m, covariance = _joined([each for score, each in agreeing if score >= least][:_SAYING])
@@ -125,6 +130,7 @@ def located(
         footprint_m=pose.footprint_m * (first.height_ratio or 1.0),
         places=tuple(dict.fromkeys(each.place_id for _, each in agreeing)),
         objection=objection,
+        lean=lean,
     )
 
 

@@ -127,7 +127,10 @@ def _followed(followed: Followed) -> dict[str, Any]:
 
 
 def _located(where: Located) -> dict[str, Any]:
-    return _where(where) | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
+    fields = _where(where) | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
+    if where.lean:
+        fields["lean"] = [round(each, 4) for each in (*where.lean.over_height, where.lean.sd)]
+    return fields
 
 
 def _where(where: Located) -> dict[str, Any]:

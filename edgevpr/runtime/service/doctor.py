@@ -10,9 +10,8 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import AutopilotReading, Inquiry, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.camera import camera_findings, frame_seen
-from edgevpr.runtime.service.finding import Finding, FlightIntent, board_findings, fine, judged, looked_at, wrong
+from edgevpr.runtime.service.finding import Finding, board_findings, fine, judged, looked_at, wrong
 from edgevpr.runtime.service.rules import RULES
 
 _SLOW_S = 0.25  # for a round trip: fixes would come as late
@@ -45,14 +44,13 @@ def doctor(
             say(f"waiting for a frame of {uri}")
             about_camera.append(looked_at("frames", lambda: frame_seen(config.source)))
         about_board += about_camera
-    intent = FlightIntent(settings.send_fixes, 1 / (config.source.rate_hz or load_board(config.board).rate_hz))
     say(f"asking the autopilot at {address}")
     reading = None
     try:
         with Inquiry(address, settings.component_id, settings.system_id, signing) as asking:
             reading = read_autopilot(asking, {name: rules.parameters for name, rules in RULES.items()})
             if reading:
-                about_autopilot = list(autopilot_findings(reading, address, intent))
+                about_autopilot = list(autopilot_findings(reading, address, settings.send_fixes))
             else:
                 about_autopilot = [silence(address, asking.reader.bad_bytes, asking.others, asking.signing.refused)]
     except LinkError as error:
@@ -86,7 +84,7 @@ def silence(address: LinkAddress, bad_bytes: int, others: set[int], refused: Map
     return wrong("link", f"{address}: no heartbeat of an autopilot in 5 s: {_WHERE_SILENT[address.kind]}.")
 
 
-def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: FlightIntent) -> Iterator[Finding]:
+def autopilot_findings(reading: AutopilotReading, address: LinkAddress, sends_fixes: bool) -> Iterator[Finding]:
     """Check what was read from the autopilot against what the flight will do, and yield a finding for each check: those
     for every autopilot, and those of the rules of its firmware."""
     yield _link(reading, address)
@@ -100,10 +98,10 @@ def autopilot_findings(reading: AutopilotReading, address: LinkAddress, intent: 
         fixes = (
             "It is neither ArduPilot nor PX4: a flight would send it fixes by command 43003, untried with it: fly dry."
         )
-        yield judged("firmware", not intent.sends_fixes, dry, fixes, "mavlink: {send_fixes: false}")
+        yield judged("firmware", not sends_fixes, dry, fixes, "mavlink: {send_fixes: false}")
     elif reading.answers:
         yield _firmware(reading)
-        yield from RULES[reading.firmware].findings(reading, intent)
+        yield from RULES[reading.firmware].findings(reading, sends_fixes)
     if reading.answers:
         yield from (_streams(reading), _filter(reading), _gps(reading), _origin(reading), _clock(reading))
 
@@ -171,8 +169,10 @@ def _filter(reading: AutopilotReading) -> Finding:
     if reading.filter_flags is None:
         return wrong("filter", "It does not say how its filter is, so no fix could be weighed against it.")
     flags, has = f"flags 0x{reading.filter_flags:x}", reading.filter_flags
-    # In constant-position mode the filter takes the vehicle to stand still, since it has nothing to navigate by.
-    if has & mavlink.EKF_ATTITUDE and has & mavlink.EKF_POS_HORIZ_ABS and not has & mavlink.EKF_CONST_POS_MODE:
+    # In constant-position mode ArduPilot's filter takes the vehicle to stand still, since it has nothing to navigate
+    # by. PX4's says so too while it stands still.
+    is_lost = has & mavlink.EKF_CONST_POS_MODE and reading.firmware != "px4"
+    if has & mavlink.EKF_ATTITUDE and has & mavlink.EKF_POS_HORIZ_ABS and not is_lost:
         return fine("filter", f"attitude and position are known ({flags})")
     lacks = "position" if has & mavlink.EKF_ATTITUDE else "attitude"
     return wrong("filter", f"The filter has no {lacks} yet ({flags}): wait, outdoors and standing still.")

@@ -22,15 +22,6 @@ LOG_ROOM_MB = 10  # some hours of queries
 _NOBODYS_GROUPS = ("root", "tty")  # devices of these are held by a login shell, or kept from all users: none is to join
 
 
-@dataclass(frozen=True, slots=True)
-class FlightIntent:
-    """Intent of a flight, for the checks of an autopilot: `sends_fixes` (False: a dry run), and `every_s`, the
-    seconds between two queries."""
-
-    sends_fixes: bool
-    every_s: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """Result of one check. `what`: name of what was checked. `message`: a description of it or, if it is not `ok`, one

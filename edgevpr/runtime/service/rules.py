@@ -1,8 +1,8 @@
 """Rules of `edgevpr doctor` for each firmware: whether the channel that the flight will choose can carry positions to
 this vehicle, and which parameters to change if not.
 
-Every rule of ArduPilot is based on the sources of 4.7-dev and was flown in simulation with GPS taken away; every rule
-of PX4 is based on the sources of 1.17-alpha.
+Every rule of ArduPilot is based on the sources of 4.7-dev, every rule of PX4 on those of 1.17-alpha; their channels
+were flown in simulation with GPS taken away, with PX4 1.18-beta1.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +24,7 @@ from edgevpr.mavlink.channel import (
     receiver_name,
 )
 from edgevpr.mavlink.messages import SENSOR_ID
-from edgevpr.runtime.service.finding import Finding, FlightIntent, fine, judged, wrong
+from edgevpr.runtime.service.finding import Finding, fine, judged, wrong
 
 Parameters = Mapping[str, float | int]
 
@@ -34,30 +34,29 @@ _SWITCH = f"GPS_AUTO_SWITCH={_USE_BEST}"
 _SOURCE_SETS = (1, 2, 3)
 _VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
 _MOST_DELAY_MS = 50  # edgevpr sends its position for the moment of sending
-SILENT_S = 5.0  # aux_global_position.cpp: after so long without message 296, PX4 no longer uses its positions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirmwareRules:
     """Rules of one firmware. `knows_fixes`: first version (major, minor) that takes position fixes. `parameters`: names
-    of the parameters to be read. `findings` checks the answers of an autopilot for a flight. `port_changes` takes a
-    baud rate and returns the parameters that the autopilot's serial port needs for it, each as a text such as
-    "SERIALn_PROTOCOL=2" (n: the number of the port)."""
+    of the parameters to be read. `findings` checks the answers of an autopilot for a flight that sends fixes or not.
+    `port_changes` takes a baud rate and returns the parameters that the autopilot's serial port needs for it, each as a
+    text such as "SERIALn_PROTOCOL=2" (n: the number of the port)."""
 
     name: str
     knows_fixes: tuple[int, int]
     parameters: tuple[str, ...]
-    findings: Callable[[AutopilotReading, FlightIntent], Iterator[Finding]]
+    findings: Callable[[AutopilotReading, bool], Iterator[Finding]]
     port_changes: Callable[[int], tuple[str, ...]]
 
 
-def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
+def _ardupilot_findings(reading: AutopilotReading, sends_fixes: bool) -> Iterator[Finding]:
     parameters, choice = reading.parameters, ardupilot_choice(reading.kind, reading.parameters)
     wanted = (("EK3_ENABLE", 1), ("AHRS_EKF_TYPE", 3))
     changes = [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]
     good, bad = "the filter that takes fixes is in use", "Only the third EKF takes fixes: use it, and reboot."
     yield judged("EKF3", not changes, good, bad, *changes)
-    if choice.channel.is_continuous and not intent.sends_fixes:
+    if choice.channel.is_continuous and not sends_fixes:
         yield _dry(choice, reading)
     elif choice.channel is Channel.GPS_INPUT:
         yield _by_gps(choice, parameters)
@@ -65,7 +64,7 @@ def _ardupilot_findings(reading: AutopilotReading, intent: FlightIntent) -> Iter
         yield _by_odometry(choice, reading)
     else:
         channel = _single_fixes(choice, reading)
-        if not channel.ok and not intent.sends_fixes:
+        if not channel.ok and not sends_fixes:
             needs = f"The first flight with fixes on needs {' and '.join(channel.changes)}: {channel.message}"
             channel = fine("channel", f"A dry run (`send_fixes: false`) needs no change. {needs}")
         yield channel
@@ -142,19 +141,8 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
     )
 
 
-def _px4_findings(reading: AutopilotReading, intent: FlightIntent) -> Iterator[Finding]:
-    choice = px4_choice(reading.kind, reading.parameters)
-    yield _px4_channel(choice, reading)
-    rarity = f"a query every {intent.every_s:g} s, and PX4 drops positions after {SILENT_S:g} s of silence"
-    if choice.channel is Channel.SENSOR:
-        yield judged(
-            "rate",
-            intent.every_s < SILENT_S,
-            rarity,
-            f"There is {rarity}: it would never keep one. Ask more often, where `edgevpr profile "
-            "--rate-hz` says that the board can, or take a faster board.",
-            f"source: {{rate_hz: {2 / SILENT_S:g}}}, or more: not every query is a match",
-        )
+def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Finding]:
+    yield _px4_channel(px4_choice(reading.kind, reading.parameters), reading)
     yield _port(reading, "MAV_PROTO_VER=2")
 
 
@@ -168,7 +156,7 @@ def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
             f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
             "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
             "optical flow.",
-            "PX4 1.17 or later, with EKF2_AGP0_CTRL",
+            "PX4 1.18 or later, with EKF2_AGP0_CTRL",
             "or EKF2_OF_CTRL=1",
         )
     wanted = (

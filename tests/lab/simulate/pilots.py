@@ -2,9 +2,11 @@
 
 import math
 import os
+import signal
 import socket
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from freeflight import Piloted
@@ -15,6 +17,7 @@ from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ARDUPILOT = os.environ.get("EDGEVPR_ARDUPILOT")  # the folder of a built ArduPilot
+PX4 = os.environ.get("EDGEVPR_PX4")  # the folder of a built PX4
 _INSTANCE = 5
 _SPEEDUP = 3
 _REPORTS_HZ = {24: 5, 33: 10, 108: 10, 193: 10}  # GPS_RAW_INT, GLOBAL_POSITION_INT, SIM_STATE, EKF
@@ -152,8 +155,8 @@ class Pilot:
 class _Simulated:
     """The bytes of a simulated flight controller. Each read turns its clock on."""
 
-    def __init__(self, kind: str, parameters: dict[str, float]) -> None:
-        self.controller = Piloted(f"ardu{kind}", **parameters)
+    def __init__(self, vehicle: str, parameters: dict[str, float]) -> None:
+        self.controller = Piloted(vehicle, **parameters)
         self._receiver, self._packer = PacketReader(), mavlink.MAVLink(None, 1, 1)
         self._said, self._now_s = b"", 0.0
 
@@ -220,9 +223,48 @@ class _Real:
             self._process.wait()
 
 
-def pilot_of(which: str, kind: str, parameters: dict[str, float], folder: Path) -> Pilot:
+class _RealPx4:
+    """A real PX4 in its own simulator, over UDP, at the altitude of the ground."""
+
+    def __init__(self, parameters: dict[str, float], folder: Path) -> None:
+        home = dict(zip(("LAT", "LON", "ALT"), (ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), strict=True))
+        own = {f"PX4_HOME_{name}": str(value) for name, value in home.items()}
+        own |= {f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()}
+        own |= {"PX4_SIMULATOR": "sihsim", "PX4_SIM_MODEL": "sihsim_quadx", "HEADLESS": "1"}
+        command = [f"{PX4}/bin/px4", "-d", f"{PX4}/etc", "-w", str(folder)]
+        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self._process = subprocess.Popen(
+            command, cwd=folder, env={**os.environ, **own}, start_new_session=True, **streams
+        )
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", 14550))
+        self._sock.settimeout(0.2)
+
+    def send(self, data: bytes) -> None:
+        with suppress(OSError):
+            self._sock.sendto(data, ("127.0.0.1", 18570))
+
+    def recv(self, size: int) -> bytes:
+        try:
+            return self._sock.recv(size)
+        except OSError:
+            return b""
+
+    def close(self) -> None:
+        self._sock.close()
+        os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+def pilot_of(which: str, vehicle: str, parameters: dict[str, float], folder: Path) -> Pilot:
     """Start a flight controller, "simulated" or "real", and return the pilot at it."""
-    pilot = Pilot(_Simulated(kind, parameters) if which == "simulated" else _Real(kind, parameters, folder))
+    if which == "simulated":
+        port = _Simulated(vehicle, parameters)
+    elif vehicle.startswith("px4"):
+        port = _RealPx4(parameters, folder)
+    else:
+        port = _Real(vehicle.removeprefix("ardu"), parameters, folder)
+    pilot = Pilot(port)
     try:
         # Over a link that is told to stream nothing, its clock is seen in SYSTEM_TIME alone.
         pilot.send(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3))
@@ -233,7 +275,8 @@ def pilot_of(which: str, kind: str, parameters: dict[str, float], folder: Path) 
         pilot.send(mavlink.MAVLink_command_long_message(1, 1, 511, 0, number, 50_000, 0, 0, 0, 0, 0))
         while "SYSTEM_TIME" not in pilot.last and time.monotonic() < give_up_s:
             pilot.read()
-        pilot.stream()
+        if not vehicle.startswith("px4"):
+            pilot.stream()
     except BaseException:
         pilot.close()
         raise

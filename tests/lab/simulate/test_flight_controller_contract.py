@@ -38,7 +38,7 @@ copter = flies("copter", GPS2_TYPE=14, GPS_AUTO_SWITCH=1)
 def pilot(request, tmp_path_factory):
     """A plane that circles, or a copter on the ground whose second GPS comes over the link."""
     which, kind, parameters = request.param
-    pilot = pilot_of(which, kind, dict(parameters), tmp_path_factory.mktemp(kind))
+    pilot = pilot_of(which, f"ardu{kind}", dict(parameters), tmp_path_factory.mktemp(kind))
     try:
         pilot.wait_ready()
         if kind == "plane":

@@ -8,6 +8,7 @@ from pictures import textured
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
+from edgevpr.frames.level import Levelled, View
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -38,7 +39,7 @@ class Aircraft:
             self.vehicle = vehicle_at(*here, self.t_s, velocity_m_s=velocity, roll_deg=0.0, pitch_deg=0.0, **said)
             self.navigator.hear_vehicle(self.vehicle)
 
-    def told(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True):
+    def told(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True, turned_deg=None):
         """The advice on a match `after_s` seconds after the loss of GPS, `off_m` (east, north) off the aircraft."""
         if heard:
             self.go_on(START_S + after_s)
@@ -47,11 +48,17 @@ class Aircraft:
         place = Place(place_id=places[0] if places else 1, source_image="", position=Position(*here))
         event = Recognition(
             frame=frame,
+            picture=Levelled(frame.image, None, View(up_deg=0.0)),
             vehicle=self.vehicle,
             best=Candidate(place, FineMatch(0.5)),
             accepted=True,
             reason="",
-            located=Located(position=Position(*here), covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2), places=places),
+            located=Located(
+                position=Position(*here),
+                covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2),
+                places=places,
+                heading_deg=turned_deg,
+            ),
             accuracy_m=fix_sd_m,
             steps=Steps(),
             cost=NO_COST,
@@ -111,6 +118,33 @@ def test_places_that_are_partly_the_same_are_not_independent():
     assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (2, 3))) == [True, True]
     assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (3, 4))) == [True, False]
     assert Aircraft().held(((500, 0), 1, ()), ((500, 0), 2, ())) == [True, True], "by the best place"
+
+
+def test_a_picture_that_is_suddenly_turned_against_the_compass_is_held_back_until_others_say_the_same():
+    aircraft = Aircraft()
+    told = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=3.0) for t_s in range(1, 4)]
+    assert [advice.is_held for advice in told] == [False] * 3
+    alone = aircraft.told((0, 0), 4, places=(4,), turned_deg=180.0)
+    assert "turned by" in alone.why
+    assert "against the compass" in alone.why
+    assert not aircraft.told((0, 0), 5, places=(5,), turned_deg=3.0).is_held
+    broken = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=100.0).is_held for t_s in range(6, 12)]
+    assert broken == [True, True, True, False, False, False], "a compass that has gone wrong"
+
+
+def test_a_compass_that_was_wrong_from_the_start_is_none_of_its_business():
+    aircraft = Aircraft()
+    told = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=140.0).is_held for t_s in range(1, 6)]
+    assert told == [False] * 5
+
+
+def test_matches_win_over_a_path_that_parts_from_them_faster_than_it_drifts():
+    aircraft = Aircraft()
+    told = [aircraft.told((200 + 20 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 5)]
+    assert [advice.is_held for advice in told] == [True, True, True, False]
+    aircraft = Aircraft()
+    told = [aircraft.told((200 + 60 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 9)]
+    assert all(advice.is_held for advice in told), "no aircraft of ours flies through these"
 
 
 def test_a_single_wrong_one_among_right_ones_is_all_that_is_held_back():

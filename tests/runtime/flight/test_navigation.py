@@ -9,9 +9,10 @@ from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.navigation import Navigation, PositionedMatch
+from edgevpr.runtime.flight.navigation import BELIEVED, Navigation, PositionedMatch, Weighed
 from edgevpr.runtime.flight.navigator import Slew
 from edgevpr.runtime.flight.path import GRAVITY_M_S2, INERTIAL, RECKONED
+from edgevpr.runtime.recognise.perspective import Lean
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
@@ -68,11 +69,11 @@ class Flown:
                 said_m.append(here.accuracy_m)
         return np.array(errors_m), np.array(said_m)
 
-    def fix(self, off_m=(0.0, 0.0), is_against=False):
+    def fix(self, off_m=(0.0, 0.0), verdict=BELIEVED):
         t_s = (self.step - self.late_steps) * STEP_S
         seen = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2) + off_m
         seen_fix = match_at(Position(*moved(*HOME, *seen)), t_s, self.fix_sd_m)
-        self.navigation.hear_fix(self.navigation.compared(seen_fix), is_against)
+        self.navigation.hear_fix(self.navigation.compared(seen_fix), verdict)
 
 
 def lengths(errors_m):
@@ -94,22 +95,45 @@ def test_fixes_hold_the_position_and_what_it_says_of_itself_is_true(drift, wrong
 
 
 def test_what_an_error_of_the_attitude_does_to_fix_and_path_is_known_to_be_one():
-    """An attitude that is two degrees wrong, 100 m above the ground, moves every fix by 3.5 m."""
+    """An attitude that is two degrees wrong, 100 m above the ground, moves every fix by 3.5 m; this one wanders."""
     lean_s2, median_m = 100 / GRAVITY_M_S2, {}
-    for is_told in (True, False):
+    for told in ("nothing", "that it is one", "that, and what the picture shows of it"):
         flown = Flown(INERTIAL, bias=(0.34, 0.0), fix_sd_m=0.5)
 
-        def fix(flown=flown, is_told=is_told):
+        def fix(flown=flown, told=told):
+            flown.bias = flown.bias + flown.rng.normal(0, 0.05, 2)
             t_s = (flown.step - flown.late_steps) * STEP_S
             seen = flown.way[flown.step - flown.late_steps] + lean_s2 * flown.bias + flown.rng.normal(0, 0.5, 2)
             match = match_at(Position(*moved(*HOME, *seen)), t_s, 0.5)
-            flown.navigation.hear_fix(flown.navigation.compared(replace(match, lean_s2=lean_s2 if is_told else 0.0)))
+            shown = Lean(tuple(flown.rng.normal(-flown.bias / GRAVITY_M_S2, 0.02)), 0.02)
+            match = replace(match, lean_s2=0.0 if told == "nothing" else lean_s2)
+            match = replace(match, lean=shown if "shows" in told else None)
+            flown.navigation.hear_fix(flown.navigation.compared(match))
 
         flown.fix = fix
         flown.fly(10, has_gps=True, fixes=False)
-        median_m[is_told] = np.median(lengths(flown.fly(120)[0][30:]))
-    assert median_m[True] < 1.0
-    assert median_m[True] < 0.75 * median_m[False]
+        median_m[told] = np.median(lengths(flown.fly(120)[0][30:]))
+    nothing, one, shown = median_m.values()
+    assert one < 0.75 * nothing
+    assert shown < 0.85 * one
+
+
+def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopilot_that_reckons():
+    flown = Flown(RECKONED, fix_sd_m=0.5)
+    flown.fly(10, has_gps=True, fixes=False)
+    lean_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
+
+    def fix():
+        t_s = (flown.step - flown.late_steps) * STEP_S
+        seen = flown.way[flown.step - flown.late_steps] - 100 * wrong + flown.rng.normal(0, 0.5, 2)
+        shown = Lean(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
+        match = replace(match_at(Position(*moved(*HOME, *seen)), t_s, 0.5), lean_s2=lean_s2, lean=shown)
+        flown.navigation.hear_fix(flown.navigation.compared(match))
+
+    flown.fix = fix
+    errors_m, said_m = flown.fly(120)
+    assert np.median(lengths(errors_m[20:])) < 1.5
+    assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
 def test_without_fixes_it_knows_that_it_knows_less_and_less():
@@ -140,7 +164,7 @@ def test_what_all_fixes_are_off_by_is_learnt_while_there_is_gps():
 def test_one_that_is_believed_against_all_replaces_what_was_known():
     flown = Flown(RECKONED)
     flown.fly(20, has_gps=True)
-    flown.fix((300.0, 0.0), is_against=True)
+    flown.fix((300.0, 0.0), Weighed(is_against=True))
     here = flown.navigation.at(flown.t_s)
     east_m, north_m = flown.at_m
     truth = moved(*HOME, east_m + 300.0, north_m)
@@ -174,7 +198,7 @@ def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
     flown.fly(10, has_gps=True)
     behind_m = [slew.followed(flown.navigation.at(flown.t_s))[2] for _ in range(2)]
     assert behind_m == [0.0, 0.0]
-    flown.fix((30.0, 0.0), is_against=True)
+    flown.fix((30.0, 0.0), Weighed(is_against=True))
     last, steps_m, behind_m = None, [], []
     for _ in range(150):
         flown.fly(0.1, fixes=False)

@@ -93,16 +93,20 @@ def test_what_is_claimed_is_met(how):
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
 
 
-def test_an_autopilot_that_fuses_what_it_gets_is_sent_every_match_and_nothing_ahead_of_the_wind():
+def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has():
     navigator = Navigator(1.0, 1.0)
     navigator.hear_channel(Channel.SENSOR)
-    air = lost(navigator, wind=WIND)
-    air.takes_fixes = False  # it fuses them
+    air = Air(navigator, wind=WIND).fly(30)
+    assert not said_states(air)
+    air.lose_gps()
     air.fly(150)
-    advices = [advice for t_s, advice in air.advices if t_s > 35]
-    assert all(advice.fix for advice in advices)
-    off_m = np.array([air.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s) for _, fix in air.sent[60:]])
-    assert abs(off_m.mean(axis=0)).max() < 1.5, "6 m/s in half a second are 3 m"
+    said = said_states(air, from_s=32.0)
+    assert len(said) > 0.99 * 10 * 148
+    off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
+    claimed_m = np.array([state.accuracy_m for _, state in said])
+    assert lengths(off_m).max() < 10.0, "of matches that are 3 m off"
+    assert (abs(off_m) < claimed_m[:, None]).mean() > 0.58
+    assert (abs(off_m) < 2 * claimed_m[:, None]).mean() > 0.92
 
 
 def test_a_picture_that_cannot_be_levelled_is_withheld_and_says_why():

@@ -18,11 +18,10 @@ from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import autopilot_findings, silence
-from edgevpr.runtime.service.finding import FlightIntent
-from edgevpr.runtime.service.rules import RULES, SILENT_S
+from edgevpr.runtime.service.rules import RULES
 
 UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
-FIXES, DRY = FlightIntent(sends_fixes=True, every_s=1.0), FlightIntent(sends_fixes=False, every_s=1.0)
+FIXES, DRY = True, False
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
 READY = 0x33F
 COPTER = AutopilotReading(
@@ -260,20 +259,9 @@ def test_a_dry_run_could_not_arm_with_what_waits_for_positions(parameters, chang
 # PX4.
 
 
-def test_a_px4_that_is_told_too_rarely_would_keep_no_position():
-    assert "4.9 s" in said(PX4, "rate", plan=FlightIntent(True, 4.9))
-    for plan in (FlightIntent(True, 5.0), FlightIntent(False, 5.0)):
-        assert set(wrong(PX4, plan=plan)) == {"rate"}
-    assert "source: {rate_hz: 0.4}" in wrong(PX4, plan=FlightIntent(True, 5.0))["rate"][0]
-    plane = replace(PX4, vehicle="plane", parameters={})  # command 43003: it reckons from fix to fix
-    assert wrong(plane, plan=FlightIntent(True, 5.0)) == {}
-    assert "rate" not in {each.what for each in autopilot_findings(COPTER, UDP, FlightIntent(True, 5.0))}
-
-
-def test_the_page_of_px4_names_the_same_silence():
-    page = " ".join((Path(__file__).parents[3] / "docs/how-to/px4.md").read_text().split())
-    silence_s = re.search(r"PX4 stops using positions after (\d+) s of silence", page)[1]
-    assert float(silence_s) == SILENT_S
+def test_a_px4_that_stands_still_with_gps_is_fine_and_an_ardupilot_that_says_the_same_is_not():
+    assert wrong(replace(PX4, filter_flags=0x3FF)) == {}, "as a real one says on the pad"
+    assert set(wrong(replace(COPTER, filter_flags=0x3FF))) == {"filter"}
 
 
 def test_a_px4_that_can_take_positions_is_told_how():
@@ -285,7 +273,7 @@ def test_a_px4_that_can_take_positions_is_told_how():
 
 def test_a_px4_without_message_296_must_reckon_well_by_itself():
     without = replace(PX4, parameters={})
-    assert wrong(without) == {"channel": ("PX4 1.17 or later, with EKF2_AGP0_CTRL", "or EKF2_OF_CTRL=1")}
+    assert wrong(without) == {"channel": ("PX4 1.18 or later, with EKF2_AGP0_CTRL", "or EKF2_OF_CTRL=1")}
     assert wrong(replace(without, vehicle="plane")) == {}
     assert wrong(with_parameters(without, EKF2_OF_CTRL=1)) == {}
 
@@ -373,7 +361,7 @@ def test_the_command_over_a_link(link, capsys, tmp_path, monkeypatch):
 
 @pytest.mark.network
 @pytest.mark.usefixtures("_quick")
-def test_the_command_knows_from_the_configuration_that_the_run_is_dry_and_how_often_it_asks(link, capsys, tmp_path):
+def test_the_command_knows_from_the_configuration_that_the_run_is_dry(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text("board: rpi-zero-2w\nmavlink: {send_fixes: false}\nlog: {path: null}\n")
     with peer(link, parameters=PLAIN):
@@ -381,14 +369,12 @@ def test_the_command_knows_from_the_configuration_that_the_run_is_dry_and_how_of
     autopilot = AutopilotThread(link.replace("udpin", "udpout"), vehicle="px4-copter")
     try:
         main(["doctor", "--config", str(config), "--link", link])
-        slow = findings_of(capsys.readouterr().out)
-        config.write_text(config.read_text() + "source: {rate_hz: 0.5}\n")
-        main(["doctor", "--config", str(config), "--link", link])
-        quick = findings_of(capsys.readouterr().out)
+        found = findings_of(capsys.readouterr().out)
     finally:
         autopilot.finish()
-    assert (slow["channel"][0], slow["rate"][0], quick["rate"][0]) == (True, False, True)
-    assert quick["clock"][0], "its time is that of this machine"
+    assert found["channel"][0]
+    assert found["filter"][0]
+    assert found["clock"][0], "its time is that of this machine"
 
 
 @pytest.mark.network

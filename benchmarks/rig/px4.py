@@ -1,0 +1,158 @@
+"""PX4's own simulator (SIH) as a process, with the interface of ArduPilot's."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+from link import Link, Listener
+from scenarios import COPTER_CIRCUIT_M, COPTER_HOME_M, COPTER_SPEED_M_S, HOME_M
+from simulator import at_degrees
+
+from edgevpr.mavlink.wire import Message, mavlink
+
+VARIABLE = "EDGEVPR_PX4"
+OWN_PORTS, COMPANION_PORTS = (14550, 18570), (14540, 14580)  # of each: where PX4 sends to, and where it listens
+GROUND_ALT_M = 1.0  # of the simulated ground: a plane's height control begins at an altitude of 0 and ramps from there
+# What an aircraft of the simulator needs to fly a mission that nobody holds a transmitter for, and that ends nowhere.
+PARAMETERS = {
+    "COM_RCL_EXCEPT": 15,
+    "NAV_RCL_ACT": 0,
+    "NAV_DLL_ACT": 0,
+    "MIS_TKO_LAND_REQ": 1,
+    "COM_LOW_BAT_ACT": 0,
+    "SIM_BAT_DRAIN": 0,
+    "SDLOG_MODE": -1,
+}
+# The airframe of 1.18 sets the thrust by a name that its simulator no longer reads: at 2 N it never leaves the ground.
+_OF_VEHICLE = {"plane": {"SIH_F_T_MAX": 6.0, "SIH_F_Q_MAX": 0.03}, "copter": {}}
+_MODELS = {"plane": "sihsim_airplane", "copter": "sihsim_quadx"}
+_AUTO, _MISSION = 4, 4
+MODES = {f"AUTO.{name}": _AUTO << 16 | number << 24 for name, number in (("MISSION", 4), ("RTL", 5), ("LAND", 6))}
+MODES |= {"AUTO.LOITER": _AUTO << 16 | 3 << 24, "DESCEND": 4 << 16 | 10 << 24}
+_STREAMS_HZ = {
+    mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 50,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 5,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
+}
+_CIRCUIT_M = ((340.0, 730.0), (1060.0, 730.0), (1060.0, 260.0), (340.0, 260.0))
+
+
+def build() -> Path | None:
+    """Return the folder of the PX4 build that EDGEVPR_PX4 names, None where none is there."""
+    folder = Path(os.environ.get(VARIABLE, ""))
+    return folder.resolve() if (folder / "bin/px4").exists() else None
+
+
+class Px4:
+    """A PX4 that starts with the `with` block and ends with it; `home_m` is where it stands, metres east and north."""
+
+    def __init__(
+        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
+    ) -> None:
+        self._vehicle, self._folder, self._listeners = vehicle, folder, listeners
+        lat_deg, lon_deg = at_degrees(*home_m)
+        home = {"PX4_HOME_LAT": f"{lat_deg:.7f}", "PX4_HOME_LON": f"{lon_deg:.7f}", "PX4_HOME_ALT": str(GROUND_ALT_M)}
+        model = {"PX4_SIMULATOR": "sihsim", "PX4_SIM_MODEL": _MODELS[vehicle], "HEADLESS": "1"}
+        self._parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters
+        own = {f"PX4_PARAM_{name}": str(value) for name, value in self._parameters.items()}
+        self._environment = {**os.environ, **home, **model, **own}
+        self._process: subprocess.Popen | None = None
+        self.link: Link | None = None
+
+    def __enter__(self) -> "Px4":
+        self._folder.mkdir(parents=True)
+        try:
+            self._start()
+        except BaseException:
+            self.kill()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def _start(self) -> None:
+        command = [str(build() / "bin/px4"), "-d", str(build() / "etc"), "-w", str(self._folder)]
+        with open(self._folder / "simulator.txt", "ab") as said:
+            streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
+            self._process = subprocess.Popen(
+                command, cwd=self._folder, env=self._environment, start_new_session=True, **streams
+            )
+        station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        station.bind(("127.0.0.1", OWN_PORTS[0]))
+        station.connect(("127.0.0.1", OWN_PORTS[1]))
+        self.link = Link(station, self._listeners, bytewise=True)
+        if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
+            raise RuntimeError(f"PX4 says nothing: see {self._folder}/simulator.txt")
+        for number, rate_hz in _STREAMS_HZ.items():
+            self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
+
+    def kill(self) -> None:
+        """End the process."""
+        if self.link:
+            self.link.close()
+        if self._process:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self.link = self._process = None
+
+    def take_off(self, height_m: float) -> None:
+        """Start the mission, and wait until the aircraft is at that height. Raises RuntimeError where it never is."""
+        self._wait_ready()
+        self.link.upload(_mission(self._vehicle, height_m))
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _AUTO, _MISSION)
+        for _ in range(30):
+            if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
+                break
+            time.sleep(1)
+        else:
+            raise RuntimeError("PX4 does not arm")
+        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda told: told.relative_alt > 950 * height_m, 180):
+            raise RuntimeError(f"{height_m:.0f} m are not reached")
+
+    def set_gps(self, is_on: bool) -> None:
+        self.link.set_parameter("SIM_GPS_USED", 10 if is_on else 0)
+
+    def set_wind(self, from_deg: float, speed_m_s: float) -> None:
+        if from_deg != 270.0:
+            raise ValueError("the wind blows from the west")
+        self.link.set_parameter("SIH_WIND_E", float(speed_m_s))
+
+    def _wait_ready(self) -> None:
+        give_up_s = time.monotonic() + 120
+        while time.monotonic() < give_up_s:
+            filter_, gps, status = (self.link.last.get(n) for n in ("ESTIMATOR_STATUS", "GPS_RAW_INT", "SYS_STATUS"))
+            if filter_ and gps and status:
+                is_placed = filter_.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS and gps.fix_type >= 3
+                if is_placed and status.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK:
+                    return
+            time.sleep(0.1)
+        raise RuntimeError("PX4 is never ready")
+
+
+def _mission(vehicle: str, height_m: float) -> list[Message]:
+    """Make the mission: take off, then round and round the corners of a circuit, (east, north) each."""
+    takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
+    free = (0, 0, 0, float("nan"))
+    if vehicle == "plane":
+        rows = [(takeoff, free, (HOME_M[0], HOME_M[1] + 320), 0.6 * height_m)]
+        rows += [(waypoint, free, corner_m, height_m) for corner_m in _CIRCUIT_M]
+        rows += [(jump, (1, -1, 0, 0), None, 0)]
+    else:
+        rows = [(takeoff, free, COPTER_HOME_M, height_m)]
+        rows += [(mavlink.MAV_CMD_DO_CHANGE_SPEED, (1, COPTER_SPEED_M_S, -1, 0), None, 0)]
+        rows += [(waypoint, free, corner_m, height_m) for corner_m in COPTER_CIRCUIT_M]
+        rows += [(jump, (2, -1, 0, 0), None, 0)]
+    items = []
+    for number, (command, values, at_m, up_m) in enumerate(rows):
+        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)
+        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if at_m else mavlink.MAV_FRAME_MISSION
+        own = (number, frame, command, int(number == 0), 1, *values, lat, lon, up_m)
+        items.append(mavlink.MAVLink_mission_item_int_message(1, 1, *own))
+    return items

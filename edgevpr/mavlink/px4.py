@@ -1,0 +1,49 @@
+"""Use of GPS and of our positions by a PX4, as its filter's report (ESTIMATOR_STATUS) tells it: it has a flag that is
+set while the filter fuses GPS or our positions, and a message 296 is never answered. Read in the sources of 1.18 (EKF2,
+`Ekf::get_ekf_soln_status`), and held beside a real 1.17.0 and 1.18-beta1."""
+
+import math
+
+from edgevpr.mavlink.wire import Message, mavlink
+
+_FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+_OUR_MARK_S = 6.0  # so long after our last position the flag may still be about ours: PX4 waits for 5 s
+_UNUSED_FOR_S = 2.0  # of a receiver with a fix: one that has just lost it, or got it, is judged by its reports
+
+
+class Px4Use:
+    """Keeps whether PX4 `uses_gps` while a receiver has a fix: with EKF2_GPS_CTRL=0, or when it rejects GPS, it does
+    not. Of its reports while our positions are sent, `used` and `unused` count those that say that they are fused, or
+    not."""
+
+    def __init__(self) -> None:
+        self.uses_gps = True
+        self.used = self.unused = 0
+        self._sent_s = self._unused_since_s = -math.inf
+        self._is_unused = self._is_telling = False  # before 1.16 the flag is that of a position, of whatever source
+
+    @property
+    def used_share(self) -> float | None:
+        """Share of the reports that say that our positions are used; None without one."""
+        count = self.used + self.unused
+        return self.used / count if count else None
+
+    def note_sent(self, now_s: float) -> None:
+        """Note that a position was sent at `now_s` (-inf: none was)."""
+        self._sent_s = max(self._sent_s, now_s)
+
+    def hear(self, report: Message, now_s: float, has_fix: bool) -> None:
+        """Process an ESTIMATOR_STATUS. `has_fix`: a GPS receiver has one."""
+        is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
+        self._is_telling |= is_fusing
+        if now_s - self._sent_s < 1.0:
+            is_used = is_fusing and not report.pos_horiz_ratio > 1  # a ratio above 1 is beyond the filter's gate
+            self.used, self.unused = self.used + is_used, self.unused + (not is_used)
+        if now_s - self._sent_s <= _OUR_MARK_S or not self._is_telling:
+            return
+        if is_fusing or not has_fix:
+            self._is_unused, self.uses_gps = False, self.uses_gps or is_fusing
+        elif not self._is_unused:
+            self._is_unused, self._unused_since_s = True, now_s
+        elif now_s - self._unused_since_s >= _UNUSED_FOR_S:
+            self.uses_gps = False

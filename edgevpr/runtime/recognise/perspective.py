@@ -1,0 +1,66 @@
+"""The tilt of a camera that its pictures show, beyond the one that the autopilot reports.
+
+A picture is levelled by the reported attitude. If that is wrong, the picture is still tilted by the error, and its
+landmarks do not lie on those of the place by one rotation, scaling and shift alone: a tilt moves a landmark by a part
+that grows with the square of its distance from the point under the camera. That part is fitted here. The rest of it,
+the same for all landmarks, cannot be told from a shift: it is what a wrong attitude does to a position.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.arrays import Array
+from edgevpr.core.geodesy import axes_of
+from edgevpr.frames.level import View
+
+_FEWEST = 12  # landmarks
+# Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
+_ALIKE, _PLACE_SD = 10.0, math.tan(math.radians(0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class Lean:
+    """By how much the camera leans more than was reported. `over_height` (east, north) is a share of the height above
+    the ground: the point under the camera is that far from where the reported attitude puts it. `sd` is the standard
+    deviation of each axis."""
+
+    over_height: tuple[float, float]
+    sd: float
+
+
+def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | None:
+    """Return the lean that landmarks show; None if they are too few, or the view has no attitude or focal length.
+
+    `asked` and `known`, complex (n,), are the landmarks of query and place that agree, as in `agreement`. `up_deg` is
+    the compass direction of the top of the query's levelled picture.
+    """
+    count = len(asked)
+    if count < _FEWEST or view.aside is None or view.focal is None:
+        return None
+    # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
+    # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
+    ray = (asked - complex(view.aside[0], -view.aside[1])) / view.focal
+    turn_scale = _similar(asked, known)
+    by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
+    columns = (asked, 1j * asked, np.ones(count), 1j * np.ones(count), by_right, by_down)
+    looks = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
+    seen = np.concatenate([known.real, known.imag])
+    normal = looks.T @ looks
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        return None  # all landmarks on a line
+    way = inverse @ looks.T @ seen
+    left = seen - looks @ way
+    variance = float(left @ left) / (2 * count - 6) * _ALIKE * float(inverse[4, 4] + inverse[5, 5]) / 2
+    right, down = way[4:]
+    east, north = axes_of(up_deg) @ (-right, down)
+    return Lean((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))
+
+
+def _similar(asked: Array, known: Array) -> complex:
+    """Return rotation and scale, as one factor, that lay `asked` over `known` by least squares."""
+    around, there = asked - asked.mean(), known - known.mean()
+    return complex(np.vdot(around, there) / max(float(np.vdot(around, around).real), 1e-12))

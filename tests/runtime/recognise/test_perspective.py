@@ -1,0 +1,70 @@
+"""The tilt that landmarks show: of rays that are turned by a known angle."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from edgevpr.frames.level import View
+from edgevpr.runtime.recognise.perspective import lean_shown
+
+FOCAL = 0.77  # shares of the longest side: 66 degrees across
+SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
+
+
+def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, noise=0.0, aside=(0.0, 0.0)):
+    """Points of a query whose camera rolls and pitches more than reported, and of the place seen straight from above:
+    the nose is the top of the query, the top of the place north."""
+    rng = np.random.default_rng(3)
+    right, down = rng.uniform(-0.5, 0.5, count), rng.uniform(-0.37, 0.37, count)
+    # Rays through the picture, in the axes nose, right, down of the aircraft, turned to those of a level one.
+    rays = np.stack([-(down + aside[1]), right - aside[0], np.full(count, FOCAL)])
+    roll, pitch = map(math.radians, (roll_deg, pitch_deg))
+    about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
+    about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
+    nose, to_right, below = np.array(about_right) @ np.array(about_nose) @ rays
+    ground = FOCAL * (to_right - 1j * nose) / below
+    known = scale * np.exp(1j * math.radians(turned_deg)) * ground + complex(0.05, -0.03)
+    return right + 1j * down, known + noise * (rng.normal(size=count) + 1j * rng.normal(size=count))
+
+
+@pytest.mark.parametrize(("turned_deg", "scale"), [(0.0, 1.0), (70.0, 1.2), (200.0, 0.8)])
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(2.0, 0.0), (0.0, -3.0), (-1.0, 1.5)])
+def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg, turned_deg, scale):
+    """Right wing down, the middle of the picture is to the left: the aircraft is right of it."""
+    asked, known = landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
+    lean = lean_shown(asked, known, SEEN, up_deg=turned_deg)
+    along = np.array([math.tan(math.radians(roll_deg)), -math.tan(math.radians(pitch_deg))])  # right, ahead
+    turned = math.radians(turned_deg)
+    east = along[0] * math.cos(turned) + along[1] * math.sin(turned)
+    north = along[1] * math.cos(turned) - along[0] * math.sin(turned)
+    assert lean.over_height == pytest.approx((east, north), abs=0.004)
+    assert lean.sd == pytest.approx(math.tan(math.radians(0.5)), rel=0.2)  # of the place's picture
+
+
+def test_it_is_as_exact_as_it_says():
+    told = [lean_shown(*landmarks(roll_deg=2.0, noise=2 / 640, count=count), SEEN, 0.0) for count in (30, 60, 120, 240)]
+    for lean in told:
+        assert lean.over_height[0] == pytest.approx(math.tan(math.radians(2.0)), abs=2 * lean.sd)
+        assert lean.over_height[1] == pytest.approx(0.0, abs=2 * lean.sd)
+    assert all(later.sd < before.sd for before, later in pairwise(told))
+
+
+def test_the_point_under_the_camera_may_be_beside_the_middle():
+    aside = (0.2, -0.1)
+    lean = lean_shown(*landmarks(roll_deg=2.0, aside=aside), View(aside=aside, focal=FOCAL), 0.0)
+    assert lean.over_height == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
+
+
+@pytest.mark.parametrize("view", [View(), View(aside=(0.0, 0.0)), View(focal=FOCAL)])
+def test_without_attitude_or_lens_nothing_is_said(view):
+    assert lean_shown(*landmarks(roll_deg=2.0), view, 0.0) is None
+
+
+def test_few_landmarks_or_those_on_a_line_say_nothing():
+    asked, known = landmarks(count=11)
+    assert lean_shown(asked, known, SEEN, 0.0) is None
+    line = np.linspace(-0.4, 0.4, 20) + 0j
+    lean = lean_shown(line, line, SEEN, 0.0)
+    assert lean is None or lean.sd > 1.0
