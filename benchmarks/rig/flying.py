@@ -140,6 +140,8 @@ class Run:
         self._marks_s["loss"] = time.monotonic()
         if scenario.loses_gps:
             simulator.set_gps(False)
+        if scenario.uses_no_gps:
+            simulator.link.set_parameter("EKF2_GPS_CTRL", 0)
         if scenario.wind_m_s:
             simulator.set_wind(WIND_FROM_DEG, scenario.wind_m_s)
         if scenario.source_set and (scenario.parameters or not self._is_control):

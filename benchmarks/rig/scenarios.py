@@ -18,11 +18,11 @@ class Scenario:
     """A flight: `gps_s` seconds with GPS, then `off_s` without.
 
     From the loss on there is wind, and the autopilot is told to use the `source_set` (None: its own choice). Without
-    `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on. The camera `is_level` on a gimbal, or
-    fixed to the airframe, and its pictures are `is_stamped` with their times, or not. `parameters` are the
-    autopilot's, `with_edgevpr` those that are set for a flight with edgevpr only; `config` is what edgevpr's
-    configuration says beside the usual. `starts_early`: edgevpr runs before arming. `is_compared`: the same flight
-    without edgevpr says something."""
+    `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on, or a PX4 `uses_no_gps`. The camera
+    `is_level` on a gimbal, or fixed to the airframe, and its pictures are `is_stamped` with their times, or not.
+    `parameters` are the autopilot's, `with_edgevpr` those that are set for a flight with edgevpr only; `config` is what
+    edgevpr's configuration says beside the usual. `starts_early`: edgevpr runs before arming. `is_compared`: the same
+    flight without edgevpr says something."""
 
     vehicle: str = "plane"
     is_px4: bool = False
@@ -30,6 +30,7 @@ class Scenario:
     gps_s: float = 60.0
     off_s: float = 300.0
     loses_gps: bool = True
+    uses_no_gps: bool = False
     wind_m_s: float = 0.0
     glitch_m_s: float = 0.0
     source_set: int | None = None
@@ -93,6 +94,22 @@ SCENARIOS = {
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
     "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=_AGP),
     "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=_AGP),
+    "px4_copter_bold": Scenario(
+        is_px4=True,
+        vehicle="copter",
+        with_edgevpr=_AGP,
+        config={"mavlink": {"min_accuracy_m": 0.1}},
+        is_compared=False,
+    ),
+    "px4_copter_unused": Scenario(
+        is_px4=True,
+        vehicle="copter",
+        with_edgevpr=_AGP,
+        loses_gps=False,
+        uses_no_gps=True,
+        off_s=120.0,
+        is_compared=False,
+    ),
     "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
     "reboot": Scenario(gps_s=30.0, off_s=60.0, reboots=True, is_compared=False),
 }

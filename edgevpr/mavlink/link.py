@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Concatenate, ParamSpec, TypeVar
 
 from edgevpr.core.errors import LinkError
@@ -36,7 +36,7 @@ class LinkStats:
     from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
     `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link,
     `refused_signatures` refusals by reason. `reopened` is how often the port was; `bad_bytes` belong to no message.
-    `used_share` is that of `Px4Use`.
+    `used_share` is that of `Px4Use`; `answered_s` is when a command of ours was last answered, by its number.
     """
 
     connected: bool
@@ -58,6 +58,7 @@ class LinkStats:
     bad_bytes: int
     reopened: int
     used_share: float | None = None
+    answered_s: dict[int, float] = field(default_factory=dict)
 
     @property
     def fixes_sent(self) -> int:
@@ -169,6 +170,7 @@ class Link:
                 bad_bytes=said.reader.bad_bytes,
                 reopened=reopened,
                 used_share=autopilot.px4.used_share,
+                answered_s=dict(autopilot.answered_s),
             )
 
     def close(self) -> None:

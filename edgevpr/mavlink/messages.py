@@ -13,6 +13,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.wire import Message, mavlink, quaternion, rotmat
 
 POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
+SOURCE_SET = mavlink.MAV_CMD_SET_EKF_SOURCE_SET  # 42007
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 TEXT_BYTES = 50
 SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
@@ -233,7 +234,7 @@ def named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]
 
 def source_set(number: int, target_system: int) -> Message:
     """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): ArduPilot shall use source set `number` (1..3)."""
-    return _command(target_system, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
+    return _command(target_system, SOURCE_SET, number)
 
 
 def computer_status(

@@ -120,6 +120,7 @@ class Autopilot:
     def __init__(self, own_component: int, system_id: int | None, listener: Listener) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
+        self.answered_s: dict[int, float] = {}  # when it last answered a command of ours, by the command's number
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
         self._listener, self._own_component = listener, own_component
         self.heard_s = -math.inf  # the time of its last heartbeat through the port now open
@@ -174,6 +175,8 @@ class Autopilot:
         if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
             return False
         self.readiness.hear(message, now_s)
+        if kind == "COMMAND_ACK":
+            self.answered_s[message.command] = now_s
         if beats:
             self.heard_s, self.firmware = now_s, message.autopilot
         else:

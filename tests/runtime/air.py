@@ -144,9 +144,8 @@ class Air:
 
     def match(self, step, vehicle, off_m=(0.0, 0.0), view=None, lean=None) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
-        place = round(step * _STEP_S)
         where = Position(*moved(*HOME, *seen_m))
-        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, (place,), view, lean)
+        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))
@@ -163,6 +162,10 @@ class Air:
 
     def hear_state(self, state: MotionState | None) -> None:
         """Do as the autopilot does that is sent a position on a continuous channel: here nothing."""
+
+    def places(self, step: int) -> tuple[int, ...]:
+        """The places that a match of that step is of."""
+        return (round(step * _STEP_S),)
 
     def match_now(self, **changes) -> Advice:
         return self.match(self.step, self.vehicle, **changes)

@@ -24,6 +24,7 @@ _SETTLED_WITHIN_S = 0.02
 
 DRY_RUN = "dry run: no fix is sent"
 
+_ASKED_AGAIN_S = 2.0  # for a source set, while that is not answered
 _GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
 
 _log = logging.getLogger(__name__)
@@ -161,7 +162,8 @@ class ToAutopilot:
         if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes:
             return
         has_own = self._navigator.knows_position(now_s)
-        if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own):
+        answered_s = self._link.stats().answered_s.get(messages.SOURCE_SET, -math.inf)
+        if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own, answered_s):
             self._herald.say(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
             self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
 
@@ -191,26 +193,30 @@ class ToAutopilot:
 class SourceSets:
     """Decides which source set, a numbered choice of sensors in the autopilot, the autopilot is asked to navigate by.
     The set `no_gps` is asked for when GPS is lost or wrong and we know the position; the set `gps`, after that, once
-    GPS has been good for ten seconds. Unless both numbers are configured, nothing is asked for."""
+    GPS has been good for ten seconds. Each is asked for again until it is answered. Unless both numbers are
+    configured, nothing is asked for."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
         self._asked: int | None = None
+        self._asked_s = math.inf
         self._bad_s = -math.inf
 
-    def wanted(self, now_s: float, has_gps: bool, has_own: bool) -> int | None:
+    def wanted(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
         """Return the number of the set to ask for now (None: ask for nothing). `has_gps`: the autopilot has a GPS that
-        is believed; `has_own`: our own position is known well enough."""
+        is believed; `has_own`: our own position is known well enough; `answered_s`: when it last answered such a
+        question."""
         if self._with_gps is None or self._without is None:
             return None
         if not has_gps:
             self._bad_s = now_s
         wanted = self._without if not has_gps and has_own else None
-        if self._asked == self._without and now_s - self._bad_s > _GPS_GOOD_FOR_S:
+        if self._asked is not None and now_s - self._bad_s > _GPS_GOOD_FOR_S:
             wanted = self._with_gps
-        if wanted is None or wanted == self._asked:
+        is_heard = answered_s >= self._asked_s or now_s - self._asked_s < _ASKED_AGAIN_S
+        if wanted is None or (wanted == self._asked and is_heard):
             return None
-        self._asked = wanted
+        self._asked, self._asked_s = wanted, now_s
         return wanted
 
 

@@ -14,7 +14,6 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.herald import Herald, Trouble
 from edgevpr.runtime.flight.navigation import PositionedMatch, positioned, worst_sd
-from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -31,6 +30,9 @@ _TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to 
 # is 23 m for good matches and a good receiver.
 _GPS_CONTRADICTS = 4.0
 _GPS_LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
+# Beside the offset that matches and receiver had so far, in which the errors that last cancel out.
+_GPS_MOVED, _GPS_MOVED_M = 3.5, 7.0  # standard deviations, and the least that counts
+_USUAL_OF, _USUAL_OVER = 10, 60  # matches before it is known, and in its mean
 _GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
 _GPS_WITHIN_S = 30.0  # the matches in a row must be no older
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
@@ -147,13 +149,17 @@ class GpsWatch:
     navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
-    from GPS; it is right again after three matches in a row that agree with it. `map_sd_m` is the standard deviation of
-    the error that all matches share."""
+    from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
+    from it, or that has moved away from where GPS was beside the matches before. Where the aircraft hovers, the same
+    place counts again if it agreed with GPS before. `map_sd_m` is the standard deviation of the error that all matches
+    share."""
 
     def __init__(self, map_sd_m: float, herald: Herald, autopilot: ToAutopilot | None) -> None:
         self._map_sd_m, self._herald, self._autopilot = map_sd_m, herald, autopilot
         self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
         self._agreeing = 0
+        self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
+        self._agreed: set[int] = set()  # places of the last match that agreed
         self.is_wrong = False
 
     def tell(self, event: Recognition) -> None:
@@ -166,7 +172,7 @@ class GpsWatch:
         off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
         in_time_m = _TIME_SD_S * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
         tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), self._map_sd_m, vehicle.gps.sd_m, tilt_m, in_time_m)
+        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, tilt_m, in_time_m)
         self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
@@ -179,10 +185,16 @@ class GpsWatch:
             self._herald.tell("gps", severity, news, said=news, off_m=round(away_m, 1), is_wrong=self.is_wrong)
 
     def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
-        """Judge GPS anew by a match that is `off_m` (2,) metres from it."""
-        if math.hypot(*off_m) <= _GPS_LEAST_M or in_sd(off_m, sd_m**2 * np.eye(2)) <= _GPS_CONTRADICTS:
+        """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
+        the error that all matches share."""
+        is_far = _is_beyond(off_m, _GPS_LEAST_M, _GPS_CONTRADICTS * math.hypot(sd_m, self._map_sd_m))
+        has_moved = self._usual_of >= _USUAL_OF and _is_beyond(off_m - self._usual_m, _GPS_MOVED_M, _GPS_MOVED * sd_m)
+        if not is_far and not has_moved:
             self._against.clear()
             self._agreeing += 1
+            self._usual_of = min(self._usual_of + 1, _USUAL_OVER)
+            self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_of
+            self._agreed = set(seen.places)
             if self._agreeing >= _GPS_IN_A_ROW:
                 self.is_wrong = False
             return
@@ -192,10 +204,14 @@ class GpsWatch:
             for other, other_m in self._against
             if seen.t_s - other.t_s <= _GPS_WITHIN_S
             and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
-            and not set(other.places) >= set(seen.places)
+            and (not set(other.places) >= set(seen.places) or self._agreed & set(seen.places))
         ]
         self._against.append((seen, off_m))
         self.is_wrong = self.is_wrong or len(self._against) >= _GPS_IN_A_ROW
+
+
+def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
+    return math.hypot(*off_m) > max(limits_m)
 
 
 def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:

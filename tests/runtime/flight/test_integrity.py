@@ -105,6 +105,46 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
 
 
+def seconds_to_alarm(air, drift_m_s):
+    glitch(air, drift_m_s)
+    began_s = air.t_s
+    for _ in range(120):
+        air.fly(1)
+        if air.news:
+            return air.news[0]["t_mono_s"] - began_s
+    raise AssertionError("no alarm")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_receiver_that_drifts_slowly_is_found_within_fifteen_seconds_of_its_beginning(watched, seed):
+    """With matches as good as those of a refined map: what they and the receiver have in common cancels out."""
+    assert seconds_to_alarm(watched(fix_sd_m=0.7, seed=seed).fly(60), 1.0) <= 15
+
+
+@pytest.mark.parametrize("drift_m_s", [None, 1.0, 5.0])
+def test_a_copter_that_hovers_over_a_place_that_agreed_before_is_warned_too(watched, drift_m_s):
+    air = watched(speed_m_s=0.0, fix_sd_m=1.0)
+    air.places = lambda step: (7, 8)
+    air.fly(60)
+    assert seconds_to_alarm(air, drift_m_s) <= 20
+
+
+def test_a_place_that_was_wrong_from_the_start_warns_nobody_while_it_hovers(watched):
+    air = watched(speed_m_s=0.0, fix_sd_m=1.0, map_off=(40.0, 0.0))
+    air.places = lambda step: (7, 8)
+    assert air.fly(120).news == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_ten_minutes_of_a_good_receiver_whose_error_wanders_alarm_nobody(watched, seed):
+    air = watched(fix_sd_m=2.0, map_off=(6.0, -3.0), seed=seed)
+    wander = np.random.default_rng(seed)
+    for _ in range(600):
+        air.gps_off_m = 0.98 * air.gps_off_m + wander.normal(0, 0.3, 2)  # 1.5 m, for a minute alike
+        air.fly(1)
+    assert air.news == []
+
+
 def test_it_is_over_when_gps_agrees_again(watched):
     air = watched().fly(30)
     glitch(air, None)

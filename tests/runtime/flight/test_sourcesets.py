@@ -1,5 +1,7 @@
 """The autopilot is asked for another set of sources (42007) where its operator allows it, once, over a real link."""
 
+import math
+
 import pytest
 from controlled import Controlled
 
@@ -9,6 +11,7 @@ from edgevpr.runtime.flight.autopilot import SourceSets
 
 pytestmark = pytest.mark.slow
 
+NEVER = -math.inf
 ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
 ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
 
@@ -72,6 +75,14 @@ def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(gps, no_gps, se
 
 def test_without_a_position_of_ours_none_is_asked_for():
     sets = SourceSets(ALLOWED)
-    assert sets.wanted(0.0, has_gps=False, has_own=False) is None
-    assert sets.wanted(1.0, has_gps=False, has_own=True) == 2
-    assert sets.wanted(2.0, has_gps=False, has_own=True) is None
+    assert sets.wanted(0.0, has_gps=False, has_own=False, answered_s=NEVER) is None
+    assert sets.wanted(1.0, has_gps=False, has_own=True, answered_s=NEVER) == 2
+    assert sets.wanted(2.0, has_gps=False, has_own=True, answered_s=1.1) is None
+
+
+def test_a_question_that_is_not_answered_is_asked_again():
+    sets = SourceSets(ALLOWED)
+    asked = [sets.wanted(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER) for t_s in range(30)]
+    assert [t_s / 2 for t_s, number in enumerate(asked) if number == 2] == [0, 2, 4]
+    assert sets.wanted(40.0, True, True, answered_s=5.1) == 1, "GPS is good"
+    assert sets.wanted(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
