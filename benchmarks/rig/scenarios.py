@@ -94,13 +94,6 @@ SCENARIOS = {
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
     "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=_AGP),
     "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=_AGP),
-    "px4_copter_bold": Scenario(
-        is_px4=True,
-        vehicle="copter",
-        with_edgevpr=_AGP,
-        config={"mavlink": {"min_accuracy_m": 0.1}},
-        is_compared=False,
-    ),
     "px4_copter_unused": Scenario(
         is_px4=True,
         vehicle="copter",
