@@ -16,8 +16,9 @@ from edgevpr.core.geodesy import axes_of
 from edgevpr.frames.level import View
 
 _FEWEST = 12  # landmarks
+_POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
-_ALIKE, _PLACE_SD = 10.0, math.tan(math.radians(0.5))
+_ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +45,22 @@ def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | 
     ray = (asked - complex(view.aside[0], -view.aside[1])) / view.focal
     turn_scale = _similar(asked, known)
     by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
-    columns = (asked, 1j * asked, np.ones(count), 1j * np.ones(count), by_right, by_down)
+    # A slope of the ground stretches and shears the picture too, by a few per cent.
+    linear = (asked, 1j * asked, asked.conj(), 1j * asked.conj())
+    columns = (*linear, np.ones(count), 1j * np.ones(count), by_right, by_down)
     looks = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
     seen = np.concatenate([known.real, known.imag])
     normal = looks.T @ looks
+    normal[2, 2] += _POINT_SD**2 / _SHEAR_SD**2
+    normal[3, 3] += _POINT_SD**2 / _SHEAR_SD**2
     try:
         inverse = np.linalg.inv(normal)
     except np.linalg.LinAlgError:
         return None  # all landmarks on a line
     way = inverse @ looks.T @ seen
     left = seen - looks @ way
-    variance = float(left @ left) / (2 * count - 6) * _ALIKE * float(inverse[4, 4] + inverse[5, 5]) / 2
-    right, down = way[4:]
+    variance = float(left @ left) / (2 * count - len(way)) * _ALIKE * float(inverse[6, 6] + inverse[7, 7]) / 2
+    right, down = way[6:]
     east, north = axes_of(up_deg) @ (-right, down)
     return Lean((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))
 

@@ -57,6 +57,15 @@ def test_the_point_under_the_camera_may_be_beside_the_middle():
     assert lean.over_height == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
+def test_a_slope_of_the_ground_is_no_tilt():
+    """Seen from 15 m beside the place at 100 m, a slope of ten degrees shears the picture by some 3 %."""
+    asked, known = landmarks(count=60, noise=2 / 640)
+    beside = asked.real > -0.1  # the pictures overlap on one side only
+    sheared = (known + 0.03 * asked.conj())[beside]
+    lean = lean_shown(asked[beside], sheared, SEEN, 0.0)
+    assert math.hypot(*lean.over_height) < 2 * lean.sd < 0.1
+
+
 @pytest.mark.parametrize("view", [View(), View(aside=(0.0, 0.0)), View(focal=FOCAL)])
 def test_without_attitude_or_lens_nothing_is_said(view):
     assert lean_shown(*landmarks(roll_deg=2.0), view, 0.0) is None
