@@ -17,6 +17,9 @@ from edgevpr.core.types import Position
 
 GRAVITY_M_S2 = 9.80665
 KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
+# So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
+# it wandered without end, every fix would be taken for a proof of it.
+_ATTITUDE_LASTS_S = 20.0
 _LONGEST_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
 _C, _S, _B, _M = (slice(first, first + 2) for first in (0, 2, 4, 6))
@@ -159,6 +162,8 @@ class DriftFilter:
         if self._drift.is_of_attitude:
             move[_C, _B] = step_s**2 / 2 * _EYE
             move[_S, _B] = step_s * _EYE
+        else:
+            move[_B, _B] = math.exp(-step_s / _ATTITUDE_LASTS_S) * _EYE
         drift = self._drift
         noise = drift.position_noise, drift.velocity_noise, drift.acceleration_noise, 0.0
         self._x = move @ self._x

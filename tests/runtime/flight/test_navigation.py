@@ -136,6 +136,24 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
+def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
+    flown = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=2.0)
+    flown.fly(10, has_gps=True, fixes=False)
+
+    def fix():
+        t_s = (flown.step - flown.late_steps) * STEP_S
+        seen = flown.way[flown.step - flown.late_steps] + flown.rng.normal(0, 2.0, 2)
+        match = match_at(Position(*moved(*HOME, *seen)), t_s, 2.0)
+        flown.navigation.hear_fix(flown.navigation.compared(replace(match, lean_s2=18.0)))
+
+    flown.fix = fix
+    flown.fly(60)
+    errors_m, said_m = flown.fly(400)
+    assert np.median(lengths(errors_m)) < 2.5
+    assert said_m.max() < 4.0, "and does not grow"
+    assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
+
+
 def test_without_fixes_it_knows_that_it_knows_less_and_less():
     flown = Flown(RECKONED, wind=(2.0, 0.0))
     flown.fly(20, has_gps=True)
