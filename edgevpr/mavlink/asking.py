@@ -23,6 +23,7 @@ TRIES, ANSWER_WAIT_S = 3, 1.0
 IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
 LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
 
+_STREAMED_WITHIN_S = 1.2
 _FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
 _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
@@ -84,7 +85,10 @@ class Inquiry(AbstractContextManager["Inquiry"]):
             answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
             if answer is not None:
                 self.round_trips_s.append(time.monotonic() - sent_s)
-                return answer if answer.get_type() == name else None
+                if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
+                    # PX4 denies what it has not anew since it last streamed it: wait for the next of the stream.
+                    answer = self._first(_STREAMED_WITHIN_S, lambda message: message.get_type() == name)
+                return answer if answer and answer.get_type() == name else None
         return None
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:

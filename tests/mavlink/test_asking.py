@@ -58,6 +58,16 @@ def test_questions_that_are_lost_are_asked_again(address):
         assert asking.parameters(names, bytewise=False) == dict.fromkeys(names, 3)
 
 
+def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_stream(address):
+    """As a PX4 does with GPS_RAW_INT."""
+    fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14)
+    streamed = fix.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+    with AnsweringAutopilot(address.number, noise=streamed), Inquiry(address) as asking:
+        assert asking.heartbeat(60)
+        assert asking.message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
+        assert asking.message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
+
+
 def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
     monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.3)
     said, peer = read(address, ["A", "B"], says_unknown=False, messages=healthy_messages(), parameters={"B": 2})
