@@ -42,6 +42,8 @@ def main() -> None:
         parser.error(f"no scenario {', '.join(unknown)}")
     if (arguments.ground is None) != (arguments.later is None) or (arguments.height and not arguments.ground):
         parser.error("--ground and --later go together, and --height only with them")
+    if absent := [str(path) for path in (arguments.ground, arguments.later) if path and not path.exists()]:
+        parser.error(f"{absent[0]} is not there")
     height_m = arguments.height or HEIGHT_M
     work = ground.from_rasters(WORK, arguments.ground, arguments.later, height_m) if arguments.ground else WORK
     if not arguments.report:
