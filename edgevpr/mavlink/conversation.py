@@ -26,8 +26,8 @@ from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
 
 MESSAGES_MAX = 64
 HEARTBEAT_S = 1.0
-HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
+HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
 BETWEEN_S = 1.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
@@ -109,8 +109,7 @@ class Conversation:
 
     def take_between(self) -> list[Sending]:
         """Return the fixes sent between matches since the last call."""
-        taken = list(self.between)
-        self.between.clear()
+        taken, self.between = list(self.between), deque(maxlen=MESSAGES_MAX)
         return taken
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
@@ -260,7 +259,8 @@ class Conversation:
             t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
             return messages.gps_input(state, choice.receiver, t_s, t_unix_s)
         if choice.channel is Channel.SENSOR:
-            autopilot.px4.note_sent(now_s if state else -math.inf)
+            if state:
+                autopilot.px4.note_sent(now_s)
             return state and messages.position_sensor(state)
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")

@@ -19,8 +19,9 @@ class Px4Use:
     def __init__(self) -> None:
         self.uses_gps = True
         self.used = self.unused = 0
-        self._sent_s = self._unused_since_s = -math.inf
-        self._is_unused = self._is_telling = False  # before 1.16 the flag is that of a position, of whatever source
+        self._sent_s = -math.inf
+        self._unused_since_s: float | None = None
+        self._is_telling = False  # before 1.16 the flag is that of a position, of whatever source
 
     @property
     def used_share(self) -> float | None:
@@ -29,8 +30,8 @@ class Px4Use:
         return self.used / count if count else None
 
     def note_sent(self, now_s: float) -> None:
-        """Note that a position was sent at `now_s` (-inf: none was)."""
-        self._sent_s = max(self._sent_s, now_s)
+        """Note that a position was sent at `now_s`."""
+        self._sent_s = now_s
 
     def hear(self, report: Message, now_s: float, has_fix: bool) -> None:
         """Process an ESTIMATOR_STATUS. `has_fix`: a GPS receiver has one."""
@@ -42,8 +43,8 @@ class Px4Use:
         if now_s - self._sent_s <= _OUR_MARK_S or not self._is_telling:
             return
         if is_fusing or not has_fix:
-            self._is_unused, self.uses_gps = False, self.uses_gps or is_fusing
-        elif not self._is_unused:
-            self._is_unused, self._unused_since_s = True, now_s
+            self._unused_since_s, self.uses_gps = None, self.uses_gps or is_fusing
+        elif self._unused_since_s is None:
+            self._unused_since_s = now_s
         elif now_s - self._unused_since_s >= _UNUSED_FOR_S:
             self.uses_gps = False

@@ -159,13 +159,13 @@ class ToAutopilot:
 
     def _ask_for_sources(self) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
-        if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes:
+        if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
-        has_own = self._navigator.knows_position(now_s)
-        answered_s = self._link.stats().answered_s.get(messages.SOURCE_SET, -math.inf)
+        has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
+        answered_s = stats.answered_s.get(messages.SOURCE_SET, -math.inf)
         if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own, answered_s):
             self._herald.say(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
-            self._link.send(messages.source_set(number, self._link.stats().autopilot_system_id or 0))
+            self._link.send(messages.source_set(number, stats.autopilot_system_id or 0))
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
@@ -202,12 +202,15 @@ class SourceSets:
         self._asked_s = math.inf
         self._bad_s = -math.inf
 
+    @property
+    def are_set(self) -> bool:
+        """True if both numbers are configured; `wanted` is asked for only then."""
+        return self._with_gps is not None and self._without is not None
+
     def wanted(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
         """Return the number of the set to ask for now (None: ask for nothing). `has_gps`: the autopilot has a GPS that
         is believed; `has_own`: our own position is known well enough; `answered_s`: when it last answered such a
         question."""
-        if self._with_gps is None or self._without is None:
-            return None
         if not has_gps:
             self._bad_s = now_s
         wanted = self._without if not has_gps and has_own else None

@@ -150,7 +150,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
         along = np.abs(way[0] * asked + way[1] - known) <= _TOLERANCE
         if np.count_nonzero(along) < _FEWEST:
             return nothing
-        way = _fitted(asked[along], known[along])
+        way = fitted(asked[along], known[along])
     along = np.abs(way[0] * asked + way[1] - known) <= _TOLERANCE
     inliers = int(np.count_nonzero(along))
     if inliers < _FEWEST or not _is_near(*way, expected):
@@ -285,7 +285,7 @@ def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tupl
     return turn_scale[best], shift[best]
 
 
-def _fitted(asked: Array, known: Array) -> tuple[complex, complex]:
+def fitted(asked: Array, known: Array) -> tuple[complex, complex]:
     """Return the way that lays `asked` of the query over `known` of the place, complex (n,) each, by least squares."""
     middle, there = asked.mean(), known.mean()
     spread = np.vdot(asked - middle, asked - middle).real

@@ -14,6 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Array
 from edgevpr.core.geodesy import axes_of
 from edgevpr.frames.level import View
+from edgevpr.runtime.recognise.agreement import fitted
 
 _FEWEST = 12  # landmarks
 _POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
@@ -43,7 +44,7 @@ def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | 
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
     # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
     ray = (asked - complex(view.aside[0], -view.aside[1])) / view.focal
-    turn_scale = _similar(asked, known)
+    turn_scale, _ = fitted(asked, known)
     by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
     # A slope of the ground stretches and shears the picture too, by a few per cent.
     linear = (asked, 1j * asked, asked.conj(), 1j * asked.conj())
@@ -63,9 +64,3 @@ def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | 
     right, down = way[6:]
     east, north = axes_of(up_deg) @ (-right, down)
     return Lean((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))
-
-
-def _similar(asked: Array, known: Array) -> complex:
-    """Return rotation and scale, as one factor, that lay `asked` over `known` by least squares."""
-    around, there = asked - asked.mean(), known - known.mean()
-    return complex(np.vdot(around, there) / max(float(np.vdot(around, around).real), 1e-12))
