@@ -1,16 +1,13 @@
 """PX4's own simulator (SIH) as a process, with the interface of ArduPilot's."""
 
-import contextlib
 import os
-import signal
 import socket
-import subprocess
 import time
 from pathlib import Path
 
 from link import Link, Listener
 from scenarios import COPTER_CIRCUIT_M, COPTER_HOME_M, COPTER_SPEED_M_S, HOME_M
-from simulator import at_degrees
+from simulator import Process, at_degrees
 
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -48,59 +45,27 @@ def build() -> Path | None:
     return folder.resolve() if (folder / "bin/px4").exists() else None
 
 
-class Px4:
+class Px4(Process):
     """A PX4 that starts with the `with` block and ends with it; `home_m` is where it stands, metres east and north."""
 
     def __init__(
         self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
     ) -> None:
-        self._vehicle, self._folder, self._listeners = vehicle, folder, listeners
+        super().__init__(folder, listeners)
+        self._vehicle = vehicle
         lat_deg, lon_deg = at_degrees(*home_m)
         home = {"PX4_HOME_LAT": f"{lat_deg:.7f}", "PX4_HOME_LON": f"{lon_deg:.7f}", "PX4_HOME_ALT": str(GROUND_ALT_M)}
         model = {"PX4_SIMULATOR": "sihsim", "PX4_SIM_MODEL": _MODELS[vehicle], "HEADLESS": "1"}
-        self._parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters
-        own = {f"PX4_PARAM_{name}": str(value) for name, value in self._parameters.items()}
+        parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters
+        own = {f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()}
         self._environment = {**os.environ, **home, **model, **own}
-        self._process: subprocess.Popen | None = None
-        self.link: Link | None = None
 
-    def __enter__(self) -> "Px4":
-        self._folder.mkdir(parents=True)
-        try:
-            self._start()
-        except BaseException:
-            self.kill()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.kill()
-
-    def _start(self) -> None:
-        command = [str(build() / "bin/px4"), "-d", str(build() / "etc"), "-w", str(self._folder)]
-        with open(self._folder / "simulator.txt", "ab") as said:
-            streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
-            self._process = subprocess.Popen(
-                command, cwd=self._folder, env=self._environment, start_new_session=True, **streams
-            )
+    def start(self, *, wipe: bool) -> None:
+        self._launch([build() / "bin/px4", "-d", build() / "etc", "-w", self._folder], self._environment)
         station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         station.bind(("127.0.0.1", OWN_PORTS[0]))
         station.connect(("127.0.0.1", OWN_PORTS[1]))
-        self.link = Link(station, self._listeners, bytewise=True)
-        if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
-            raise RuntimeError(f"PX4 says nothing: see {self._folder}/simulator.txt")
-        for number, rate_hz in _STREAMS_HZ.items():
-            self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
-
-    def kill(self) -> None:
-        """End the process."""
-        if self.link:
-            self.link.close()
-        if self._process:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
-        self.link = self._process = None
+        self._talk(Link(station, self._listeners, bytewise=True), _STREAMS_HZ)
 
     def take_off(self, height_m: float) -> None:
         """Start the mission, and wait until the aircraft is at that height. Raises RuntimeError where it never is."""

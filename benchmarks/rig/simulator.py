@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -49,25 +50,17 @@ def at_degrees(east_m: float, north_m: float) -> tuple[float, float]:
     return where.lat_deg, where.lon_deg
 
 
-class Simulator:
-    """A simulator that starts with the `with` block and ends with it. `home_m` is where it stands, metres east and
-    north; `listeners` hear every message."""
+class Process:
+    """The process of a simulator, in a folder of its own, and the rig's link to it: from the begin of the `with` block
+    to its end. `listeners` hear every message."""
 
-    def __init__(
-        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
-    ) -> None:
-        self.vehicle = VEHICLES[vehicle]
-        self._folder, self._parameters, self._listeners = folder, parameters, listeners
-        self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
+    def __init__(self, folder: Path, listeners: list[Listener]) -> None:
+        self._folder, self._listeners = folder, listeners
         self._process: subprocess.Popen | None = None
         self.link: Link | None = None
 
-    def __enter__(self) -> "Simulator":
+    def __enter__(self):
         self._folder.mkdir(parents=True)
-        try:
-            socket.create_server(("", LAST_PORT)).close()
-        except OSError:
-            raise RuntimeError("another simulator runs on this machine: end it first") from None
         try:
             self.start(wipe=True)
         except BaseException:
@@ -80,20 +73,21 @@ class Simulator:
 
     def start(self, *, wipe: bool) -> None:
         """Start the process, with the parameters of old unless they are wiped, and connect to it."""
-        own = self._folder / "rig.parm"
-        own.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
-        folder = tree()
-        defaults = folder / "Tools/autotest" / self.vehicle.defaults
-        command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
-        command += ["--home", self._home, "--sim-address", "127.0.0.1"]
-        command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
+        raise NotImplementedError
+
+    def _launch(self, command: list, environment: dict[str, str]) -> None:
         with open(self._folder / "simulator.txt", "ab") as said:
             streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
-            self._process = subprocess.Popen([*map(str, command)], cwd=self._folder, start_new_session=True, **streams)
-        self.link = Link(connected(OWN_PORT), self._listeners)
+            self._process = subprocess.Popen(
+                [*map(str, command)], cwd=self._folder, env=environment, start_new_session=True, **streams
+            )
+
+    def _talk(self, link: Link, streams_hz: dict[int, float]) -> None:
+        """Keep the link, and ask for messages at these rates."""
+        self.link = link
         if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
             raise RuntimeError(f"the simulator says nothing: see {self._folder}/simulator.txt")
-        for number, rate_hz in STREAMS_HZ.items():
+        for number, rate_hz in streams_hz.items():
             self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
 
     def kill(self) -> None:
@@ -102,9 +96,39 @@ class Simulator:
             self.link.close()
         if self._process:
             with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+                os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
         self.link = self._process = None
+
+
+class Simulator(Process):
+    """ArduPilot's simulator; `home_m` is where it stands, metres east and north."""
+
+    def __init__(
+        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
+    ) -> None:
+        self.vehicle = VEHICLES[vehicle]
+        super().__init__(folder, listeners)
+        self._parameters = parameters
+        self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
+
+    def __enter__(self) -> "Simulator":
+        try:
+            socket.create_server(("", LAST_PORT)).close()
+        except OSError:
+            raise RuntimeError("another simulator runs on this machine: end it first") from None
+        return super().__enter__()
+
+    def start(self, *, wipe: bool) -> None:
+        own = self._folder / "rig.parm"
+        own.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
+        folder = tree()
+        defaults = folder / "Tools/autotest" / self.vehicle.defaults
+        command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
+        command += ["--home", self._home, "--sim-address", "127.0.0.1"]
+        command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
+        self._launch(command, dict(os.environ))
+        self._talk(Link(connected(OWN_PORT), self._listeners), STREAMS_HZ)
 
     def wait_ready(self) -> None:
         """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""
