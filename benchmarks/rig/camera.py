@@ -38,11 +38,14 @@ class Picture:
 
 class Camera:
     """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
-    file. `is_level`: on a gimbal; else fixed to the airframe. `is_stamped`: the pictures have their times."""
+    file. `seed` is that of the noise. `is_level`: on a gimbal; else fixed to the airframe. `is_stamped`: the pictures
+    have their times."""
 
-    def __init__(self, truth: Truth, lit_ground: np.ndarray, log: Path, is_level: bool, is_stamped: bool) -> None:
+    def __init__(
+        self, truth: Truth, lit_ground: np.ndarray, log: Path, seed: int, is_level: bool, is_stamped: bool
+    ) -> None:
         self._truth, self._ground, self._is_level, self.is_stamped = truth, lit_ground, is_level, is_stamped
-        self._log, self._rng = log, np.random.default_rng(ground.SEED + 1)
+        self._log, self._rng = log, np.random.default_rng(seed)
         self._picture: Picture | None = None
         self._is_on, self._changed = True, threading.Condition()
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _Viewer)

@@ -26,6 +26,7 @@ from scenarios import (
     VEHICLE_PARAMETERS,
     WIND_FROM_DEG,
     Scenario,
+    scenario_of,
 )
 from simulator import COMPANION_PORT, Simulator, at_degrees, mission
 from truth import Truth
@@ -65,7 +66,8 @@ class Run:
             self._simulator = stack.enter_context(simulator)
             if not self._is_control:
                 lit, stream = ground.lit_ground(self._work, "later"), (scenario.is_level, scenario.is_stamped)
-                camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", *stream))
+                seed = ground.SEED + scenario_of(folder.name)[1]
+                camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, *stream))
                 between = DatagramRelay, COMPANION_PORTS, "udpin"
                 relay_of, ports, kind = between if scenario.is_px4 else (Relay, COMPANION_PORT, "tcp")
                 relay = stack.enter_context(relay_of(self._truth, folder / "sent.csv", ports, home_m))

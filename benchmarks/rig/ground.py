@@ -43,7 +43,7 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
 
 def from_rasters(work: Path, mapped: Path, later: Path, height_m: float) -> Path:
     """Return the folder of a ground of two pictures from space, of the map's day and of the flight's, in metres and of
-    the same place, to be flown over at a height. Its south-west corner is theirs; beyond them there is nothing."""
+    the same place, to be flown over at a height. They lie in its middle; beyond them there is nothing."""
     folder = work / f"{mapped.stem}-{later.stem}-{height_m:g}m"
     folder.mkdir(parents=True, exist_ok=True)
     for name, path in (("mapping", mapped), ("later", later)):
@@ -53,7 +53,9 @@ def from_rasters(work: Path, mapped: Path, later: Path, height_m: float) -> Path
                 seen = raster.read((3, 2, 1), out_shape=(3, high, wide), resampling=rasterio.enums.Resampling.cubic)
             ground = np.zeros((round(DEPTH_M / METRES_PER_PIXEL), round(WIDTH_M / METRES_PER_PIXEL), 3), np.uint8)
             rows, columns = min(high, len(ground)), min(wide, ground.shape[1])
-            ground[len(ground) - rows :, :columns] = seen.transpose(1, 2, 0)[high - rows :, :columns]
+            top, left, skipped = (len(ground) - rows) // 2, (ground.shape[1] - columns) // 2, (wide - columns) // 2
+            shown = seen.transpose(1, 2, 0)[(high - rows) // 2 :][:rows, skipped : skipped + columns]
+            ground[top : top + rows, left : left + columns] = shown
             np.save(folder / f"ground-{name}.npy", ground)
     return folder
 

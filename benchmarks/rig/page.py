@@ -11,8 +11,10 @@ import numpy as np
 import px4
 from base import RESULTS, Row
 from figures import by_second, figures_of, read_table, worse_by
-from scenarios import SCENARIOS
+from scenarios import SCENARIOS, scenario_of
 from simulator import VEHICLES
+
+from edgevpr.runtime.flight.flightlog import read_log
 
 _SHOWN_PER_M = 0.3  # pixels of the ground in the picture
 _TRUE, _WITH, _WITHOUT = "white", "#20e020", "#ff3030"
@@ -57,10 +59,13 @@ _SENT = {
 
 def write_page(work: Path) -> None:
     """Write rig.json, rig.md and rig.jpg of the newest run of each scenario."""
-    found = {name: _runs(work / "runs", name) for name in SCENARIOS}
+    flown = sorted(folder.name for folder in (work / "runs").iterdir() if "-" not in folder.name)
+    found = {name: _runs(work / "runs", name) for each in SCENARIOS for name in flown if scenario_of(name)[0] == each}
     result = {**base.made_by(), "scenarios": {name: runs for name, runs in found.items() if runs}}
     base.write("rig", result, page(result))
+    flown = [name for name, runs in result["scenarios"].items() if "with" in runs]
     _draw(work, list(result["scenarios"]), RESULTS / "rig.jpg")
+    draw_claims([work / "runs" / name for name in flown], RESULTS / "rig-claims.jpg")
 
 
 def _runs(runs: Path, name: str) -> dict[str, Row]:
@@ -97,6 +102,8 @@ after the loss. Worse: the second at which the estimate was worst in comparison 
 
 {base.table(_rows(found), _ESTIMATES)}
 
+{_spread(found)}
+
 edgevpr's fixes against the true position of their own picture, by how far the aircraft banked, and the share of errors,
 axis by axis, within one and two sigma of the accuracy that was claimed (asked: .68 and .95). Query: from the picture to
 the answer, median and 99 %.
@@ -113,6 +120,11 @@ Flown with edgevpr at {_commits(found)}; {result["date"]}, {result["machine"]["c
 
 ![tracks](rig.jpg)
 
+![claims](rig-claims.jpg)
+
+Metres over the seconds after the loss. Blue: the error of the autopilot's estimate. Dots: of each position when it was
+sent. Grey: twice the accuracy that was claimed with it. Below, green and red: queries accepted and refused.
+
 White: where the aircraft was, from the loss of GPS on. Green: where its autopilot took it to be, with edgevpr. Red:
 where it took it to be without edgevpr, in another flight, whose own true track is dotted.
 """
@@ -127,7 +139,7 @@ def _commits(found: dict[str, dict[str, Row]]) -> str:
 def _rows(found: dict[str, dict[str, Row]], only: str | None = None) -> Iterator[Row]:
     """Yield the runs (`only` those with or without edgevpr), with words for their modes and answers."""
     for name, runs in found.items():
-        scenario = SCENARIOS[name]
+        scenario = SCENARIOS[scenario_of(name)[0]]
         modes = px4.MODES if scenario.is_px4 else VEHICLES[scenario.vehicle].modes
         names = {number: word for word, number in modes.items()}
         for which, run in runs.items():
@@ -144,6 +156,20 @@ def _sent(found: dict[str, dict[str, Row]]) -> Iterator[Row]:
     for run in _rows(found, "with"):
         for kind, each in run.get("sent", {}).items():
             yield {**each, "name": run["name"], "kind": kind, "wire_ms": run["wire_ms"]}
+
+
+def _spread(found: dict[str, dict[str, Row]]) -> str:
+    """Return a line for each scenario that was flown several times: the least and the largest of its figures."""
+    lines = []
+    for scenario, runs in base.groups(_rows(found, "with"), lambda run: scenario_of(run["name"])[0]):
+        each = [run["estimate"]["after"] for run in runs]
+        if len(each) > 1:
+            told = ", ".join(
+                f"{word} {min(run[key] for run in each):.1f} to {max(run[key] for run in each):.1f} m"
+                for key, word in (("median", "median"), ("p90", "90 %"), ("max", "largest"))
+            )
+            lines.append(f"* {scenario}, {len(each)} flights: {told}.")
+    return "\n".join(lines)
 
 
 def _remarks(found: dict[str, dict[str, Row]]) -> str:
@@ -169,6 +195,27 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
         if told:
             lines.append(f"* {name}, {which} edgevpr: {'; '.join(told)}.")
     return "\n".join(lines)
+
+
+def draw_claims(folders: list[Path], path: Path) -> None:
+    """Draw the errors of each run over time, beside what was claimed, and which queries were accepted."""
+    rows = -(-len(folders) // 2)
+    drawn, axes = base.panels(12, 3.0 * rows, len(folders), rows)
+    for axis, folder in zip(axes, folders, strict=True):
+        (track, loss_s), sent = _track(folder), read_table(folder / "sent.csv")
+        track, sent = track[track["t_s"] >= loss_s], sent[sent["t_s"] >= loss_s]
+        off_m = np.hypot(sent["east_m"] - sent["true_east_m"], sent["north_m"] - sent["true_north_m"])
+        axis.fill_between(sent["t_s"] - loss_s, 0, 2 * sent["accuracy_m"], color="0.85", step="mid")
+        axis.plot(track["t_s"] - loss_s, track["error_m"], color="#3060ff", lw=0.9)
+        axis.plot(sent["t_s"] - loss_s, off_m, ".", color="black", ms=2)
+        top_m = max(10.0, 1.3 * float(np.max(track["error_m"], initial=0)))
+        queries = [line for line in read_log(folder / "flight.jsonl") if line["kind"] == "query"]
+        for is_accepted, colour in ((True, "#20a020"), (False, "#ff3030")):
+            at_s = np.array([q["t_frame_s"] - loss_s for q in queries if q["accepted"] == is_accepted])
+            axis.plot(at_s, np.full(len(at_s), -0.04 * top_m), "|", color=colour, ms=4)
+        axis.set(xlim=(0, None), ylim=(-0.08 * top_m, top_m))
+        axis.set_title(folder.name, fontsize=9)
+    drawn.savefig(path, dpi=70)
 
 
 def _draw(work: Path, names: list[str], path: Path) -> None:

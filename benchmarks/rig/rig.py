@@ -1,7 +1,8 @@
 """Flights of edgevpr with a real ArduPilot, plane and copter, in ArduPilot's own simulator: `make rig` flies every
 scenario, with and without edgevpr, and writes benchmarks/results/rig.md. README.md says how, and how it is built.
 
-python benchmarks/rig/rig.py [SCENARIO ...] [--seconds S] [--ground FILE --later FILE --height M] [--report]
+python benchmarks/rig/rig.py [SCENARIO ...] [--seconds S] [--ground FILE --later FILE --height M] [--seeds N]
+       [--report]
 """
 
 import argparse
@@ -19,7 +20,7 @@ import px4
 from figures import figures_of
 from flying import Run
 from page import write_page
-from scenarios import HEIGHT_M, SCENARIOS
+from scenarios import HEIGHT_M, SCENARIOS, numbered
 from simulator import VARIABLE, tree
 
 WORK = Path.home() / ".cache" / "edgevpr-rig"
@@ -36,6 +37,7 @@ def main() -> None:
     parser.add_argument("--ground", **over)
     parser.add_argument("--later", **over)
     parser.add_argument("--height", type=float, help=f"above that ground, metres ({HEIGHT_M:.0f})")
+    parser.add_argument("--seeds", type=int, default=1, help="flights of each scenario with edgevpr, each of its own")
     parser.add_argument("--report", action="store_true", help="write the page of the flights that were made")
     arguments = parser.parse_args()
     if unknown := set(arguments.scenarios) - set(SCENARIOS):
@@ -53,12 +55,13 @@ def main() -> None:
                 whose, variable = ("PX4", px4.VARIABLE) if scenario.is_px4 else ("ArduPilot", VARIABLE)
                 sys.exit(f"rig: build {whose}'s simulator, and name its folder in {variable}.")
             shown = replace(scenario, off_s=arguments.seconds or scenario.off_s, height_m=height_m)
-            for is_control in (False, True)[: 1 + scenario.is_compared]:
+            flights = [(numbered(name, seed), False) for seed in range(1, 1 + arguments.seeds)]
+            for flight, is_control in [*flights, (name, True)][: arguments.seeds + scenario.is_compared]:
                 try:
-                    folder = Run(work, name, shown, is_control).fly()
+                    folder = Run(work, flight, shown, is_control).fly()
                     print(f"{folder.name}: {json.dumps(figures_of(folder))}", flush=True)
                 except RuntimeError as error:  # one that does not arm, for example: the page has the others
-                    print(f"rig: {name}: {error}", file=sys.stderr, flush=True)
+                    print(f"rig: {flight}: {error}", file=sys.stderr, flush=True)
     if arguments.report or not (arguments.scenarios or arguments.ground):
         write_page(WORK)
 

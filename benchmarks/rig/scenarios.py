@@ -45,6 +45,17 @@ class Scenario:
     is_compared: bool = True
 
 
+def numbered(name: str, seed: int) -> str:
+    """Return the name of a scenario's flight of a seed: "plane_wind", "plane_wind.2"."""
+    return name if seed == 1 else f"{name}.{seed}"
+
+
+def scenario_of(flight: str) -> tuple[str, int]:
+    """Return the name of the scenario of a flight, and its seed; the inverse of `numbered`."""
+    name, _, seed = flight.partition(".")
+    return name, int(seed or 1)
+
+
 VEHICLE_PARAMETERS = {
     "plane": {
         "ROLL_LIMIT_DEG": 35,

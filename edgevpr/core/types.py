@@ -59,8 +59,9 @@ class Vehicle:
     `heading_deg`: compass direction of the nose, 0..360. `t_heard_s`: when the report came, on the clock of the frames.
     `has_gps`: True if a GPS receiver had a 3D fix near the estimated position then. If False, the position may be
     wrong: an autopilot reports its estimate long after GPS is lost, and ignores a receiver that it does not trust.
-    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up. `height_m`: above the ground.
-    `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed downwards.
+    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; together they change by
+    `tilting_deg_s`. `height_m`: above the ground. `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed
+    downwards.
     `position_sd_m`: standard deviation of one axis of the position; also None if the autopilot does not rely on it.
     `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
     `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
@@ -73,6 +74,7 @@ class Vehicle:
     has_gps: bool
     roll_deg: float | None = None
     pitch_deg: float | None = None
+    tilting_deg_s: float = 0.0
     height_m: float | None = None
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
@@ -176,13 +178,15 @@ NO_COST = StageCost(0.0, 0.0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
     """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (warp it as seen from
-    straight above), test its salience (`gate`), `encode` it, `scan` all places, `compare` and judge the candidates,
-    `verify` the best one by its landmarks, `locate` the aircraft. A step that the query did not reach has no cost."""
+    straight above), test its salience (`gate`), `encode` it, measure the `stride` since the frame before (in a flight
+    only), `scan` all places, `compare` and judge the candidates, `verify` the best one by its landmarks, `locate` the
+    aircraft. A step that the query did not reach has no cost."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
     gate: StageCost = NO_COST
     encode: StageCost = NO_COST
+    stride: StageCost = NO_COST
     scan: StageCost = NO_COST
     compare: StageCost = NO_COST
     verify: StageCost = NO_COST
@@ -196,7 +200,7 @@ class Steps:
     @property
     def match(self) -> StageCost:
         """Cost of matching as the thesis defines it: all steps after encoding."""
-        return self.scan + self.compare + self.verify + self.locate
+        return self.stride + self.scan + self.compare + self.verify + self.locate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

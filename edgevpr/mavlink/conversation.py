@@ -28,7 +28,7 @@ MESSAGES_MAX = 64
 HEARTBEAT_S = 1.0
 STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
-BETWEEN_S = 1.5  # from a single fix to the next one that no match asks for
+BETWEEN_S = 0.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 

@@ -155,7 +155,13 @@ class Autopilot:
         if vehicle is None or attitude is None:
             return vehicle
         heading_deg = None if vehicle.heading_deg is None else attitude.yaw_deg % 360
-        return replace(vehicle, roll_deg=attitude.roll_deg, pitch_deg=attitude.pitch_deg, heading_deg=heading_deg)
+        return replace(
+            vehicle,
+            roll_deg=attitude.roll_deg,
+            pitch_deg=attitude.pitch_deg,
+            tilting_deg_s=attitude.tilting_deg_s,
+            heading_deg=heading_deg,
+        )
 
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
         """Process a message received at `now_s` from `address`. Returns True if it is a heartbeat of our autopilot."""

@@ -31,12 +31,14 @@ _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 
 class Attitude(NamedTuple):
-    """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`."""
+    """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`, and
+    how fast roll and pitch change together (`tilting_deg_s`)."""
 
     t_s: float
     roll_deg: float
     pitch_deg: float
     yaw_deg: float
+    tilting_deg_s: float = 0.0
 
 
 class Attitudes:
@@ -63,12 +65,13 @@ class Attitudes:
         after = next((attitude for attitude in near if attitude.t_s > t_s), None)
         if before is None or after is None:
             return before or after
-        share = (t_s - before.t_s) / (after.t_s - before.t_s)
-
-        def between(one_deg: float, other_deg: float) -> float:
-            return one_deg + share * ((other_deg - one_deg + 180) % 360 - 180)
-
-        return Attitude(t_s, *map(between, before[1:], after[1:]))
+        step_s = after.t_s - before.t_s
+        changed_deg = [(other - one + 180) % 360 - 180 for one, other in zip(before[1:4], after[1:4], strict=True)]
+        share = (t_s - before.t_s) / step_s
+        roll_deg, pitch_deg, yaw_deg = (
+            one + share * change for one, change in zip(before[1:4], changed_deg, strict=True)
+        )
+        return Attitude(t_s, roll_deg, pitch_deg, yaw_deg, math.hypot(*changed_deg[:2]) / step_s)
 
 
 class Heights:

@@ -2,8 +2,9 @@
 
 import os
 import re
+import socket
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 
 import pytest
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
@@ -181,6 +182,45 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
             assert fix.get_link_id() == TO_AUTOPILOT
             assert other.mav.signing.badsig_count == 0
     assert (key_file.parent / "signing.key.time").exists()
+
+
+@pytest.mark.network
+def test_an_autopilot_whose_clock_is_old_learns_the_time_though_another_has_called_before(key_file):
+    """As after a flat battery of its clock: it takes ours from the first message that it gets, so it must get one."""
+    number, day = free_port(), 86_400 * TICKS_S
+    with link_to(f"udpin:127.0.0.1:{number}", signing=open_signing(str(key_file), None)) as link, ExitStack() as stack:
+        stray, own, replaying = (stack.enter_context(closing(calling(number))) for _ in range(3))
+        stray.send(unsigned())
+        wait_until(lambda: link.stats().refused_signatures, "the stray packet")
+        signer = Signer(stamp=int((time.time() - 1_420_070_400) * TICKS_S) - day)
+        old = signer.packet()
+
+        def beat() -> bool:
+            own.send(signer.packet())
+            for message in PacketReader().feed(received(own)):
+                signer.packer.signing.timestamp = int.from_bytes(message.get_msgbuf()[-12:-6], "little") + 1
+            return link.stats().autopilot_heard
+
+        wait_until(beat, "believing it")
+        replaying.send(old)
+        wait_until(lambda: link.stats().refused_signatures.get(OLD, 0) > 1, "refusing what is sent again")
+        link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
+        wait_until(lambda: received(own), "the fix, not sent elsewhere")
+        assert received(replaying) == b""
+
+
+def calling(number: int) -> socket.socket:
+    """A socket of its own address that sends to a port of this machine."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.connect(("127.0.0.1", number))
+    sock.setblocking(False)
+    return sock
+
+
+def received(sock: socket.socket) -> bytes:
+    with suppress(BlockingIOError):
+        return sock.recv(4096)
+    return b""
 
 
 @pytest.mark.parametrize("key", [None, OTHER_KEY])

@@ -17,6 +17,7 @@ from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.stride import Stride
 
 HOME = 47.0, 8.0
 GPS_SD_M = 1.0
@@ -52,7 +53,9 @@ class Air:
     """A flight in wide circles at `speed_m_s`, with GPS until `lose_gps`. Its autopilot then reckons, wrong by `wind`
     (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
     of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
-    `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot follows it until it `reject_gps`."""
+    With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right);
+    without `matches`, no place is accepted. `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot
+    follows it until it `reject_gps`."""
 
     def __init__(
         self,
@@ -70,6 +73,7 @@ class Air:
         map_off=(0.0, 0.0),
         bias=(0.0, 0.0),
         attitude=(0.0, 0.0),
+        stride_sd_m=None,
         seed=7,
     ):
         self.navigator, self.rng = navigator, np.random.default_rng(seed)
@@ -84,7 +88,8 @@ class Air:
         self.known = GPS_SD_M, 0.0  # how well it knew its position, and when
         self.way, self.waiting, self.vehicle = [self.at_m], deque(), None
         self.is_silent = self.knows_nothing = False
-        self.sees, self.takes_fixes, self.events = True, True, []
+        self.sees, self.takes_fixes, self.matches, self.events = True, True, True, []
+        self.stride_sd_m, self.stretch, self.turn, self.strode = stride_sd_m, 1.0, 0.0, None
         self.advices: list[tuple[float, Advice]] = []
         self.errors_m, self.states = [], []  # of the autopilot once a second; of a continuous channel
         self.between, self.between_due_s = [], 0.0  # fixes that no match asked for, and their errors
@@ -131,13 +136,30 @@ class Air:
             if self.step % self.every_steps == 0 and self.sees:
                 self.waiting.append((self.step, self.vehicle))
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
-                self.match(*self.waiting.popleft())
+                self._look(*self.waiting.popleft())
             if self.t_s >= self.between_due_s and (fix := self.navigator.fix_between(self.t_s)):
                 self.between.append((fix, self.off(fix.lat_deg, fix.lon_deg)))
                 self.take(fix)
             if self.step % 50 == 0:
                 self.errors_m.append(self.off_m)
         return self
+
+    def _look(self, step, vehicle) -> None:
+        if self.matches:
+            self.match(step, vehicle)
+        else:
+            event = Recognition(frame=Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S), vehicle=vehicle)
+            event.stride = self._stride(step)
+            self.navigator.hear_frame(event)
+
+    def _stride(self, step) -> Stride | None:
+        before, self.strode = self.strode, step
+        if self.stride_sd_m is None or before is None:
+            return None
+        east_m, north_m = (self.way[step] - self.way[before]) * self.stretch
+        turned = complex(east_m, north_m) * np.exp(-1j * self.turn)
+        moved_m = np.array([turned.real, turned.imag]) + self.rng.normal(0, self.stride_sd_m, 2)
+        return Stride(before * _STEP_S, step * _STEP_S, tuple(moved_m), self.stride_sd_m, 100)
 
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
@@ -146,6 +168,7 @@ class Air:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
         where = Position(*moved(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
+        event.stride = self._stride(step)
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))

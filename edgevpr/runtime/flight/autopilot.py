@@ -115,7 +115,11 @@ class ToAutopilot:
         if there is none. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("told"):
             last = _reported(*self._last) if self._last else None
-            fix, sending = self._fixed(event) if event.accepted else (None, None)
+            fix, sending = None, None
+            if event.accepted:
+                fix, sending = self._fixed(event)
+            else:
+                self._navigator.hear_frame(event)
             is_heard = self._link.listens()
         if sending:
             if is_heard:

@@ -1,5 +1,5 @@
-"""The position of the aircraft at any moment, from its path and the filter of the path's errors (see `path`), and the
-check of fixes against it. `navigator` uses both."""
+"""The position of the aircraft at any moment, from its `path` and the filter of the path's errors (see `drift`), and
+the check of fixes against it. `navigator` uses both."""
 
 import math
 from dataclasses import dataclass
@@ -10,10 +10,12 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Vehicle
-from edgevpr.runtime.flight.path import INERTIAL, RECKONED, Drift, DriftFilter, Path
+from edgevpr.runtime.flight.drift import INERTIAL, RECKONED, Drift, DriftFilter, Strode
+from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import in_sd, matrix_of
 from edgevpr.runtime.recognise.perspective import Lean
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.stride import Stride
 
 _GPS_EVERY_S = 1.0
 _GPS_NEW_S = 0.7  # positions of a receiver come five times a second; without new ones the autopilot dead-reckons
@@ -28,6 +30,7 @@ _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
 _DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
 _TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
+_MOST_ALIKE = 16.0  # fixes of the same ground that count as one
 _IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
 
 
@@ -44,20 +47,43 @@ class Whereabouts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PositionedMatch:
-    """An accepted match with a position: `t_s`, the time of its frame; `position` of the aircraft then; `accuracy_m`,
-    to be sent with it; `covariance_m2` (2, 2), without the error that all fixes share; numbers of the `places` it comes
-    from; `lean_s2`, how far an error of the attitude moves it (see `DriftFilter` in `path`); `lean`, what its picture
-    shows of that error; and `turn_deg`, by how much the heading that it shows exceeds the autopilot's."""
+class HeardFrame:
+    """A frame taken at `t_s`. `sd_m` is the standard deviation, of each axis, by which its picture puts the aircraft
+    wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter` in `drift`). `stride` is
+    the motion since the frame before (None: unknown). `alike_m` is how far apart pictures are whose fixes do not err
+    alike."""
 
     t_s: float
+    sd_m: float
+    lean_s2: float = 0.0
+    stride: Stride | None = None
+    alike_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionedMatch:
+    """An accepted match with a position: its `frame`; `position` of the aircraft then; `accuracy_m`, to be sent with
+    it; `covariance_m2` (2, 2), without the error that all fixes share and that of the frame; numbers of the `places` it
+    comes from; `lean`, what its picture shows of the error of the attitude; and `turn_deg`, by how much the heading
+    that it shows exceeds the autopilot's."""
+
+    frame: HeardFrame
     position: Position
     accuracy_m: float
     covariance_m2: Doubles
     places: tuple[int, ...]
-    lean_s2: float = 0.0
     lean: Lean | None = None
     turn_deg: float | None = None
+
+    @property
+    def t_s(self) -> float:
+        """Time of the frame."""
+        return self.frame.t_s
+
+    @property
+    def scatter_m2(self) -> Doubles:
+        """Covariance (2, 2) by which the fixes of two frames differ."""
+        return self.covariance_m2 + self.frame.sd_m**2 * np.eye(2)
 
     def is_turned_like(self, turn_deg: float | None) -> bool:
         """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
@@ -100,11 +126,13 @@ class Navigation:
         self._drift = drift
         self._path: Path | None = None
         self._filter = DriftFilter(drift, map_sd_m)
+        self._framed: Point | None = None  # of the path, when the last frame was taken
+        self._fixed_m: Doubles | None = None  # the last fix, from the origin of the path
         self.has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
 
     @property
     def fixed_s(self) -> float:
-        """Time of the last fix or the last GPS position, whichever is later; -inf if there was none."""
+        """Time of the last fix, stride or GPS position, whichever is the latest; -inf if there was none."""
         return max(self._fixed_s, self._gps_s)
 
     def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
@@ -140,13 +168,29 @@ class Navigation:
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
+    def hear_frame(self, frame: HeardFrame) -> None:
+        """Process a frame, whatever is recognised in it."""
+        path, before = self._unbroken, self._framed
+        self._framed = there = path.at(frame.t_s) if path else None
+        if path is None or there is None:
+            return
+        stride, strode = frame.stride, None
+        if stride and before and before.t_s == stride.from_s:
+            moved_m = np.array(stride.moved_m)
+            strode = Strode(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
+        is_used = self._filter.hear_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
+        if strode and is_used:
+            self._fixed_s = max(self._fixed_s, frame.t_s)
+
     def compared(self, seen: PositionedMatch) -> ComparedFix | None:
-        """Compare the fix of a match with its prediction; None if the path at that time is not known."""
-        path = self._unbroken
-        there = path.at(seen.t_s) if path else None
+        """Compare the fix of a match with its prediction; None if the path at that time is not known. The match is of
+        the last frame heard, or of a new one."""
+        if self._framed is None or self._framed.t_s != seen.t_s:
+            self.hear_frame(seen.frame)
+        path, there = self._unbroken, self._framed
         if path is None or there is None:
             return None
-        expected_m, covariance_m2 = self._filter.expected_fix(path.now.t_s - seen.t_s, seen.lean_s2)
+        expected_m, covariance_m2 = self._filter.expected_fix()
         off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
         return ComparedFix(
             seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
@@ -155,13 +199,23 @@ class Navigation:
     def hear_fix(self, fix: ComparedFix, verdict: Weighed = BELIEVED) -> None:
         """Correct our position by a fix of which `Consistency` has given a verdict."""
         if self._path and verdict.is_lost and self._drift is INERTIAL:
-            self.begin(fix.seen.position, worst_sd(fix.seen.covariance_m2), fix.seen.t_s, self._path.now.t_s)
+            self.begin(fix.seen.position, worst_sd(fix.seen.scatter_m2), fix.seen.t_s, self._path.now.t_s)
         elif self._path:
             hear = self._filter.trust_fix if verdict.is_against else self._filter.hear_fix
-            hear(fix.off_m, fix.seen.covariance_m2, self._path.now.t_s - fix.seen.t_s, fix.seen.lean_s2)
-            if fix.seen.lean_s2 and (lean := fix.seen.lean):
+            hear(fix.off_m, self._alike(fix) * fix.seen.covariance_m2)
+            if fix.seen.frame.lean_s2 and (lean := fix.seen.lean):
                 self._filter.hear_lean(np.array(lean.over_height), lean.sd)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
+
+    def _alike(self, fix: ComparedFix) -> float:
+        """Return the factor of the covariance of a fix. Fixes of about the same ground err alike, so the nearer it is
+        to the last one, the less it says. That one is remembered by the path and by strides only."""
+        at_m, before_m = fix.path_m + fix.off_m, self._fixed_m
+        self._fixed_m = at_m
+        if fix.seen.frame.stride is None or before_m is None:
+            return 1.0
+        away_m = max(float(np.hypot(*(at_m - before_m))), fix.seen.frame.alike_m / _MOST_ALIKE)
+        return max(1.0, fix.seen.frame.alike_m / away_m) if away_m else 1.0
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
@@ -196,7 +250,7 @@ class Navigation:
     def _start(
         self, position: Position, sd_m: float, velocity_m_s: Doubles, t_s: float, velocity_sd_m_s: float
     ) -> None:
-        self._path = Path(position, t_s, velocity_m_s)
+        self._path, self._framed, self._fixed_m = Path(position, t_s, velocity_m_s), None, None
         self._filter.start(sd_m, velocity_sd_m_s)
 
     @property
@@ -262,15 +316,15 @@ def worst_sd(covariance: Doubles) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def positioned(event: Recognition) -> PositionedMatch | None:
-    """Return the positioned match of an event; None if no match with a position was accepted."""
-    if event.frame is None or event.best is None or event.located is None or event.accuracy_m is None:
+def positioned(event: Recognition, frame: HeardFrame) -> PositionedMatch | None:
+    """Return the positioned match of an event and its frame; None if no match with a position was accepted."""
+    if event.best is None or event.located is None or event.accuracy_m is None:
         return None
     turn_deg, shown_deg, told_deg = None, event.located.heading_deg, event.view.up_deg
     if shown_deg is not None and told_deg is not None:
         turn_deg = (shown_deg - told_deg + 180) % 360 - 180
     return PositionedMatch(
-        t_s=event.frame.t_mono_s,
+        frame=frame,
         position=event.located.position,
         accuracy_m=event.accuracy_m,
         covariance_m2=matrix_of(event.located.covariance_m2),
@@ -305,5 +359,5 @@ def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:
 
 def _of_both(one: ComparedFix, other: ComparedFix) -> Doubles:
     drift_m = _DRIFT_M_S * abs(other.seen.t_s - one.seen.t_s)
-    both: Doubles = one.seen.covariance_m2 + other.seen.covariance_m2 + drift_m**2 * np.eye(2)
+    both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
     return both

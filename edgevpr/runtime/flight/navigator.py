@@ -4,12 +4,9 @@ second, otherwise single fixes. The link calls it in its own thread, the loop of
 main one."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Lock
 
-import numpy as np
-
-from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -17,16 +14,17 @@ from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
+from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import (
     Consistency,
+    HeardFrame,
     Navigation,
-    PositionedMatch,
     Whereabouts,
     positioned,
     reckons_by_gps,
     worst_sd,
 )
-from edgevpr.runtime.flight.path import GRAVITY_M_S2, INERTIAL, RECKONED, over_ground
+from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviations that are added to that of a fix: the attitude is known to half a degree, and the time of a frame
@@ -40,6 +38,7 @@ _ALT_SD_M = 3.0
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE, _PX4_ALIKE, _LEAN_GOOD_FOR_S = math.sqrt(50), 1.5, 5.0
 _FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
+_ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
 # With GPS, ArduPilot refuses a fix, and PX4 takes it with a gain that makes its velocity jump.
@@ -109,9 +108,16 @@ class Navigator(Listener):
             self._attitude = attitude
             self._navigation.hear_acceleration(t_s, acceleration_m_s2)
 
+    def hear_frame(self, event: Recognition) -> None:
+        """Process the frame of an event without an accepted match: its motion since the frame before."""
+        with self._lock:
+            if frame := self._frame(event):
+                self._navigation.hear_frame(frame)
+
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""
-        seen = positioned(event)
+        frame = self._frame(event)
+        seen = positioned(event, frame) if frame else None
         if seen is None:
             return Advice(None, "the place has no position")
         if event.view.reason:
@@ -123,11 +129,9 @@ class Navigator(Listener):
                 return self._unheard(fix, now_s)
             if vehicle.velocity_m_s is None:
                 return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
-            told = event.vehicle or vehicle
-            seen = replace(seen, covariance_m2=_covariance(seen, told), lean_s2=self._lean_s2(event, told))
             compared = self._navigation.compared(seen)
             if compared is None:
-                self._navigation.begin(seen.position, worst_sd(seen.covariance_m2), seen.t_s, vehicle.t_heard_s)
+                self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
             verdict = self._consistency.weighed(compared, self.has_gps)
             if verdict.why:
@@ -194,12 +198,27 @@ class Navigator(Listener):
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
         return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
 
-    def _lean_s2(self, event: Recognition, vehicle: Vehicle) -> float:
-        """Return how far an error of the attitude moves the fix of a match, see `DriftFilter` in `path`: not where the
-        picture's lean comes from none."""
-        leans = event.view.aside or event.view.lean_m
-        is_apart = self._is_level or vehicle.roll_deg is None
-        return 0.0 if is_apart or not leans else (vehicle.height_m or 0.0) / GRAVITY_M_S2
+    def _frame(self, event: Recognition) -> HeardFrame | None:
+        """Return the frame of an event; None for one that could not be read. An error of the attitude does not move the
+        picture of a level camera, nor one that leans by no reported attitude. An error of the time moves the point
+        under the camera, as the aircraft flies and as it rolls."""
+        if event.frame is None:
+            return None
+        vehicle = event.vehicle or self._vehicle
+        height_m, has_attitude, speed_m_s = 0.0, False, 0.0
+        if vehicle:
+            height_m, has_attitude = vehicle.height_m or 0.0, vehicle.roll_deg is not None
+            tilting_m_s = height_m * math.radians(0.0 if self._is_level else vehicle.tilting_deg_s)
+            speed_m_s = math.hypot(tilting_m_s, *(vehicle.velocity_m_s or (0.0, 0.0)))
+        is_apart = self._is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
+        tilt_sd = _ATTITUDE_SD if has_attitude else _UNTOLD_ATTITUDE_SD
+        return HeardFrame(
+            t_s=event.frame.t_mono_s,
+            sd_m=math.hypot(tilt_sd * height_m, _TIME_SD_S * speed_m_s),
+            lean_s2=0.0 if is_apart else height_m / GRAVITY_M_S2,
+            stride=event.stride,
+            alike_m=_ALIKE_SHARE * (event.view.footprint_m or 0.0),
+        )
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
@@ -275,12 +294,3 @@ class Slew:
 
 def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
     return math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg), math.radians(attitude.yaw_deg)
-
-
-def _covariance(seen: PositionedMatch, vehicle: Vehicle) -> Doubles:
-    """Return the covariance (2, 2) of a fix, without the error that all fixes share."""
-    speed_m_s = math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
-    height_m = vehicle.height_m or 0.0
-    tilt_sd = _ATTITUDE_SD if vehicle.roll_deg is not None else _UNTOLD_ATTITUDE_SD
-    more_m2 = (tilt_sd * height_m) ** 2 + (_TIME_SD_S * speed_m_s) ** 2
-    return seen.covariance_m2 + more_m2 * np.eye(2)

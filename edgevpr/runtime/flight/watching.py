@@ -13,7 +13,7 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.herald import Herald, Trouble
-from edgevpr.runtime.flight.navigation import PositionedMatch, positioned, worst_sd
+from edgevpr.runtime.flight.navigation import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -164,15 +164,17 @@ class GpsWatch:
 
     def tell(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
-        seen, vehicle = positioned(event), event.vehicle
-        if seen is None or event.view.reason or vehicle is None or vehicle.gps is None:
+        vehicle = event.vehicle
+        if event.frame is None or event.view.reason or vehicle is None or vehicle.gps is None:
             return
-        if not vehicle.is_fresh_at(seen.t_s):
-            return
-        off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
         in_time_m = _TIME_SD_S * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
         tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, tilt_m, in_time_m)
+        frame = HeardFrame(t_s=event.frame.t_mono_s, sd_m=math.hypot(tilt_m, in_time_m))
+        seen = positioned(event, frame)
+        if seen is None or not vehicle.is_fresh_at(seen.t_s):
+            return
+        off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
+        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, frame.sd_m)
         self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:

@@ -175,7 +175,8 @@ class Verification:
         self._spec, self.picture, self._index, self._map = spec, picture, index, place_map
 
     @cached_property
-    def _query(self) -> Landmarks:
+    def landmarks(self) -> Landmarks:
+        """Landmarks of the query."""
         return describe(self.picture.image, self.picture.mask, OF_QUERY)
 
     def proof(self, ranking: Ranking) -> Agreement | None:
@@ -183,7 +184,7 @@ class Verification:
         match gives. None if the place has no landmarks, or its match no shift or rotation. Raises PlaceError if the
         landmarks cannot be read; the place is then left out."""
         expected, known = self._place(ranking, int(ranking.slots[0]))
-        return held_against(self._query, known, expected) if expected and known is not None else None
+        return held_against(self.landmarks, known, expected) if expected and known is not None else None
 
     def rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int]) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
@@ -193,7 +194,7 @@ class Verification:
         if not len(away):
             return 0
         expected, known = self._place(ranking, int(away[0]))
-        return OF_PLACE if known is None else agreement(self._query, known, expected).inliers
+        return OF_PLACE if known is None else agreement(self.landmarks, known, expected).inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Of the best few places compared, return the numbers of those that show the same ground as the best one: the

@@ -28,14 +28,15 @@ _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
 _MISSED = 0.2  # how likely a query misses the place below it, relative to one over ground that is not in the map
 _ALIKE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
 _LEAST_REST = 1e-4  # least probability that no candidate is right
-_GOES_ON, _ODOMETRY = 0.75, 0.6  # probabilities of going on as before, and of moving by odometry, which comes first
-_GOES_ON_SD, _ODOMETRY_SD = 0.5, 0.25  # standard deviations of these ways, in spacings of the map
+_GOES_ON, _GOES_ON_SD = 0.75, 0.5  # probability of going on as before; its standard deviation, in spacings of the map
+# Of moving by odometry, which comes first, as an autopilot tells it or as the camera sees it: the probability, and the
+# standard deviation in spacings and as a share of the length.
+_TOLD, _SEEN = (0.6, 0.25, 0.15), (0.9, 0.05, 0.05)
 _REACH_SD = 1.5  # the reach in standard deviations
 _LEARNS = 0.2  # weight of the newest displacement in the mean velocity
 _SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight is dropped
 _LEAST = 1e-300  # instead of zero, where a number divides
-_OF_LENGTH_SD = 0.15  # standard deviation of a credible displacement by odometry, as a share of its length
 _LONGEST_S = 3600.0  # longest time that counts
 _ROUNDING = 1e-12  # relative error of the difference of two squares
 _THINNEST = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
@@ -103,11 +104,13 @@ class Proposals:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
     """Motion of the aircraft since the previous query, in metres or places: `reach` is how far it can have moved in
-    `elapsed_s` seconds, and `by` (2,) its displacement by odometry (None: unknown)."""
+    `elapsed_s` seconds, and `by` (2,) its displacement by odometry (None: unknown), which `is_seen` by the camera
+    itself or told by the autopilot."""
 
     reach: float
     elapsed_s: float
     by: Doubles | None = None
+    is_seen: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,16 +127,18 @@ class Posterior:
     heading_deg: float | None = None
 
 
-def moved(elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None) -> Moved:
+def moved(
+    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_seen: bool = False
+) -> Moved:
     """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
     `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown), which is not used without a time or if it is too high to be true."""
+    unknown), which is not used without a time or if it is too high to be true; for `is_seen` see `Moved`."""
     if elapsed_s is None or not elapsed_s > 0:
         return Moved(reach=speed_max, elapsed_s=1.0)
     elapsed_s, by = min(elapsed_s, _LONGEST_S), None
     if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
         by = elapsed_s * np.asarray(velocity, float)
-    return Moved(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by)
+    return Moved(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by, is_seen=is_seen)
 
 
 class Belief:
@@ -199,10 +204,11 @@ class Belief:
         ahead *= (moved.reach / np.maximum(np.hypot(*ahead.T), max(moved.reach, _LEAST)))[:, None]
         left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * scale.spacing)
         if moved.by is not None:
-            spread = (_OF_LENGTH_SD**2 * moved.by @ moved.by + (_ODOMETRY_SD * scale.spacing) ** 2) * np.eye(2)
-            ways.append(_Way(_ODOMETRY * left, now.at + moved.by, now.covariance + spread))
+            share, least_sd, of_length = _SEEN if moved.is_seen else _TOLD
+            spread = (of_length**2 * moved.by @ moved.by + (least_sd * scale.spacing) ** 2) * np.eye(2)
+            ways.append(_Way(share * left, now.at + moved.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
-            left, middle, sd = (1 - _ODOMETRY) * left, moved.by, min(sd, scale.spacing + math.hypot(*moved.by))
+            left, middle, sd = (1 - share) * left, moved.by, min(sd, scale.spacing + math.hypot(*moved.by))
         variance = (_GOES_ON_SD * scale.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
         going = now.covariance + variance[:, None, None] * np.eye(2)
         ways.append(_Way(_GOES_ON * is_going * left, now.at + ahead, going))

@@ -21,6 +21,7 @@ from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import share_of
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
+from edgevpr.runtime.recognise.stride import Stride
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
@@ -103,14 +104,17 @@ class Follower:
         self._t_settled_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
+        self._stride: Stride | None = None
 
-    def went_on(self, frame: Frame, vehicle: Vehicle | None) -> None:
-        """Note the time since the last settled look, and the velocity of the aircraft, if they are known."""
+    def went_on(self, frame: Frame, vehicle: Vehicle | None, stride: Stride | None = None) -> None:
+        """Note the time since the last settled look, and the motion since then, if they are known: the `stride` from
+        the frame before or, without one, by the velocity that the autopilot reports."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_settled_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if vehicle and is_fresh else None
+        self._stride = stride if stride and stride.from_s == before_s else None
 
     def heard(
         self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: Sureness, where: Located | None
@@ -156,6 +160,10 @@ class Follower:
     def _moved(self, survey: _Survey) -> Moved:
         if survey.scale.is_ordinal or self._elapsed_s is None:
             return moved(None, _PLACES_A_QUERY * survey.scale.spacing)
+        if self._stride and self._elapsed_s > 0:
+            east_m, north_m = self._stride.moved_m
+            velocity_m_s = east_m / self._elapsed_s, north_m / self._elapsed_s
+            return moved(self._elapsed_s, self._fastest_m_s, velocity_m_s, is_seen=True)
         return moved(self._elapsed_s, self._fastest_m_s, self._velocity_m_s)
 
     def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:

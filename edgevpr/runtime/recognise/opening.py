@@ -23,9 +23,10 @@ from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, Told
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import is_now, levelling_of
+from edgevpr.runtime.recognise.levelling import Levelling, is_now, levelling_of
 from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
+from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques.card import load_card
 
 _WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
@@ -223,6 +224,7 @@ def _recogniser(
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=None if matcher.search else prior,
         follower=follower,
+        strides=Strides() if isinstance(prior, Prior) and isinstance(levelling, Levelling) else None,
     )
     if isinstance(prior, Prior):
         place_map.wait_at_most(_WAIT_S)

@@ -38,6 +38,7 @@ from edgevpr.runtime.recognise.levelling import Levelling, Straightening, seen_a
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
+from edgevpr.runtime.recognise.stride import Strides
 
 _log = logging.getLogger(__name__)
 _Judged = tuple[Verdict, Candidate, Located | None]  # with the best place, and the position of the aircraft
@@ -87,7 +88,8 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `prior` makes hints that narrow each query (None: the whole map is searched). `follower` follows the flight from
-    query to query (None: each is judged alone). The governor changes `candidates`; `take` and `extend` the index.
+    query to query (None: each is judged alone), and `strides` measures the motion from frame to frame (None: it is not
+    measured). The governor changes `candidates`; `take` and `extend` the index.
     """
 
     def __init__(
@@ -100,9 +102,11 @@ class Recogniser:
         preparation: Preparation = Preparation(),
         prior: Prior | Told | None = None,
         follower: Follower | None = None,
+        strides: Strides | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
-        self._settings, self._preparation, self._prior, self._follower = settings, preparation, prior, follower
+        self._settings, self._preparation = settings, preparation
+        self._prior, self._follower, self._strides = prior, follower, strides
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         self.take(matcher)
@@ -140,7 +144,11 @@ class Recogniser:
                 event.worth = preparation.gate.look(frame.image) if preparation.gate else None
             with self.meter.step("encode"):
                 event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
-            verdict, where = self._recognise(event, frame, picture, descriptor)
+            looked = Verification(self.technique.spec, picture, self.index, self.place_map)
+            if self._strides:
+                with self.meter.step("stride"):
+                    event.stride = self._strides.to(frame.t_mono_s, picture.view, looked.landmarks)
+            verdict, where = self._recognise(event, frame, looked, descriptor)
             event.accepted, event.reason = verdict.accepted, verdict.reason
             if event.accepted and where:
                 event.located, event.accuracy_m = where, max(self._settings.min_accuracy_m, where.accuracy_m)
@@ -165,7 +173,7 @@ class Recogniser:
         return packed(describe(picture.image, picture.mask)) if picture else None
 
     def _recognise(
-        self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor
+        self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor
     ) -> tuple[Verdict, Located | None]:
         """Search the map for an encoded frame. Returns the verdict and the aircraft's position (None: unknown)."""
         follower = self._follower
@@ -173,14 +181,14 @@ class Recogniser:
         event.says_nothing = nothing is not None
         objection = nothing or (event.worth.reason if event.worth else None)
         if follower:
-            follower.went_on(frame, event.vehicle)
+            follower.went_on(frame, event.vehicle, event.stride)
         if not len(self.index):
             return Verdict(False, "the map has no place yet"), None
         if objection and self.search is None:  # a sequence needs every query
             if follower:
                 follower.saw_nothing(self.index)
             return Verdict(False, objection), None
-        verdict, best, where = self._found(event, frame, picture, descriptor)
+        verdict, best, where = self._found(event, frame, looked, descriptor)
         if follower:
             follower.settle()
         if objection:
@@ -189,18 +197,17 @@ class Recogniser:
             self._prior.learn(best, verdict.accepted, frame.t_mono_s)
         return verdict, where
 
-    def _found(self, event: Recognition, frame: Frame, picture: Levelled, descriptor: Descriptor) -> _Judged:
+    def _found(self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor) -> _Judged:
         """Search for a query as expected and, if nothing is accepted, at all other heights; return as `_judged`."""
         prior, spec, search = self._prior, self.technique.spec, self.search
         if prior:
             margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-            event.hints = prior.hints(seen_as(frame, picture.view), event.vehicle, self.index, margin_m)
+            event.hints = prior.hints(seen_as(frame, looked.picture.view), event.vehicle, self.index, margin_m)
         height_ratio = prior.height_ratio if prior else 1.0
         expected = expected_of(event.hints, height_ratio, self.index)
         ranking = self._look(descriptor, expected)
         if search:
             ranking = search.follow(ranking, self.index, frame.t_mono_s)
-        looked = Verification(spec, picture, self.index, self.place_map)
         judged = self._judged(event, ranking, looked)
         others = other_heights(spec.height_ratios, height_ratio)
         if judged[0].accepted or search or not others or (prior and not prior.looks_again):

@@ -13,6 +13,7 @@ from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.salience_gate import Worth
+from edgevpr.runtime.recognise.stride import Stride
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
@@ -29,6 +30,7 @@ class Recognition:
     picture: Levelled | None = None  # that was encoded, and how it lies on the ground
     worth: Worth | None = None  # judgement of the salience gate
     descriptor: Descriptor | None = None
+    stride: Stride | None = None  # since the frame before
     hints: Hints | None = None  # that narrowed the search
     ranking: Ranking | None = None
     best: Candidate | None = None  # the first of the ranking
@@ -80,12 +82,13 @@ def fields_of(event: Recognition) -> dict[str, Any]:
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
-    if nothing was accepted), costs. Only if known: view (how the picture lies on the ground), salience, landmarks,
-    confidence, evidence, followed.
+    if nothing was accepted), costs. Only if known: view (how the picture lies on the ground), salience, stride,
+    landmarks, confidence, evidence, followed.
     """
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.worth and event.worth.salience.rounded(),
+        "stride": event.stride and event.stride.fields(),
         "landmarks": event.proof and _landmarks(event.proof),
         "confidence": _rounded(event.confidence, 6),
         "evidence": event.evidence and {key: round(value, 3) for key, value in event.evidence.items()},

@@ -9,18 +9,18 @@ from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.navigation import BELIEVED, Navigation, PositionedMatch, Weighed
+from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
+from edgevpr.runtime.flight.navigation import BELIEVED, HeardFrame, Navigation, PositionedMatch, Weighed
 from edgevpr.runtime.flight.navigator import Slew
-from edgevpr.runtime.flight.path import GRAVITY_M_S2, INERTIAL, RECKONED
 from edgevpr.runtime.recognise.perspective import Lean
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
 
 
-def match_at(position, t_s, sd_m):
-    covariance_m2 = sd_m**2 * np.eye(2)
-    return PositionedMatch(t_s=t_s, position=position, accuracy_m=sd_m, covariance_m2=covariance_m2, places=(1,))
+def match_at(position, t_s, sd_m, lean_s2=0.0):
+    frame, covariance_m2 = HeardFrame(t_s=t_s, sd_m=0.0, lean_s2=lean_s2), sd_m**2 * np.eye(2)
+    return PositionedMatch(frame=frame, position=position, accuracy_m=sd_m, covariance_m2=covariance_m2, places=(1,))
 
 
 class Flown:
@@ -104,9 +104,8 @@ def test_what_an_error_of_the_attitude_does_to_fix_and_path_is_known_to_be_one()
             flown.bias = flown.bias + flown.rng.normal(0, 0.05, 2)
             t_s = (flown.step - flown.late_steps) * STEP_S
             seen = flown.way[flown.step - flown.late_steps] + lean_s2 * flown.bias + flown.rng.normal(0, 0.5, 2)
-            match = match_at(Position(*moved(*HOME, *seen)), t_s, 0.5)
+            match = match_at(Position(*moved(*HOME, *seen)), t_s, 0.5, 0.0 if told == "nothing" else lean_s2)
             shown = Lean(tuple(flown.rng.normal(-flown.bias / GRAVITY_M_S2, 0.02)), 0.02)
-            match = replace(match, lean_s2=0.0 if told == "nothing" else lean_s2)
             match = replace(match, lean=shown if "shows" in told else None)
             flown.navigation.hear_fix(flown.navigation.compared(match))
 
@@ -127,7 +126,7 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
         t_s = (flown.step - flown.late_steps) * STEP_S
         seen = flown.way[flown.step - flown.late_steps] - 100 * wrong + flown.rng.normal(0, 0.5, 2)
         shown = Lean(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
-        match = replace(match_at(Position(*moved(*HOME, *seen)), t_s, 0.5), lean_s2=lean_s2, lean=shown)
+        match = replace(match_at(Position(*moved(*HOME, *seen)), t_s, 0.5, lean_s2), lean=shown)
         flown.navigation.hear_fix(flown.navigation.compared(match))
 
     flown.fix = fix
@@ -143,8 +142,8 @@ def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_
     def fix():
         t_s = (flown.step - flown.late_steps) * STEP_S
         seen = flown.way[flown.step - flown.late_steps] + flown.rng.normal(0, 2.0, 2)
-        match = match_at(Position(*moved(*HOME, *seen)), t_s, 2.0)
-        flown.navigation.hear_fix(flown.navigation.compared(replace(match, lean_s2=18.0)))
+        match = match_at(Position(*moved(*HOME, *seen)), t_s, 2.0, 18.0)
+        flown.navigation.hear_fix(flown.navigation.compared(match))
 
     flown.fix = fix
     flown.fly(60)

@@ -1,0 +1,206 @@
+"""The filter of a path's errors: how far the aircraft is from its path by now. `navigation` uses it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.runtime.recognise.locate import in_sd
+
+GRAVITY_M_S2 = 9.80665
+# So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
+# it wandered without end, every fix would be taken for a proof of it.
+_ATTITUDE_LASTS_S = 20.0
+# The error of the attitude wanders up to five times as fast as that of good gyros, as in PX4's simulator. Of the last
+# twenty pictures: the mean square of the leans that they show, over their variances, is .2 in flights of ArduPilot's
+# simulator and 1.3 in those of PX4's.
+_ROUGHEST, _SHOWN_GAIN = 4.0, 0.05
+_CALM, _ROUGH = 0.3, 0.8
+_CONTRADICTS = 4.0  # standard deviations: a stride that differs by more is not believed
+_STRIDE_SD, _STRIDE_NOISE = 0.05, 0.003  # error of scale and direction of all strides, and its change in one second
+
+_C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
+_SIZE, _EYE = 12, np.eye(2)
+_OF_FRAME, _FIX = np.zeros((2, _SIZE)), np.zeros((2, _SIZE))  # what `f` is, and what the fix of a frame is
+_OF_FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drift:
+    """Size of the errors of a path. `velocity_sd` (m/s) and `acceleration_sd` (m/s2) are the standard deviations, of
+    one axis, for a path that nothing corrects. `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise`
+    (m/s2) are the standard deviations of the random change of the error of position, velocity and acceleration in one
+    second."""
+
+    velocity_sd: float
+    acceleration_sd: float
+    position_noise: float
+    velocity_noise: float
+    acceleration_noise: float
+    is_of_attitude: bool  # the path rests on the attitude, so that an error of it is one of the path's acceleration
+
+
+# Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
+# plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
+RECKONED = Drift(
+    velocity_sd=4.0, acceleration_sd=0.1, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.03,
+    is_of_attitude=False,
+)  # fmt: skip
+# Accelerations, rotated into east and north by the autopilot's attitude: an error of half a degree is 0.09 m/s2.
+INERTIAL = Drift(
+    velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
+    is_of_attitude=True,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Strode:
+    """A stride (see `recognise.stride`): by `moved_m` (2,), which exceeds the motion of the path by `off_m` (2,).
+    `sd_m` is the standard deviation of each axis."""
+
+    moved_m: Doubles
+    off_m: Doubles
+    sd_m: float
+
+
+class DriftFilter:
+    """Kalman filter that estimates the errors of one path. `drift` is the size of these errors, `map_sd_m` the standard
+    deviation, of one axis, of the error that all fixes share.
+
+    The state has six parts, each east and north: `c` (m), the offset from the path to the aircraft; `s` (m/s), by how
+    much the aircraft is faster than the path; `b` (m/s2), the part of gravity that an error of the attitude takes for
+    acceleration, the other way round, which for a path of accelerations is the rate of change of `s`; `m` (m), the
+    offset from GPS positions to fixes; `f` (m), the offset from the path to where the last frame's picture puts the
+    aircraft; and `k`, the error of scale and direction (radians, clockwise) of all strides.
+
+    A frame may have been taken seconds ago: it is compared with the path at that time. An error of the attitude moves
+    its `f`, and so its fix, by `lean_s2`, the height above the ground over gravity (0: it rests on no attitude), times
+    `b` the other way. A stride takes `f` from one frame to the next, with the errors of both.
+    """
+
+    def __init__(self, drift: Drift, map_sd_m: float) -> None:
+        self._drift, self._map_sd_m = drift, map_sd_m
+        self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
+        self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
+        self._shown = 0.0  # mean square of the leans of the last pictures, over their variances
+
+    def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
+        """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
+        of its offset and of the error of velocity."""
+        self._x = np.zeros(_SIZE)
+        of_parts = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _STRIDE_SD
+        self._p = np.diag(np.repeat(np.square(of_parts), 2))
+
+    def go_on(self, step_s: float) -> None:
+        """Predict the state `step_s` seconds later."""
+        move = np.eye(_SIZE)
+        move[_C, _S] = step_s * _EYE
+        if self._drift.is_of_attitude:
+            move[_C, _B] = step_s**2 / 2 * _EYE
+            move[_S, _B] = step_s * _EYE
+        else:
+            move[_B, _B] = math.exp(-step_s / _ATTITUDE_LASTS_S) * _EYE
+        drift = self._drift
+        wander = drift.acceleration_noise * (1.0 + _ROUGHEST * self._roughness)
+        noise = drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE
+        self._x = move @ self._x
+        self._p = move @ self._p @ move.T + step_s * np.diag(np.repeat(np.square(noise), 2))
+
+    @property
+    def _roughness(self) -> float:
+        """Poorness of the gyros, 0 to 1, by the leans that pictures have shown."""
+        share = (self._shown - _CALM) / (_ROUGH - _CALM)
+        return min(1.0, max(0.0, share)) if self._drift.is_of_attitude else 0.0
+
+    def lose_gps(self) -> None:
+        """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more."""
+        self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
+
+    def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
+        """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
+        that of the path by `off_m_s` (2,). The standard deviations are those of one axis."""
+        look = np.zeros((4, _SIZE))
+        look[:2, _C] = look[2:, _S] = _EYE
+        self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
+
+    def hear_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: Strode | None = None) -> bool:
+        """Note a frame taken `age_s` ago. `sd_m` is the standard deviation, of each axis, by which its picture puts the
+        aircraft wrongly, beside what `lean_s2` does. Correct the state by the `stride` from the frame before (None: it
+        is unknown). Returns False if that contradicts the state, and is not used."""
+        self._frame = seen, variance_m2 = self._seen(age_s, lean_s2), sd_m**2
+        if stride is None:
+            self._begin_frame()
+            return True
+        (east_m, north_m), look, go_on = stride.moved_m, seen - _OF_FRAME, np.eye(_SIZE)
+        go_on[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
+        x, p = go_on @ self._x, go_on @ self._p @ go_on.T
+        x[_F] += stride.off_m
+        p[_F, _F] += stride.sd_m**2 * _EYE
+        if in_sd(look @ x, look @ p @ look.T + variance_m2 * _EYE) > _CONTRADICTS:
+            self._begin_frame()
+            return False
+        self._x, self._p = x, p
+        self._correct(look, np.zeros(2), variance_m2 * _EYE)
+        return True
+
+    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
+        """Correct the state by the fix of the last frame, of covariance (2, 2), `off_m` (2,) metres from the path."""
+        self._correct(_FIX, off_m, covariance_m2)
+
+    def hear_lean(self, over_height: Doubles, sd: float) -> None:
+        """Correct the state by the error of the attitude that a picture shows (see `recognise.perspective`). Where
+        pictures show more than they may be wrong by, the gyros are poor and the error wanders faster."""
+        shown = float(np.mean(np.square(over_height))) / sd**2
+        self._shown += _SHOWN_GAIN * (shown - self._shown)
+        look = np.zeros((2, _SIZE))
+        look[:, _B] = _EYE / GRAVITY_M_S2
+        self._correct(look, over_height, sd**2 * _EYE)
+
+    def trust_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
+        """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
+        self._p[_C] = self._p[:, _C] = 0.0
+        self._p[_C, _C] = 1e6 * _EYE
+        self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
+        self._begin_frame()
+        self.hear_fix(off_m, covariance_m2)
+
+    def expected_fix(self) -> tuple[Doubles, Doubles]:
+        """Predict the fix of the last frame. Returns its offset (2,) from the path, metres, and the covariance (2, 2)
+        of this prediction, without that of the fix itself."""
+        return _FIX @ self._x, _FIX @ self._p @ _FIX.T
+
+    def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
+        """Return the errors of the path `age_s` seconds ago (negative: in the future):
+        - offset (2,) from the path to the aircraft, metres
+        - error of velocity (2,), m/s
+        - covariance (4, 4) of both.
+        """
+        look = np.zeros((4, _SIZE))
+        look[:2] = self._seen(age_s, 0.0)
+        look[2:, _S], look[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
+        off = look @ self._x
+        return off[:2], off[2:], look @ self._p @ look.T
+
+    def _begin_frame(self) -> None:
+        """Set `f` to where the aircraft was when the last frame was taken."""
+        seen, variance_m2 = self._frame
+        begin = np.eye(_SIZE)
+        begin[_F] = seen
+        self._x, self._p = begin @ self._x, begin @ self._p @ begin.T
+        self._p[_F, _F] += variance_m2 * _EYE
+
+    def _correct(self, look: Doubles, seen: Doubles, covariance: Doubles) -> None:
+        """Do a Kalman update with the measurement matrix `look` (n, 12) and what was `seen` (n,)."""
+        gain = np.linalg.solve(look @ self._p @ look.T + covariance, look @ self._p).T
+        self._x = self._x + gain @ (seen - look @ self._x)
+        kept = np.eye(_SIZE) - gain @ look
+        self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
+
+    def _seen(self, age_s: float, lean_s2: float) -> Doubles:
+        """Return the matrix (2, 12) that gives the offset from the path to the aircraft `age_s` seconds ago, where a
+        picture puts it with an error of the attitude that counts by `lean_s2`."""
+        look = np.zeros((2, _SIZE))
+        look[:, _C], look[:, _S] = _EYE, -age_s * _EYE
+        look[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - lean_s2) * _EYE
+        return look

@@ -1,0 +1,71 @@
+"""Strides: the motion of the aircraft between two frames, by the landmarks of both pictures (visual odometry).
+
+Both pictures are levelled, so that the landmarks of one lie on those of the other by a rotation, a scaling and a shift,
+and the point under the camera is known in each. No map is needed. It is for cameras that look straight down only.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from edgevpr.core.geodesy import axes_of
+from edgevpr.frames.level import View
+from edgevpr.runtime.recognise.agreement import agreement
+from edgevpr.runtime.recognise.landmarks import Landmarks
+
+# Over ground that repeats, as furrows do, landmarks match at many shifts: few of the matches agree on one.
+_FEWEST, _LEAST_SHARE = 30, 0.4
+_MOST_TURN_DEG, _MOST_SCALE = 8.0, 1.15  # two levelled pictures lie on each other turned and scaled by no more
+_LONGEST_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stride:
+    """Motion from the frame of `from_s` to that of `to_s`: by `moved_m` (east, north), as far as height and heading are
+    right that the pictures were levelled by. `sd_m` is the standard deviation of each axis, by the landmarks alone, of
+    which `inliers` agree."""
+
+    from_s: float
+    to_s: float
+    moved_m: tuple[float, float]
+    sd_m: float
+    inliers: int
+
+    def fields(self) -> dict[str, Any]:
+        """Return this stride as fields of the flight log."""
+        moved_m = [round(each, 2) for each in self.moved_m]
+        return {"from_s": self.from_s, "moved_m": moved_m, "sd_m": round(self.sd_m, 3), "inliers": self.inliers}
+
+
+class Strides:
+    """Measures the stride to each frame from the one before it."""
+
+    def __init__(self) -> None:
+        self._before: tuple[float, View, Landmarks] | None = None
+
+    def to(self, t_s: float, view: View, landmarks: Landmarks) -> Stride | None:
+        """Return the stride to a frame taken at `t_s`; None if it is not known. The next one begins there."""
+        before, self._before = self._before, (t_s, view, landmarks)
+        if before is None or not 0 < t_s - before[0] <= _LONGEST_S:
+            return None
+        from_s, start, known = before
+        if start.aside is None or view.aside is None or start.up_deg is None or view.up_deg is None:
+            return None
+        if start.footprint_m is None or view.footprint_m is None:
+            return None
+        found = agreement(landmarks, known)
+        if found.inliers < max(_FEWEST, _LEAST_SHARE * found.matched):
+            return None
+        if found.shift_share is None or found.rotation_deg is None or found.scale is None:
+            return None
+        turned_deg = (found.rotation_deg - (view.up_deg - start.up_deg) + 180) % 360 - 180
+        stretched = found.scale * start.footprint_m / view.footprint_m
+        if abs(turned_deg) > _MOST_TURN_DEG or not 1 / _MOST_SCALE < stretched < _MOST_SCALE:
+            return None
+        # The point under the camera, in the picture before: that of this picture, turned, scaled and shifted.
+        factor = found.scale * complex(math.cos(turn := math.radians(found.rotation_deg)), math.sin(turn))
+        step = factor * complex(view.aside[0], -view.aside[1]) + complex(*found.shift_share)
+        step -= complex(start.aside[0], -start.aside[1])
+        east_m, north_m = start.footprint_m * axes_of(start.up_deg) @ (step.real, -step.imag)
+        sd_m = start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0])
+        return Stride(from_s, t_s, (float(east_m), float(north_m)), sd_m, found.inliers)

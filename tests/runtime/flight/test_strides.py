@@ -1,0 +1,81 @@
+"""The motion that the camera sees, in the navigator: it carries the position where no place is accepted."""
+
+import numpy as np
+import pytest
+from air import Air, lengths
+
+from edgevpr.mavlink.channel import Channel
+from edgevpr.runtime.flight.navigator import Navigator
+
+WIND = (5.0, -3.0)
+GAP_S = 60
+
+
+def air_of(channel, **how):
+    ours = Navigator(1.0, 1.0)
+    ours.hear_channel(channel)
+    return Air(ours, wind=WIND, gusts=0.2, fix_sd_m=1.5, other_sd_m=0.5, bias=(0.1, 0.0), **how)
+
+
+def off_m(air):
+    """Metres (2,) by which our position is wrong now, and what it says of itself."""
+    here = air.navigator._navigation.at(air.t_s)
+    return air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m
+
+
+def across_a_gap(air, seconds=GAP_S):
+    """Fly without GPS over the map, then off it. Returns the errors and the accuracies told, once a second."""
+    air.fly(60)
+    air.lose_gps()
+    air.fly(60)
+    air.matches = False
+    found = [off_m(air.fly(1)) for _ in range(seconds)]
+    return [error for error, _ in found], np.array([said for _, said in found])
+
+
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
+@pytest.mark.parametrize(("stretch", "turn"), [(1.0, 0.0), (1.05, 0.0), (1.0, 0.06)])
+def test_a_minute_off_the_map_is_bridged_to_three_per_cent_of_the_way(channel, stretch, turn):
+    air = air_of(channel, stride_sd_m=0.2)
+    air.stretch, air.turn = stretch, turn
+    errors_m, said_m = across_a_gap(air)
+    way_m = air.speed_m_s * GAP_S
+    assert lengths(errors_m).max() <= 0.03 * way_m
+    assert (np.abs(errors_m) < 2 * said_m[:, None]).mean() >= 0.9
+    assert said_m[-1] < 0.04 * way_m
+
+
+def test_without_strides_the_same_gap_is_not_bridged():
+    errors_m, said_m = across_a_gap(air_of(Channel.COMMAND))
+    assert lengths(errors_m).max() > 30.0
+    assert said_m[-1] > 30.0
+
+
+def test_a_hover_is_told_and_holds_its_place():
+    air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=0.0)
+    errors_m, said_m = across_a_gap(air, seconds=120)
+    assert lengths(errors_m).max() < 4.0
+    assert said_m[-1] < 4.0
+    _, state = air.states[-1]
+    assert np.hypot(*state.velocity_m_s[:2]) < 0.5
+
+
+def test_the_autopilot_is_held_in_the_gap():
+    air = air_of(Channel.COMMAND, stride_sd_m=0.2)
+    across_a_gap(air)
+    assert len(air.between) > 15
+    assert lengths([error for _, error in air.between[-15:]]).max() < 25.0
+    assert lengths(air.errors_m[-30:]).max() < 35.0
+
+
+def test_a_stride_that_contradicts_the_path_is_not_believed():
+    air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2)
+    air.fly(60)
+    air.lose_gps()
+    air.fly(30)
+    before_m, _ = off_m(air)
+    air.matches, air.stretch = False, 5.0
+    air.fly(1)
+    air.stretch = 1.0
+    after_m, _ = off_m(air)
+    assert np.hypot(*(after_m - before_m)) < 2.0

@@ -1,0 +1,97 @@
+"""The motion between two frames, by pictures rendered over generated ground, and where there is none to be told."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.core.types import Frame
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
+from edgevpr.runtime.recognise.stride import Strides
+
+METRES_PER_PIXEL, FOOTPRINT_M = 0.25, 130.0
+FOV_DEG = math.degrees(2 * math.atan(Camera().width / 2 / Camera().focal_px))
+LIGHT = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
+START = CameraPose(east_m=200.0, north_m=200.0, height_m=100.0, heading_deg=30.0, roll_deg=4.0, pitch_deg=-3.0)
+
+
+@pytest.fixture(scope="module")
+def ground():
+    return lit(make_scene(5, 400.0, 400.0, METRES_PER_PIXEL), LIGHT, 5)
+
+
+def seen(ground, pose, told=None):
+    """The levelled picture from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
+    image, told = photograph(ground, METRES_PER_PIXEL, pose, Camera(), LIGHT, np.random.default_rng(1)), told or pose
+    names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")
+    frame = Frame(image=image, name="f", t_mono_s=0.0, **{name: getattr(told, name) for name in names})
+    picture = levelled(frame, None, Lens(FOV_DEG), FOOTPRINT_M)
+    return picture.view, describe(picture.image, picture.mask, OF_QUERY)
+
+
+def stride(first, second, after_s=1.0):
+    strides = Strides()
+    assert strides.to(5.0, *first) is None
+    return strides.to(5.0 + after_s, *second)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"east_m": 215.0, "north_m": 190.0},
+        {"north_m": 240.0, "heading_deg": 50.0},
+        {"east_m": 190.0, "roll_deg": -20.0, "pitch_deg": 5.0},
+        {"east_m": 210.0, "height_m": 110.0},
+    ],
+)
+def test_it_is_the_way_that_the_aircraft_has_gone(ground, change):
+    second = replace(START, **change)
+    found = stride(seen(ground, START), seen(ground, second))
+    gone_m = second.east_m - START.east_m, second.north_m - START.north_m
+    assert found.moved_m == pytest.approx(gone_m, abs=0.5)
+    assert (found.from_s, found.to_s) == (5.0, 6.0)
+    assert found.sd_m < 0.5
+
+
+def test_a_wrong_height_stretches_it_and_a_wrong_compass_turns_it(ground):
+    second = replace(START, east_m=230.0)
+    low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
+    pair = [seen(ground, pose, replace(pose, **low)) for pose in (START, second)]
+    assert stride(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
+    pair = [seen(ground, pose, replace(pose, **turned)) for pose in (START, second)]
+    east, north = stride(*pair).moved_m
+    assert math.degrees(math.atan2(-north, east)) == pytest.approx(10.0, abs=1.0)
+
+
+def test_where_it_cannot_be_told_there_is_none(ground):
+    first, second = seen(ground, START), seen(ground, replace(START, east_m=215.0))
+    elsewhere = seen(ground, replace(START, east_m=60.0, north_m=330.0))
+    assert stride(first, elsewhere) is None
+    assert stride(first, second, after_s=40.0) is None
+    assert stride(first, second, after_s=0.0) is None
+    assert stride(first, (UNKNOWN_VIEW, second[1])) is None
+    assert stride(first, (replace(second[0], footprint_m=None), second[1])) is None
+
+
+def test_a_compass_or_a_height_that_jumps_is_not_believed(ground):
+    second = replace(START, east_m=215.0)
+    for wrong in ({"heading_deg": 50.0}, {"height_m": 70.0}):
+        assert stride(seen(ground, START), seen(ground, second, replace(second, **wrong))) is None
+
+
+def test_ground_that_repeats_or_says_nothing_gives_none():
+    rng = np.random.default_rng(2)
+    tile = cv2.GaussianBlur(rng.uniform(0, 255, (40, 40)).astype(np.float32), (0, 0), 2)
+    tile = cv2.normalize(tile, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    repeated = np.repeat(np.tile(tile, (40, 40))[..., None], 3, 2)
+    second = replace(START, east_m=217.0)
+    found = stride(seen(repeated, START), seen(repeated, second))
+    assert found is None or found.moved_m == pytest.approx((17.0, 0.0), abs=0.5)
+    blank = np.full((1600, 1600, 3), 90, np.uint8)
+    assert stride(seen(blank, START), seen(blank, second)) is None
