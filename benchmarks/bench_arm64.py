@@ -26,7 +26,7 @@ from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent
 TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
-WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
+WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml", "pymavlink", "fastcrc")  # what the parts import
 _COLUMNS = {
     "part": "{part}",
     "million instructions": "{millions:.2f}",

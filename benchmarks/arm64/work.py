@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import cv2
+import flying
 import numpy as np
 from counted import SMALL
 
+from edgevpr.core.arrays import Image
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
@@ -26,16 +28,21 @@ def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the name of each part, and a function that does it."""
     yield from of_camera("ahead", "forward", ahead)
     yield from of_camera("down", "nadir", down)
+    yield from flying.parts(_picture(np.random.default_rng(0)))
     yield "micro-benchmark: a round of products", product_round()
     yield "micro-benchmark: a round of passes", pass_round()
+
+
+def _picture(rng: np.random.Generator) -> Image:
+    """Return noise, smoothed and stretched: nearly all regions are good, as over a town."""
+    noise = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
+    return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
 
 
 def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the parts of a query of `cohog` in one map."""
     rng = np.random.default_rng(0)
-    # Noise smoothed and stretched: nearly all regions are good, as over a town.
-    noise = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
-    picture = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
+    picture = _picture(rng)
     technique = create("cohog", {"camera": camera})
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)

@@ -31,7 +31,7 @@ _LEAST_REST = 1e-4  # least probability that no candidate is right
 _GOES_ON, _GOES_ON_SD = 0.75, 0.5  # probability of going on as before; its standard deviation, in spacings of the map
 # Of moving by odometry, which comes first, as an autopilot tells it or as the camera sees it: the probability, and the
 # standard deviation in spacings and as a share of the length.
-_TOLD, _SEEN = (0.6, 0.25, 0.15), (0.9, 0.05, 0.05)
+_TOLD, _SEEN = (0.6, 0.25, 0.15), (0.98, 0.05, 0.05)
 _REACH_SD = 1.5  # the reach in standard deviations
 _LEARNS = 0.2  # weight of the newest displacement in the mean velocity
 _SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
@@ -112,6 +112,10 @@ class Moved:
     by: Doubles | None = None
     is_seen: bool = False
 
+    def to_fresh_ground(self, spacing: float) -> float:
+        """Return which share of the ground in the picture is new, as far as that is seen: 0 to 1."""
+        return min(1.0, float(np.hypot(*self.by)) / spacing) if self.is_seen and self.by is not None else 1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
@@ -167,7 +171,8 @@ class Belief:
             numbers, proposed = _usable(proposed, self._scale)
             there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
             lost *= alike
-            unseen = _unseen(now, ways, _MISSED)
+            # Of a miss, too, pictures of the same ground are no new evidence.
+            unseen = _unseen(now, ways, _MISSED ** moved.to_fresh_ground(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
             there = replace(there, w=there.w * max(1.0, kept) ** staleness)

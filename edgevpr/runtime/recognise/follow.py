@@ -183,7 +183,9 @@ def _proposals(
     """Return what the query proposes to the belief, as in `Follower.heard`: the slots, int (K,), and the proposals."""
     slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
     at = survey.positions(slots, index)
-    covariance = np.tile((1.0 if survey.origin is None else survey.spread**2) * np.eye(2), (len(slots), 1, 1))
+    # Of a match that is not worth locating the place is known, and not where in its picture the aircraft is.
+    spread = survey.spread if where else max(survey.spread, survey.scale.near)
+    covariance = np.tile((1.0 if survey.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)
     same = np.zeros(len(slots), bool)
     if where and survey.origin:

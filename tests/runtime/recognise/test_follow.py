@@ -6,13 +6,14 @@ from fakes import vehicle_at
 from sureness import told
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.stride import Stride
 
 PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground
@@ -46,10 +47,12 @@ class Flight:
         self.place_map, self.index, self.t_s = place_map, index, 1000.0
         self.has_poses = place_map.footprint_m() is not None
 
-    def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None):
-        self.t_s += elapsed_s
+    def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
+        """Go on, `moved_m` (east, north) by the camera's own motion."""
+        before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
-        self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle)
+        stride = moved_m and Stride(before_s, self.t_s, moved_m, 0.2, 100)
+        self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def hear(self, place, p, of_map=None, others=(), lead=1.0):
         """A look whose best place is this one (a number between two is one between two places)."""
@@ -68,8 +71,8 @@ class Flight:
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, sure, where
         )
 
-    def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, **more):
-        self.go_on(elapsed_s, velocity_m_s)
+    def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
+        self.go_on(elapsed_s, velocity_m_s, moved_m)
         followed = self.hear(place, p, **more)
         self.follower.settle()
         assert_sound(followed)
@@ -239,3 +242,45 @@ def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, ba
         assert followed.confidence < 0.1
         assert not followed.leads_from(30)
         assert followed.lost > 0.9
+
+
+def along(places):
+    """Metres east and north by so many places."""
+    here, there = at(0), at(places)
+    return offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+
+
+def after_a_gap(place_map, moved_m, away=60, p=0.5):
+    """Six places found, three queries that find nothing while the flight goes on, then one that is right."""
+    flight = Flight(place_map, IN_METRES)
+    for place in range(6):
+        flight.look(place, moved_m=along(1))
+    for place in range(6, 9):
+        flight.look(place + away, p=0.01, moved_m=moved_m)
+    return flight, flight.look(9, p=p, moved_m=moved_m)
+
+
+def test_what_the_camera_sees_of_the_motion_makes_a_doubtful_match_sure(posed_map):
+    _, blind = after_a_gap(posed_map, None)
+    _, seen = after_a_gap(posed_map, along(1))
+    assert blind.confidence < 0.9  # of a match that is right half the time
+    assert seen.confidence > 0.96
+    assert off_m(seen, 9) < SPACING_M
+
+
+def test_queries_that_find_nothing_over_the_same_ground_are_one(posed_map):
+    flight = Flight(posed_map, IN_METRES)
+    for place in range(6):
+        flight.look(place, moved_m=along(1))
+    lost = [flight.look(60, p=0.01, elapsed_s=1.0, moved_m=along(0.02)).lost for _ in range(20)]
+    assert lost[-1] < 0.5
+
+
+@pytest.mark.parametrize("moved_m", [None, along(1)])
+def test_a_belief_that_is_wrong_costs_queries_and_not_the_flight(posed_map, moved_m):
+    """Carried off by half the map, while the camera sees nothing of it, or sees a motion that is not the aircraft's."""
+    flight, _ = after_a_gap(posed_map, moved_m)
+    found = [flight.look(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
+    assert found[-1].confidence >= 0.9
+    assert found[-1].mass > SURE
+    assert off_m(found[-1], 65) < SPACING_M
