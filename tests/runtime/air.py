@@ -159,7 +159,8 @@ class Air:
         east_m, north_m = (self.way[step] - self.way[before]) * self.stretch
         turned = complex(east_m, north_m) * np.exp(-1j * self.turn)
         moved_m = np.array([turned.real, turned.imag]) + self.rng.normal(0, self.stride_sd_m, 2)
-        return Stride(before * _STEP_S, step * _STEP_S, tuple(moved_m), self.stride_sd_m, 100)
+        from_s, to_s = before * _STEP_S, step * _STEP_S
+        return Stride(from_s=from_s, to_s=to_s, moved_m=tuple(moved_m), sd_m=self.stride_sd_m, inliers=100)
 
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)

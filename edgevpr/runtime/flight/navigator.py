@@ -14,16 +14,9 @@ from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Attitude
+from edgevpr.runtime.flight.consistency import Consistency, HeardFrame, positioned, worst_sd
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import (
-    Consistency,
-    HeardFrame,
-    Navigation,
-    Whereabouts,
-    positioned,
-    reckons_by_gps,
-    worst_sd,
-)
+from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 

@@ -12,8 +12,8 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.flight.herald import Herald, Trouble
-from edgevpr.runtime.flight.navigation import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.runtime.recognise.motion import Moved
 
 _MOST = 64  # hypotheses kept
 # Chances between two queries to leave the map, to be anywhere on it, and to enter it. The odds for a history are at
@@ -37,7 +38,6 @@ _LEARNS = 0.2  # weight of the newest displacement in the mean velocity
 _SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
 _FORGOTTEN = 1e-9  # a hypothesis of less weight is dropped
 _LEAST = 1e-300  # instead of zero, where a number divides
-_LONGEST_S = 3600.0  # longest time that counts
 _ROUNDING = 1e-12  # relative error of the difference of two squares
 _THINNEST = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
 _FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
@@ -102,22 +102,6 @@ class Proposals:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Moved:
-    """Motion of the aircraft since the previous query, in metres or places: `reach` is how far it can have moved in
-    `elapsed_s` seconds, and `by` (2,) its displacement by odometry (None: unknown), which `is_seen` by the camera
-    itself or told by the autopilot."""
-
-    reach: float
-    elapsed_s: float
-    by: Doubles | None = None
-    is_seen: bool = False
-
-    def to_fresh_ground(self, spacing: float) -> float:
-        """Return which share of the ground in the picture is new, as far as that is seen: 0 to 1."""
-        return min(1.0, float(np.hypot(*self.by)) / spacing) if self.is_seen and self.by is not None else 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
     and an estimate of the position: `at` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
@@ -129,20 +113,6 @@ class Posterior:
     at: Doubles = field(default_factory=lambda: np.full(2, np.nan))
     covariance: Doubles = field(default_factory=lambda: np.full((2, 2), np.nan))
     heading_deg: float | None = None
-
-
-def moved(
-    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_seen: bool = False
-) -> Moved:
-    """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
-    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown), which is not used without a time or if it is too high to be true; for `is_seen` see `Moved`."""
-    if elapsed_s is None or not elapsed_s > 0:
-        return Moved(reach=speed_max, elapsed_s=1.0)
-    elapsed_s, by = min(elapsed_s, _LONGEST_S), None
-    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
-        by = elapsed_s * np.asarray(velocity, float)
-    return Moved(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by, is_seen=is_seen)
 
 
 class Belief:

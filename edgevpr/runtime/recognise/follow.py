@@ -16,11 +16,12 @@ from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.belief import Belief, MapScale, Moved, Proposals, moved
+from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import share_of
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
+from edgevpr.runtime.recognise.motion import Moved, moved
 from edgevpr.runtime.recognise.stride import Stride
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.

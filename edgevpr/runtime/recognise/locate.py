@@ -36,15 +36,17 @@ _SAYING = 5  # of these determine the position
 class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
-    pictures, and `footprint_m` the length on the ground of the longest side (None: unknown). `places` are the numbers
-    of the places that agree on it. `objection` is the reason not to trust the position (None: no reason). `lean` is
-    what the picture shows of an error of the reported attitude, which the position is computed with."""
+    pictures, `footprint_m` the length on the ground of the longest side, and `height_m` the height above the ground
+    that follows from it, whatever was reported (None: unknown). `places` are the numbers of the places that agree on
+    it. `objection` is the reason not to trust the position (None: no reason). `lean` is what the picture shows of an
+    error of the reported attitude, which the position is computed with."""
 
     position: Position
     covariance_m2: Covariance
     heading_deg: float | None = None
     height_ratio: float | None = None
     footprint_m: float | None = None
+    height_m: float | None = None
     places: tuple[int, ...] = ()
     objection: str | None = None
     lean: Lean | None = None
@@ -122,12 +124,14 @@ def located(
     if sum(score for score, _ in against) > _OUTWEIGHS * sum(score for score, _ in agreeing):
         objection = f"places of the same ground say positions that are {max(against)[1]:.0f} m apart"
     lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
+    footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(
         position=Position(lat_deg, lon_deg, best.position.alt_m),
         covariance_m2=triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,
-        footprint_m=pose.footprint_m * (first.height_ratio or 1.0),
+        footprint_m=footprint_m,
+        height_m=view.focal and view.focal * footprint_m,
         places=tuple(dict.fromkeys(each.place_id for _, each in agreeing)),
         objection=objection,
         lean=lean,

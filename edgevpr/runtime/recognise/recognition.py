@@ -131,6 +131,8 @@ def _followed(followed: Followed) -> dict[str, Any]:
 
 def _located(where: Located) -> dict[str, Any]:
     fields = _where(where) | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
+    if where.height_m is not None:
+        fields["height_m"] = round(where.height_m, 1)
     if where.lean:
         fields["lean"] = [round(each, 4) for each in (*where.lean.over_height, where.lean.sd)]
     return fields

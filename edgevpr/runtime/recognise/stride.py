@@ -19,7 +19,7 @@ _MOST_TURN_DEG, _MOST_SCALE = 8.0, 1.15  # two levelled pictures lie on each oth
 _LONGEST_S = 30.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Stride:
     """Motion from the frame of `from_s` to that of `to_s`: by `moved_m` (east, north), as far as height and heading are
     right that the pictures were levelled by. `sd_m` is the standard deviation of each axis, by the landmarks alone, of
@@ -68,4 +68,5 @@ class Strides:
         step -= complex(start.aside[0], -start.aside[1])
         east_m, north_m = start.footprint_m * axes_of(start.up_deg) @ (step.real, -step.imag)
         sd_m = start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0])
-        return Stride(from_s, t_s, (float(east_m), float(north_m)), sd_m, found.inliers)
+        moved_m = float(east_m), float(north_m)
+        return Stride(from_s=from_s, to_s=t_s, moved_m=moved_m, sd_m=sd_m, inliers=found.inliers)

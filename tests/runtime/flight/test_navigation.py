@@ -9,8 +9,9 @@ from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
+from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
-from edgevpr.runtime.flight.navigation import BELIEVED, HeardFrame, Navigation, PositionedMatch, Weighed
+from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.flight.navigator import Slew
 from edgevpr.runtime.recognise.perspective import Lean
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals, moved
+from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
+from edgevpr.runtime.recognise.motion import moved
 
 PLACES, SPACING_M = 100, 20.0
 IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)

@@ -51,7 +51,7 @@ class Flight:
         """Go on, `moved_m` (east, north) by the camera's own motion."""
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
-        stride = moved_m and Stride(before_s, self.t_s, moved_m, 0.2, 100)
+        stride = moved_m and Stride(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
         self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def hear(self, place, p, of_map=None, others=(), lead=1.0):

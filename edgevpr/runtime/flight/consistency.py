@@ -1,0 +1,194 @@
+"""The fixes of accepted matches, and the check of each against where the path says that the aircraft is. `navigation`
+compares them, `navigator` asks."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.core.types import Position
+from edgevpr.runtime.recognise.locate import in_sd, matrix_of
+from edgevpr.runtime.recognise.perspective import Lean
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.stride import Stride
+
+# Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
+# second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
+_CONTRADICTS, _AGREES = 4.0, 2.0
+_GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
+_DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
+_TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
+_IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeardFrame:
+    """A frame taken at `t_s`. `sd_m` is the standard deviation, of each axis, by which its picture puts the aircraft
+    wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter` in `drift`). `stride` is
+    the motion since the frame before (None: unknown). `alike_m` is how far apart pictures are whose fixes do not err
+    alike."""
+
+    t_s: float
+    sd_m: float
+    lean_s2: float = 0.0
+    stride: Stride | None = None
+    alike_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionedMatch:
+    """An accepted match with a position: its `frame`; `position` of the aircraft then; `accuracy_m`, to be sent with
+    it; `covariance_m2` (2, 2), without the error that all fixes share and that of the frame; numbers of the `places` it
+    comes from; `lean`, what its picture shows of the error of the attitude; and `turn_deg`, by how much the heading
+    that it shows exceeds the autopilot's."""
+
+    frame: HeardFrame
+    position: Position
+    accuracy_m: float
+    covariance_m2: Doubles
+    places: tuple[int, ...]
+    lean: Lean | None = None
+    turn_deg: float | None = None
+
+    @property
+    def t_s(self) -> float:
+        """Time of the frame."""
+        return self.frame.t_s
+
+    @property
+    def scatter_m2(self) -> Doubles:
+        """Covariance (2, 2) by which the fixes of two frames differ."""
+        return self.covariance_m2 + self.frame.sd_m**2 * np.eye(2)
+
+    def is_turned_like(self, turn_deg: float | None) -> bool:
+        """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
+        if self.turn_deg is None or turn_deg is None:
+            return True
+        return abs((self.turn_deg - turn_deg + 180) % 360 - 180) <= _TURNED_DEG
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedFix:
+    """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
+    the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
+    predicted offset; `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
+
+    seen: PositionedMatch
+    path_m: Doubles
+    off_m: Doubles
+    expected_m: Doubles
+    covariance_m2: Doubles
+
+
+class Weighed(NamedTuple):
+    """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
+    and other fixes agree with it; `is_lost`: the path's velocity is wrong too."""
+
+    why: str | None = None
+    is_against: bool = False
+    is_lost: bool = False
+
+
+BELIEVED = Weighed()
+
+
+class Consistency:
+    """Holds back a fix that contradicts the expected position, until a second, independent fix agrees with it. With
+    GPS, a contradicting fix is never believed.
+
+    The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
+    right fixes have the same offset from the path, and two wrong ones hardly ever do. A path that is wrong by more
+    than a drift has no such fixes: there, several in a row that an aircraft can have flown through are believed. So
+    are several whose pictures are suddenly turned against the compass, of which one alone is wrong."""
+
+    def __init__(self) -> None:
+        self._held: ComparedFix | None = None
+        self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
+        self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
+
+    def is_contradicted(self, now_s: float) -> bool:
+        """Return True while the last fix contradicts what is expected, and another one may still agree with it."""
+        return self._held is not None and now_s - self._held.seen.t_s <= _GOOD_FOR_S
+
+    def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""
+        step_m, is_turned = fix.off_m - fix.expected_m, not fix.seen.is_turned_like(self._turn_deg)
+        if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
+            return self._believed(fix, BELIEVED)
+        off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
+        turned = f"held back: its picture is turned by {fix.seen.turn_deg or 0:.0f} degrees against the compass"
+        if has_gps:
+            self._held, self._row = None, []
+            there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
+            return Weighed(turned if is_turned else there)
+        self._row = [*(each for each in self._row[1 - _IN_A_ROW :] if _could_follow(each, fix)), fix]
+        if len(self._row) == _IN_A_ROW:
+            return self._believed(fix, Weighed(is_against=True, is_lost=True))
+        if is_turned:
+            return Weighed(turned)
+        if self._held is None or _differ(self._held, fix) > _AGREES:
+            self._held = fix
+        elif _is_independent(self._held, fix):
+            return self._believed(fix, Weighed(is_against=True))
+        there = "where the aircraft is by the autopilot's reckoning and the fixes before"
+        return Weighed(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
+
+    def _believed(self, fix: ComparedFix, verdict: Weighed) -> Weighed:
+        self._held, self._row = None, []
+        if fix.seen.turn_deg is not None:
+            self._turn_deg = fix.seen.turn_deg
+        return verdict
+
+
+def worst_sd(covariance: Doubles) -> float:
+    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def positioned(event: Recognition, frame: HeardFrame) -> PositionedMatch | None:
+    """Return the positioned match of an event and its frame; None if no match with a position was accepted."""
+    if event.best is None or event.located is None or event.accuracy_m is None:
+        return None
+    turn_deg, shown_deg, told_deg = None, event.located.heading_deg, event.view.up_deg
+    if shown_deg is not None and told_deg is not None:
+        turn_deg = (shown_deg - told_deg + 180) % 360 - 180
+    return PositionedMatch(
+        frame=frame,
+        position=event.located.position,
+        accuracy_m=event.accuracy_m,
+        covariance_m2=matrix_of(event.located.covariance_m2),
+        places=event.located.places or (event.best.place.place_id,),
+        lean=event.located.lean,
+        turn_deg=turn_deg,
+    )
+
+
+def _differ(one: ComparedFix, other: ComparedFix) -> float:
+    """Return by how many standard deviations the offsets of two fixes differ; infinity if they are 30 s apart."""
+    apart_s = abs(other.seen.t_s - one.seen.t_s)
+    return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
+
+
+def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
+    """Tell whether an aircraft can have flown from one fix to another one, of other places, within some seconds."""
+    apart_s = other.seen.t_s - one.seen.t_s
+    is_other = set(one.seen.places).isdisjoint(other.seen.places) and other.seen.is_turned_like(one.seen.turn_deg)
+    if not 0 < apart_s <= _ROW_WITHIN_S or not is_other:
+        return False
+    flown_m = float(np.hypot(*(other.path_m + other.off_m - one.path_m - one.off_m)))
+    return flown_m <= _FASTEST_M_S * apart_s
+
+
+def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:
+    """Tell whether two fixes are of different places, or so far apart that one wrong position would not agree."""
+    if set(one.seen.places).isdisjoint(other.seen.places):
+        return True
+    return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS
+
+
+def _of_both(one: ComparedFix, other: ComparedFix) -> Doubles:
+    drift_m = _DRIFT_M_S * abs(other.seen.t_s - one.seen.t_s)
+    both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
+    return both
