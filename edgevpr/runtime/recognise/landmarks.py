@@ -45,6 +45,10 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.points)
 
+    def best(self, most: int) -> "Landmarks":
+        """Return the `most` best of them."""
+        return Landmarks(self.points[:most], self.angle_deg[:most], self.size[:most], self.bits[:most])
+
 
 def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE) -> Landmarks:
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, best first: none without corners,

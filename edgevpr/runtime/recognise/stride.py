@@ -11,7 +11,7 @@ from typing import Any
 from edgevpr.core.geodesy import axes_of
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import agreement
-from edgevpr.runtime.recognise.landmarks import Landmarks
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
 
 # Over ground that repeats, as furrows do, landmarks match at many shifts: few of the matches agree on one.
 _FEWEST, _LEAST_SHARE = 30, 0.4
@@ -45,7 +45,7 @@ class Strides:
 
     def to(self, t_s: float, view: View, landmarks: Landmarks) -> Stride | None:
         """Return the stride to a frame taken at `t_s`; None if it is not known. The next one begins there."""
-        before, self._before = self._before, (t_s, view, landmarks)
+        before, self._before = self._before, (t_s, view, landmarks.best(OF_PLACE))
         if before is None or not 0 < t_s - before[0] <= _LONGEST_S:
             return None
         from_s, start, known = before
