@@ -17,6 +17,9 @@ _ATTITUDE_LASTS_S = 20.0
 # simulator and 1.3 in those of PX4's.
 _ROUGHEST, _SHOWN_GAIN = 4.0, 0.05
 _CALM, _ROUGH = 0.3, 0.8
+# An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times faster,
+# for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
+_UPSET, _UPSET_S = 6.0, 10.0
 _CONTRADICTS = 4.0  # standard deviations: a stride that differs by more is not believed
 _STRIDE_SD, _STRIDE_NOISE = 0.05, 0.003  # error of scale and direction of all strides, and its change in one second
 
@@ -83,6 +86,7 @@ class DriftFilter:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
+        self._upset = 0.0  # 1 when GPS is lost, then less and less
         self._shown = 0.0  # mean square of the leans of the last pictures, over their variances
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
@@ -102,7 +106,8 @@ class DriftFilter:
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_LASTS_S) * _EYE
         drift = self._drift
-        wander = drift.acceleration_noise * (1.0 + _ROUGHEST * self._roughness)
+        wander = drift.acceleration_noise * (1.0 + _ROUGHEST * self._roughness + _UPSET * self._upset)
+        self._upset *= math.exp(-step_s / _UPSET_S)
         noise = drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.repeat(np.square(noise), 2))
@@ -114,8 +119,10 @@ class DriftFilter:
         return min(1.0, max(0.0, share)) if self._drift.is_of_attitude else 0.0
 
     def lose_gps(self) -> None:
-        """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more."""
+        """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more, and
+        so does that of the attitude of an autopilot that reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
+        self._upset = 0.0 if self._drift.is_of_attitude else 1.0
 
     def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
         """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds

@@ -9,11 +9,13 @@ from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Position
+from edgevpr.runtime.flight import drift
 from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.flight.navigator import Slew
 from edgevpr.runtime.recognise.perspective import Lean
+from edgevpr.runtime.recognise.stride import Stride
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
@@ -134,6 +136,33 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
     errors_m, said_m = flown.fly(120)
     assert np.median(lengths(errors_m[20:])) < 1.5
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
+
+
+@pytest.mark.parametrize("upset", [drift._UPSET, 0.0])
+def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
+    """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
+    monkeypatch.setattr(drift, "_UPSET", upset)
+    flown, frames = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=1.0), []
+    flown.fly(30, has_gps=True, fixes=False)
+    loss_s, lean_s2 = flown.t_s, 100 / GRAVITY_M_S2
+
+    def fix():
+        t_s = (flown.step - flown.late_steps) * STEP_S
+        led_m = 8.0 * min(1.0, max(0.0, t_s - loss_s) / 10.0)
+        seen = flown.way[flown.step - flown.late_steps] + (led_m, 0.0) + flown.rng.normal(0, 0.5, 2)
+        frames.append((t_s, seen))
+        stride = None
+        if len(frames) > 1:
+            (from_s, before), (to_s, now) = frames[-2:]
+            stride = Stride(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
+        match = match_at(Position(*moved(*HOME, *seen)), t_s, 1.0, lean_s2)
+        frame = replace(match.frame, sd_m=1.5, stride=stride)
+        flown.navigation.hear_fix(flown.navigation.compared(replace(match, frame=frame)))
+
+    flown.fix = fix
+    errors_m, said_m = flown.fly(15)
+    holds = (abs(errors_m) < 2 * said_m[:, None]).mean() >= 0.92
+    assert holds == (upset > 0)
 
 
 def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
