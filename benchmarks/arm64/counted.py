@@ -20,12 +20,13 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
         scan_per_place = (large - small) / (LARGE - SMALL)
         technique = create("cohog", {"camera": camera})
         full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
-        if camera == "nadir":  # landmarks: those of the frame, held against the best place's and the last frame's
-            full += parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
+        landmarks = 0.0
+        if camera == "nadir":  # those of the frame, held against the best place's and the last frame's
+            landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
         work = {
             "encode": encode,
             "match_per_place": (parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
-            "compare_once": full,
+            "compare_once": full + landmarks,
             "scan_per_place": scan_per_place,
             "scan_once": small - SMALL * scan_per_place,
         }

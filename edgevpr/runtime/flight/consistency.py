@@ -18,6 +18,7 @@ from edgevpr.runtime.recognise.stride import Stride
 # second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
 _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
+_JOINED_WITHIN_S = 2.5
 _DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
 _TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
 _IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
@@ -108,9 +109,11 @@ class Consistency:
         self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
         self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
 
-    def is_contradicted(self, now_s: float) -> bool:
-        """Return True while the last fix contradicts what is expected, and another one may still agree with it."""
-        return self._held is not None and now_s - self._held.seen.t_s <= _GOOD_FOR_S
+    def is_contradicted(self, now_s: float, is_followed: bool) -> bool:
+        """Return True while the last fix contradicts what is expected, and another one may still agree with it. Where
+        the path `is_followed` from frame to frame, one that was right would have been joined by another soon."""
+        good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
+        return self._held is not None and now_s - self._held.seen.t_s <= good_for_s
 
     def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""

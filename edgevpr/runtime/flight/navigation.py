@@ -19,6 +19,7 @@ _GPS_ALIKE = 2.0
 _GPS_VELOCITY_SD = 0.3  # m/s
 _UNKNOWN_M = 1e4
 _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
+_FOLLOWED_S = 4.0  # after the frame of the last stride
 _MOST_ALIKE = 16.0  # fixes of the same ground that count as one
 
 
@@ -45,12 +46,16 @@ class Navigation:
         self._filter = DriftFilter(drift, map_sd_m)
         self._framed: Point | None = None  # of the path, when the last frame was taken
         self._fixed_m: Doubles | None = None  # the last fix, from the origin of the path
-        self.has_gps, self._gps_s, self._fixed_s = False, -math.inf, -math.inf
+        self.has_gps, self._gps_s, self._fixed_s, self._strode_s = False, -math.inf, -math.inf, -math.inf
 
     @property
     def fixed_s(self) -> float:
         """Time of the last fix, stride or GPS position, whichever is the latest; -inf if there was none."""
-        return max(self._fixed_s, self._gps_s)
+        return max(self._fixed_s, self._strode_s, self._gps_s)
+
+    def is_followed_at(self, t_s: float) -> bool:
+        """Tell whether the path is followed from frame to frame, by strides that it does not contradict."""
+        return t_s - self._strode_s <= _FOLLOWED_S
 
     def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
         """Process a report of the autopilot. A path of velocities (`RECKONED`) goes on with the reported velocity. If
@@ -97,7 +102,7 @@ class Navigation:
             strode = Strode(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
         is_used = self._filter.hear_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
         if strode and is_used:
-            self._fixed_s = max(self._fixed_s, frame.t_s)
+            self._strode_s = frame.t_s
 
     def compared(self, seen: PositionedMatch) -> ComparedFix | None:
         """Compare the fix of a match with its prediction; None if the path at that time is not known. The match is of

@@ -139,7 +139,9 @@ class Navigator(Listener):
         autopilot is no better off with it, or a match has contradicted what is known."""
         with self._lock:
             vehicle = self._vehicle
-            if self._is_muted or self._channel is not Channel.COMMAND or self._consistency.is_contradicted(now_s):
+            if self._is_muted or self._channel is not Channel.COMMAND:
+                return None
+            if self._consistency.is_contradicted(now_s, self._navigation.is_followed_at(now_s)):
                 return None
             if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
                 return None
