@@ -106,9 +106,10 @@ class DriftFilter:
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_LASTS_S) * _EYE
         drift = self._drift
-        wander = drift.acceleration_noise * (1.0 + _ROUGHEST * self._roughness + _UPSET * self._upset)
+        rough = 1.0 + _ROUGHEST * self._roughness  # gyros that tilt wrongly turn wrongly too
+        wander = drift.acceleration_noise * (rough + _UPSET * self._upset)
         self._upset *= math.exp(-step_s / _UPSET_S)
-        noise = drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE
+        noise = drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE * rough
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.repeat(np.square(noise), 2))
 
