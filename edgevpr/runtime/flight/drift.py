@@ -17,8 +17,8 @@ _ATTITUDE_LASTS_S = 20.0
 # simulator and 1.3 in those of PX4's.
 _ROUGHEST, _SHOWN_GAIN = 4.0, 0.05
 _CALM, _ROUGH = 0.3, 0.8
-# An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times faster,
-# for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
+# An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times
+# faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
 _UPSET, _UPSET_S = 6.0, 10.0
 _CONTRADICTS = 4.0  # standard deviations: a stride that differs by more is not believed
 _STRIDE_SD, _STRIDE_NOISE = 0.05, 0.003  # error of scale and direction of all strides, and its change in one second

@@ -35,6 +35,7 @@ _GPS_MOVED, _GPS_MOVED_M = 3.5, 7.0  # standard deviations, and the least that c
 _USUAL_OF, _USUAL_OVER = 10, 60  # matches before it is known, and in its mean
 _GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
 _GPS_WITHIN_S = 30.0  # the matches in a row must be no older
+_GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
@@ -151,12 +152,14 @@ class GpsWatch:
     GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
     from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
     from it, or that has moved away from where GPS was beside the matches before. Where the aircraft hovers, the same
-    place counts again if it agreed with GPS before. `map_sd_m` is the standard deviation of the error that all matches
-    share."""
+    place counts again if it agreed with GPS before. A jammer that comes and goes is found by five matches within
+    twenty seconds, whatever lies between, and GPS is not right again before there are fewer. `map_sd_m` is the standard
+    deviation of the error that all matches share."""
 
     def __init__(self, map_sd_m: float, herald: Herald, autopilot: ToAutopilot | None) -> None:
         self._map_sd_m, self._herald, self._autopilot = map_sd_m, herald, autopilot
         self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
+        self._doubts: list[PositionedMatch] = []  # the last matches that contradicted it
         self._agreeing = 0
         self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
@@ -191,25 +194,30 @@ class GpsWatch:
         the error that all matches share."""
         is_far = _is_beyond(off_m, _GPS_LEAST_M, _GPS_CONTRADICTS * math.hypot(sd_m, self._map_sd_m))
         has_moved = self._usual_of >= _USUAL_OF and _is_beyond(off_m - self._usual_m, _GPS_MOVED_M, _GPS_MOVED * sd_m)
+        self._doubts = [other for other in self._doubts if seen.t_s - other.t_s <= _GPS_IN_TURN_S]
         if not is_far and not has_moved:
             self._against.clear()
             self._agreeing += 1
             self._usual_of = min(self._usual_of + 1, _USUAL_OVER)
             self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_of
             self._agreed = set(seen.places)
-            if self._agreeing >= _GPS_IN_A_ROW:
+            if self._agreeing >= _GPS_IN_A_ROW and len(self._doubts) < _GPS_IN_TURN:
                 self.is_wrong = False
             return
+        places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
+        if has_agreed or not any(set(other.places) >= places for other in self._doubts):
+            self._doubts.append(seen)
         self._agreeing = 0
         self._against = [
             (other, other_m)
             for other, other_m in self._against
             if seen.t_s - other.t_s <= _GPS_WITHIN_S
             and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
-            and (not set(other.places) >= set(seen.places) or self._agreed & set(seen.places))
+            and (has_agreed or not set(other.places) >= places)
         ]
         self._against.append((seen, off_m))
-        self.is_wrong = self.is_wrong or len(self._against) >= _GPS_IN_A_ROW
+        is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN
+        self.is_wrong = self.is_wrong or is_proven
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:

@@ -160,6 +160,20 @@ def test_it_is_over_when_gps_agrees_again(watched):
     assert [line["is_wrong"] for line in air.news] == [True, False, True]
 
 
+@pytest.mark.parametrize("every_s", [1, 2, 3])
+def test_a_jammer_that_comes_and_goes_is_told_and_is_over_when_it_stays_away(watched, every_s):
+    air = watched().fly(30)
+    for _ in range(60 // every_s):
+        air.gps_off_m = np.array([0.0, 80.0]) - air.gps_off_m
+        air.fly(every_s)
+    assert air.news[0]["t_mono_s"] - 30 <= 15
+    before = [line["is_wrong"] for line in air.news]
+    assert before in ([True], [True, False, True]), "the first time it may be a glitch that has passed"
+    air.gps_off_m = np.zeros(2)
+    air.fly(30)
+    assert [line["is_wrong"] for line in air.news] == [*before, False]
+
+
 @GLITCHES
 def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_an_autopilot_that_has_it(
     watched, drift_m_s
