@@ -58,7 +58,7 @@ class Run:
         home_m = COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M
         parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters, **own}
         listeners = [self._truth.listen, self._recorder.listen]
-        place_map = ground.place_map(self._work, scenario.height_m)
+        place_map = ground.place_map(self._work, scenario.height_m, scenario.mapped_m)
         make = Px4 if scenario.is_px4 else Simulator
         with ExitStack() as stack:
             stack.callback(self._recorder.close)

@@ -73,10 +73,11 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1"}
 
 
-def place_map(work: Path, height_m: float) -> Path:
-    """Return the map of the ground: `edgevpr map build` makes it of the pictures of a mapping flight, a gimbal's, with
-    their true positions, from the height of the flight."""
-    path, folder = work / "ground.gpkg", work / "mapping"
+def place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Path:
+    """Return the map of the ground, up to `mapped_m` north (None: all of it): `edgevpr map build` makes it of the
+    pictures of a mapping flight, a gimbal's, with their true positions, from the height of the flight."""
+    part = "" if mapped_m is None else f"-{mapped_m:.0f}m"
+    path, folder = work / f"ground{part}.gpkg", work / f"mapping{part}"
     if path.exists():
         return path
     ground = lit_ground(work, "mapping")
@@ -85,7 +86,8 @@ def place_map(work: Path, height_m: float) -> Path:
     with open(folder / "positions.csv", "w", newline="", encoding="utf-8") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon", "alt", "height_m", "yaw_deg"))
-        for number, pose in enumerate(_mapping_poses(rng, height_m)):
+        poses = [pose for pose in _mapping_poses(rng, height_m) if mapped_m is None or pose.north_m <= mapped_m]
+        for number, pose in enumerate(poses):
             name, at = f"{number:05d}.jpg", to_position(pose)
             (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
             where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")

@@ -21,8 +21,8 @@ class Scenario:
     `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on, or a PX4 `uses_no_gps`. The camera
     `is_level` on a gimbal, or fixed to the airframe, and its pictures are `is_stamped` with their times, or not.
     `parameters` are the autopilot's, `with_edgevpr` those that are set for a flight with edgevpr only; `config` is what
-    edgevpr's configuration says beside the usual. `starts_early`: edgevpr runs before arming. `is_compared`: the same
-    flight without edgevpr says something."""
+    edgevpr's configuration says beside the usual; its map ends `mapped_m` north (None: nowhere). `starts_early`:
+    edgevpr runs before arming. `is_compared`: the same flight without edgevpr says something."""
 
     vehicle: str = "plane"
     is_px4: bool = False
@@ -40,6 +40,7 @@ class Scenario:
     with_edgevpr: Mapping[str, float] = field(default_factory=dict)
     config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     starts_early: bool = False
+    mapped_m: float | None = None
     learns: bool = False
     reboots: bool = False
     is_compared: bool = True
@@ -100,6 +101,9 @@ SCENARIOS = {
     "plane_mjpeg": Scenario(wind_m_s=6.0, is_stamped=False, is_compared=False),
     "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
     "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),
+    "copter_off_map": Scenario(
+        vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True, mapped_m=450.0, is_compared=False
+    ),
     "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=_ODOMETRY, starts_early=True),
     "plane_glitch": Scenario(loses_gps=False, glitch_m_s=5.0, off_s=60.0),
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
