@@ -60,6 +60,7 @@ def figures_of(folder: Path) -> Row:
         ages_s = np.array([line["t_mono_s"] - line["t_frame_s"] for line in queries])
         found["query_ms"] = [round(1e3 * float(each)) for each in np.quantile(ages_s, (0.5, 0.99))] if queries else None
         found["learnt"] = _learnt(pictures, log, loss_s)
+        found["gap"] = _longest_gap(sent, pictures, [q["t_frame_s"] for q in queries if q["accepted"]], loss_s)
         found["gps_alarms_s"] = [
             round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
         ]
@@ -138,6 +139,23 @@ def _sent(sent: np.ndarray) -> Row:
         rate_hz = round(len(rows) / float(np.ptp(rows["t_s"])), 1)
         claims = _claims(off_m, rows["accuracy_m"])
         found[str(kind)] = {"rate_hz": rate_hz, "error": spread(np.hypot(*off_m.T)), **claims}
+    return found
+
+
+def _longest_gap(sent: np.ndarray, pictures: np.ndarray, accepted_s: list[float], loss_s: float) -> Row | None:
+    """Return the longest time without a match after the loss: its seconds, the metres flown in it, and by how much what
+    was sent last in it is wrong, metres (None: nothing was sent in it)."""
+    bounds_s = np.array([loss_s, *(each for each in accepted_s if each > loss_s), pictures["t_s"][-1]])
+    longest = int(np.diff(bounds_s).argmax())
+    from_s, to_s = bounds_s[longest : longest + 2]
+    flown = pictures[(pictures["t_s"] >= from_s) & (pictures["t_s"] <= to_s)]
+    told = sent[(sent["t_s"] > from_s) & (sent["t_s"] <= to_s)]
+    way_m = float(np.hypot(np.diff(flown["east_m"]), np.diff(flown["north_m"])).sum())
+    found: Row = {"s": round(float(to_s - from_s), 1), "way_m": round(way_m), "off_m": None}
+    if len(told):
+        last = told[-1]
+        off_m = math.hypot(last["east_m"] - last["true_east_m"], last["north_m"] - last["true_north_m"])
+        found |= {"off_m": round(off_m, 1), "told_s": round(float(last["t_s"] - from_s), 1)}
     return found
 
 

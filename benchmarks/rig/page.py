@@ -185,6 +185,11 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
                 f"{error['n']} places learnt, {error['median']} m off, at most {error['max']} m; "
                 f"{learnt['after_the_loss']} of them without GPS"
             )
+        if (gap := run.get("gap")) and gap["s"] > 30 and gap["off_m"] is not None:
+            told.append(
+                f"{gap['s']:.0f} s and {gap['way_m']} m without a match; what was sent {gap['told_s']:.0f} s after the "
+                f"last one was {gap['off_m']} m off"
+            )
         if run.get("heard_again_s") is not None:
             told.append(f"heard again {run['heard_again_s']} s after the autopilot was back")
         if name in ("plane_glitch", "plane_clean") and which == "with":
