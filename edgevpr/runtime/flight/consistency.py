@@ -101,8 +101,9 @@ class Consistency:
 
     The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
     right fixes have the same offset from the path, and two wrong ones hardly ever do. A path that is wrong by more
-    than a drift has no such fixes: there, several in a row that an aircraft can have flown through are believed. So
-    are several whose pictures are suddenly turned against the compass, of which one alone is wrong."""
+    than a drift has no such fixes: there, several in a row that an aircraft can have flown through are believed. Only
+    several are believed, too, where the camera has followed the path from frame to frame, since ground that repeats
+    itself can say the same twice, and where pictures are suddenly turned against the compass."""
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
@@ -115,8 +116,9 @@ class Consistency:
         good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
         return self._held is not None and now_s - self._held.seen.t_s <= good_for_s
 
-    def weighed(self, fix: ComparedFix, has_gps: bool) -> Weighed:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed."""
+    def weighed(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> Weighed:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path is
+        known from frame to frame, so that it takes several in a row to be wrong."""
         step_m, is_turned = fix.off_m - fix.expected_m, not fix.seen.is_turned_like(self._turn_deg)
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
             return self._believed(fix, BELIEVED)
@@ -133,7 +135,7 @@ class Consistency:
             return Weighed(turned)
         if self._held is None or _differ(self._held, fix) > _AGREES:
             self._held = fix
-        elif _is_independent(self._held, fix):
+        elif not is_followed and _is_independent(self._held, fix):
             return self._believed(fix, Weighed(is_against=True))
         there = "where the aircraft is by the autopilot's reckoning and the fixes before"
         return Weighed(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")

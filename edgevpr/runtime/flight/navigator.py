@@ -126,7 +126,8 @@ class Navigator(Listener):
             if compared is None:
                 self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
                 return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            verdict = self._consistency.weighed(compared, self.has_gps)
+            is_followed = self._navigation.is_followed_at(seen.t_s)
+            verdict = self._consistency.weighed(compared, self.has_gps, is_followed)
             if verdict.why:
                 return Advice(None, verdict.why, is_held=True)
             self._navigation.hear_fix(compared, verdict)

@@ -215,16 +215,21 @@ def _recogniser(
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
     levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
+    preparation = Preparation(
+        levelling=levelling,
+        mask=mask,
+        gate=gate_of(config.salience, board.threads),
+        strides=Strides() if isinstance(prior, Prior) and isinstance(levelling, Levelling) else None,
+    )
     recogniser = Recogniser(
         matcher,
         place_map,
         meter_of(config, board),
         WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=config.mavlink.min_accuracy_m),
-        preparation=Preparation(levelling=levelling, mask=mask, gate=gate_of(config.salience, board.threads)),
+        preparation=preparation,
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=None if matcher.search else prior,
         follower=follower,
-        strides=Strides() if isinstance(prior, Prior) and isinstance(levelling, Levelling) else None,
     )
     if isinstance(prior, Prior):
         place_map.wait_at_most(_WAIT_S)

@@ -59,12 +59,14 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """Preparation of a frame before it is encoded: `levelling` levels or straightens its picture, `mask` excludes parts
-    of it, and `gate` rejects frames that are not memorable (None: neither is done)."""
+    """What is done with a frame before it is searched for: `levelling` levels or straightens its picture, `mask`
+    excludes parts of it, `gate` rejects frames that are not memorable, and `strides` measures the motion since the
+    frame before (None: it is not done)."""
 
     levelling: Levelling | Straightening | None = None
     mask: Mask | None = None
     gate: Gate | None = None
+    strides: Strides | None = None
 
     def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
         """Return the levelled picture of a frame, with its mask and view."""
@@ -88,8 +90,7 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `prior` makes hints that narrow each query (None: the whole map is searched). `follower` follows the flight from
-    query to query (None: each is judged alone), and `strides` measures the motion from frame to frame (None: it is not
-    measured). The governor changes `candidates`; `take` and `extend` the index.
+    query to query (None: each is judged alone). The governor changes `candidates`; `take` and `extend` the index.
     """
 
     def __init__(
@@ -102,11 +103,10 @@ class Recogniser:
         preparation: Preparation = Preparation(),
         prior: Prior | Told | None = None,
         follower: Follower | None = None,
-        strides: Strides | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
         self._settings, self._preparation = settings, preparation
-        self._prior, self._follower, self._strides = prior, follower, strides
+        self._prior, self._follower = prior, follower
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         self.take(matcher)
@@ -145,9 +145,9 @@ class Recogniser:
             with self.meter.step("encode"):
                 event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
             looked = Verification(self.technique.spec, picture, self.index, self.place_map)
-            if self._strides:
+            if preparation.strides:
                 with self.meter.step("stride"):
-                    event.stride = self._strides.to(frame.t_mono_s, picture.view, looked.landmarks)
+                    event.stride = preparation.strides.to(frame.t_mono_s, picture.view, looked.landmarks)
             verdict, where = self._recognise(event, frame, looked, descriptor)
             event.accepted, event.reason = verdict.accepted, verdict.reason
             if event.accepted and where:

@@ -79,3 +79,29 @@ def test_a_stride_that_contradicts_the_path_is_not_believed():
     air.stretch = 1.0
     after_m, _ = off_m(air)
     assert np.hypot(*(after_m - before_m)) < 2.0
+
+
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
+def test_matches_of_ground_that_repeats_itself_must_be_four_to_overrule_a_path_that_is_followed(channel):
+    air = air_of(channel, stride_sd_m=0.2)
+    air.fly(60)
+    air.lose_gps()
+    air.fly(30)
+    air.map_off = np.array([80.0, 0.0])
+    air.fly(3)
+    led_m, _ = off_m(air)
+    assert np.hypot(*led_m) < 8.0, "three that agree with each other are not believed"
+    air.fly(3)
+    led_m, _ = off_m(air)
+    assert np.hypot(*(led_m - air.map_off)) < 8.0, "matches win in the end"
+
+
+def test_without_strides_two_overrule_it():
+    air = air_of(Channel.COMMAND)
+    air.fly(60)
+    air.lose_gps()
+    air.fly(30)
+    air.map_off = np.array([80.0, 0.0])
+    air.fly(3)
+    led_m, _ = off_m(air)
+    assert np.hypot(*(led_m - air.map_off)) < 15.0
