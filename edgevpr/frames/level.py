@@ -60,6 +60,11 @@ class View:
     focal: float | None = None
     reason: str | None = None
 
+    @property
+    def is_laid(self) -> bool:
+        """True if direction and size of the picture are known, and where in it the point under the camera is."""
+        return None not in (self.up_deg, self.footprint_m, self.aside)
+
     def fields(self) -> dict[str, Any]:
         """Return this view as fields of the flight log, with rounded numbers. None: unknown."""
         return {

@@ -256,8 +256,8 @@ class Link:
             finally:
                 verdicts = self._settings.signing.take_verdicts()
                 step("heard", data, line.port.sender, verdicts)
-                # An autopilot whose clock is old, which has the key, learns the time from what we send it.
-                is_behind = OLD in verdicts and not self._conversation.autopilot.listens(self._turns.now_s())
+            # An autopilot whose clock is old, which has the key, learns the time from what we send it.
+            is_behind = OLD in verdicts and not self._conversation.autopilot.listens(self._turns.now_s())
         if beats or is_behind:
             line.port.answer_sender()
 

@@ -215,11 +215,12 @@ def _recogniser(
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
     levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
+    knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     preparation = Preparation(
         levelling=levelling,
         mask=mask,
         gate=gate_of(config.salience, board.threads),
-        strides=Strides() if isinstance(prior, Prior) and isinstance(levelling, Levelling) else None,
+        strides=Strides() if isinstance(prior, Prior) and knows_scale else None,
     )
     recogniser = Recogniser(
         matcher,

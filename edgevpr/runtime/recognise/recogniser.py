@@ -145,7 +145,7 @@ class Recogniser:
             with self.meter.step("encode"):
                 event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
             looked = Verification(self.technique.spec, picture, self.index, self.place_map)
-            if preparation.strides:
+            if preparation.strides and picture.view.is_laid:
                 with self.meter.step("stride"):
                     event.stride = preparation.strides.to(frame.t_mono_s, picture.view, looked.landmarks)
             verdict, where = self._recognise(event, frame, looked, descriptor)
