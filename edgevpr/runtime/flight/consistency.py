@@ -19,7 +19,7 @@ from edgevpr.runtime.recognise.stride import Stride
 _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
 _JOINED_WITHIN_S = 2.5
-_DRIFT_M_S = 2.5  # drift of the path that is allowed for between two fixes that agree
+_DRIFT_M_S, _FOLLOWED_DRIFT_M_S = 2.5, 0.5  # drift of the path that is allowed for between two fixes that agree
 _TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
 _IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
 
@@ -82,6 +82,11 @@ class ComparedFix:
     expected_m: Doubles
     covariance_m2: Doubles
 
+    @property
+    def beside_m(self) -> Doubles:
+        """How far the fix is from where it was expected (2,)."""
+        return self.off_m - self.expected_m
+
 
 class Weighed(NamedTuple):
     """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
@@ -107,6 +112,7 @@ class Consistency:
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
+        self._joined = 0  # how many say what the held one says
         self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
         self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
 
@@ -117,9 +123,9 @@ class Consistency:
         return self._held is not None and now_s - self._held.seen.t_s <= good_for_s
 
     def weighed(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> Weighed:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path is
-        known from frame to frame, so that it takes several in a row to be wrong."""
-        step_m, is_turned = fix.off_m - fix.expected_m, not fix.seen.is_turned_like(self._turn_deg)
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
+        is known from frame to frame, so that it takes several to be wrong."""
+        step_m, is_turned = fix.beside_m, not fix.seen.is_turned_like(self._turn_deg)
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
             return self._believed(fix, BELIEVED)
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
@@ -133,10 +139,13 @@ class Consistency:
             return self._believed(fix, Weighed(is_against=True, is_lost=True))
         if is_turned:
             return Weighed(turned)
-        if self._held is None or _differ(self._held, fix) > _AGREES:
-            self._held = fix
-        elif not is_followed and _is_independent(self._held, fix):
-            return self._believed(fix, Weighed(is_against=True))
+        drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
+        if self._held is None or _differ(self._held, fix, drift_m_s) > _AGREES:
+            self._held, self._joined = fix, 1
+        else:
+            self._joined += 1
+            if _is_independent(self._held, fix, drift_m_s) and self._joined >= (_IN_A_ROW if is_followed else 2):
+                return self._believed(fix, Weighed(is_against=True))
         there = "where the aircraft is by the autopilot's reckoning and the fixes before"
         return Weighed(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
 
@@ -170,10 +179,12 @@ def positioned(event: Recognition, frame: HeardFrame) -> PositionedMatch | None:
     )
 
 
-def _differ(one: ComparedFix, other: ComparedFix) -> float:
-    """Return by how many standard deviations the offsets of two fixes differ; infinity if they are 30 s apart."""
-    apart_s = abs(other.seen.t_s - one.seen.t_s)
-    return in_sd(other.off_m - one.off_m, _of_both(one, other)) if apart_s <= _GOOD_FOR_S else math.inf
+def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
+    """Return by how many standard deviations two fixes differ, each as seen from where it was expected; infinity if
+    they are 30 s apart."""
+    if abs(other.seen.t_s - one.seen.t_s) > _GOOD_FOR_S:
+        return math.inf
+    return in_sd(other.beside_m - one.beside_m, _of_both(one, other, drift_m_s))
 
 
 def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
@@ -186,14 +197,15 @@ def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
     return flown_m <= _FASTEST_M_S * apart_s
 
 
-def _is_independent(one: ComparedFix, other: ComparedFix) -> bool:
+def _is_independent(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> bool:
     """Tell whether two fixes are of different places, or so far apart that one wrong position would not agree."""
     if set(one.seen.places).isdisjoint(other.seen.places):
         return True
-    return in_sd(other.path_m - one.path_m, _of_both(one, other)) > _CONTRADICTS
+    flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
+    return in_sd(flown_m, _of_both(one, other, drift_m_s)) > _CONTRADICTS
 
 
-def _of_both(one: ComparedFix, other: ComparedFix) -> Doubles:
-    drift_m = _DRIFT_M_S * abs(other.seen.t_s - one.seen.t_s)
+def _of_both(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> Doubles:
+    drift_m = drift_m_s * abs(other.seen.t_s - one.seen.t_s)
     both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
     return both

@@ -105,3 +105,15 @@ def test_without_strides_two_overrule_it():
     air.fly(3)
     led_m, _ = off_m(air)
     assert np.hypot(*(led_m - air.map_off)) < 15.0
+
+
+def test_matches_win_where_a_slow_copter_sees_the_same_places_for_long():
+    air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=7.0)
+    air.places = lambda step: tuple(range(step // 150, step // 150 + 12))  # those of 36 s
+    air.fly(60)
+    air.lose_gps()
+    air.fly(30)
+    air.map_off = np.array([80.0, 0.0])
+    air.fly(15)
+    led_m, _ = off_m(air)
+    assert np.hypot(*(led_m - air.map_off)) < 8.0
