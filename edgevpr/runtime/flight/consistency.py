@@ -84,7 +84,7 @@ class ComparedFix:
 
     @property
     def beside_m(self) -> Doubles:
-        """How far the fix is from where it was expected (2,)."""
+        """Offset of the fix from where it was expected (2,)."""
         return self.off_m - self.expected_m
 
 

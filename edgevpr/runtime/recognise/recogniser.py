@@ -59,9 +59,9 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preparation:
-    """What is done with a frame before it is searched for: `levelling` levels or straightens its picture, `mask`
-    excludes parts of it, `gate` rejects frames that are not memorable, and `strides` measures the motion since the
-    frame before (None: it is not done)."""
+    """Preparation of a frame before it is searched for: `levelling` levels or straightens its picture, `mask` excludes
+    parts of it, `gate` rejects frames that are not memorable, and `strides` measures the motion since the frame before
+    (None: it is not done)."""
 
     levelling: Levelling | Straightening | None = None
     mask: Mask | None = None
