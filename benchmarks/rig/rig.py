@@ -19,7 +19,7 @@ import ground
 import px4
 from figures import figures_of
 from flying import Run
-from page import write_page
+from page import draw_claims, write_page
 from scenarios import HEIGHT_M, SCENARIOS, numbered
 from simulator import VARIABLE, tree
 
@@ -48,6 +48,7 @@ def main() -> None:
         parser.error(f"{absent[0]} is not there")
     height_m = arguments.height or HEIGHT_M
     work = ground.from_rasters(WORK, arguments.ground, arguments.later, height_m) if arguments.ground else WORK
+    flown = []
     if not arguments.report:
         for name in arguments.scenarios or SCENARIOS:
             scenario = SCENARIOS[name]
@@ -60,8 +61,11 @@ def main() -> None:
                 try:
                     folder = Run(work, flight, shown, is_control).fly()
                     print(f"{folder.name}: {json.dumps(figures_of(folder))}", flush=True)
+                    flown += [] if is_control else [folder]
                 except RuntimeError as error:  # one that does not arm, for example: the page has the others
                     print(f"rig: {flight}: {error}", file=sys.stderr, flush=True)
+    if flown:
+        draw_claims(flown, work / "claims.jpg")
     if arguments.report or not (arguments.scenarios or arguments.ground):
         write_page(WORK)
 
