@@ -42,7 +42,7 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
 
     page = (tmp_path / "out" / "sets.md").read_text()
     assert "| technique | RAM B/place | meadow (report, 4) |" in page
-    assert "| cohog | 144 | 1.00 |" in page
+    assert "| cohog | 170 | 1.00 |" in page
     assert "* grief_stromovka_monthly: five places only" in page
 
 
