@@ -105,8 +105,10 @@ def _fixes(pictures: np.ndarray, queries: list[Row]) -> Row:
     off_m, roll_deg, claimed_m = [], [], []
     for line in queries:
         of = pictures[np.argmin(abs(pictures["t_s"] - line["t_frame_s"]))]
-        is_fix = line["accepted"] and line["located"] and not line.get("view", {}).get("reason")  # a tilted one is not sent
-        if not is_fix or abs(of["t_s"] - line["t_frame_s"]) > _TAKEN_WITHIN_S:
+        is_tilted = line.get("view", {}).get("reason")  # too far to be sent
+        if not line["accepted"] or not line["located"] or is_tilted:
+            continue
+        if abs(of["t_s"] - line["t_frame_s"]) > _TAKEN_WITHIN_S:
             continue
         east_m, north_m = to_metres(line["located"]["lat_deg"], line["located"]["lon_deg"])
         off_m.append((east_m - of["east_m"], north_m - of["north_m"]))
