@@ -49,7 +49,7 @@ class Navigation:
         self.has_gps, self._gps_s, self._fixed_s, self._strode_s = False, -math.inf, -math.inf, -math.inf
 
     @property
-    def fixed_s(self) -> float:
+    def known_s(self) -> float:
         """Time of the last fix, stride or GPS position, whichever is the latest; -inf if there was none."""
         return max(self._fixed_s, self._strode_s, self._gps_s)
 
@@ -124,20 +124,21 @@ class Navigation:
             self.begin(fix.seen.position, worst_sd(fix.seen.scatter_m2), fix.seen.t_s, self._path.now.t_s)
         elif self._path:
             hear = self._filter.trust_fix if verdict.is_against else self._filter.hear_fix
-            hear(fix.off_m, self._alike(fix) * fix.seen.covariance_m2)
+            hear(fix.off_m, self._repeats(fix) * fix.seen.covariance_m2)
             if fix.seen.frame.lean_s2 and (lean := fix.seen.lean):
                 self._filter.hear_lean(np.array(lean.over_height), lean.sd)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
 
-    def _alike(self, fix: ComparedFix) -> float:
-        """Return the factor of the covariance of a fix. Fixes of about the same ground err alike, so the nearer it is
-        to the last one, the less it says. That one is remembered by the path and by strides only."""
+    def _repeats(self, fix: ComparedFix) -> float:
+        """Return the factor of the covariance of a fix: the nearer it is to the last one, the more it repeats of its
+        error. It is 1 without a stride: then the last one does not last, since nothing carries it on."""
         at_m, before_m = fix.path_m + fix.off_m, self._fixed_m
         self._fixed_m = at_m
-        if fix.seen.frame.stride is None or before_m is None:
+        alike_m = fix.seen.frame.alike_m
+        if fix.seen.frame.stride is None or before_m is None or alike_m == 0:
             return 1.0
-        away_m = max(float(np.hypot(*(at_m - before_m))), fix.seen.frame.alike_m / _MOST_ALIKE)
-        return max(1.0, fix.seen.frame.alike_m / away_m) if away_m else 1.0
+        away_m = float(np.hypot(*(at_m - before_m)))
+        return max(1.0, alike_m / max(away_m, alike_m / _MOST_ALIKE))
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose

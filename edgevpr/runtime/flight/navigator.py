@@ -218,7 +218,7 @@ class Navigator(Listener):
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
-        if estimate is None or t_s - self._navigation.fixed_s > _LOST_S or estimate.accuracy_m > _LOST_M:
+        if estimate is None or t_s - self._navigation.known_s > _LOST_S or estimate.accuracy_m > _LOST_M:
             return None
         return estimate
 

@@ -205,7 +205,11 @@ class GpsWatch:
                 self.is_wrong = False
             return
         places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
-        if has_agreed or not any(set(other.places) >= places for other in self._doubts):
+
+        def is_news_beside(other: PositionedMatch) -> bool:
+            return has_agreed or not set(other.places) >= places
+
+        if all(map(is_news_beside, self._doubts)):
             self._doubts.append(seen)
         self._agreeing = 0
         self._against = [
@@ -213,7 +217,7 @@ class GpsWatch:
             for other, other_m in self._against
             if seen.t_s - other.t_s <= _GPS_WITHIN_S
             and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
-            and (has_agreed or not set(other.places) >= places)
+            and is_news_beside(other)
         ]
         self._against.append((seen, off_m))
         is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN

@@ -17,17 +17,30 @@ def air_of(channel, **how):
     return Air(ours, wind=WIND, gusts=0.2, fix_sd_m=1.5, other_sd_m=0.5, bias=(0.1, 0.0), **how)
 
 
+def without_gps(air, seconds):
+    """Fly with GPS for a minute, then so many seconds without."""
+    air.fly(60)
+    air.lose_gps()
+    return air.fly(seconds)
+
+
 def off_m(air):
     """Metres (2,) by which our position is wrong now, and what it says of itself."""
     here = air.navigator._navigation.at(air.t_s)
     return air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m
 
 
+def beside_m(air, seconds):
+    """Metres (2,) by which we are beside the aircraft, and beside where matches put it, so long after they have begun
+    to put it 80 m off."""
+    air.map_off = np.array([80.0, 0.0])
+    led_m, _ = off_m(air.fly(seconds))
+    return np.hypot(*led_m), np.hypot(*(led_m - air.map_off))
+
+
 def across_a_gap(air, seconds=GAP_S):
     """Fly without GPS over the map, then off it. Returns the errors and the accuracies told, once a second."""
-    air.fly(60)
-    air.lose_gps()
-    air.fly(60)
+    without_gps(air, 60)
     air.matches = False
     found = [off_m(air.fly(1)) for _ in range(seconds)]
     return [error for error, _ in found], np.array([said for _, said in found])
@@ -70,9 +83,7 @@ def test_the_autopilot_is_held_in_the_gap():
 
 def test_a_stride_that_contradicts_the_path_is_not_believed():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2)
-    air.fly(60)
-    air.lose_gps()
-    air.fly(30)
+    without_gps(air, 30)
     before_m, _ = off_m(air)
     air.matches, air.stretch = False, 5.0
     air.fly(1)
@@ -83,37 +94,16 @@ def test_a_stride_that_contradicts_the_path_is_not_believed():
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
 def test_matches_of_ground_that_repeats_itself_must_be_four_to_overrule_a_path_that_is_followed(channel):
-    air = air_of(channel, stride_sd_m=0.2)
-    air.fly(60)
-    air.lose_gps()
-    air.fly(30)
-    air.map_off = np.array([80.0, 0.0])
-    air.fly(3)
-    led_m, _ = off_m(air)
-    assert np.hypot(*led_m) < 8.0, "three that agree with each other are not believed"
-    air.fly(3)
-    led_m, _ = off_m(air)
-    assert np.hypot(*(led_m - air.map_off)) < 8.0, "matches win in the end"
+    air = without_gps(air_of(channel, stride_sd_m=0.2), 30)
+    assert beside_m(air, 3)[0] < 8.0, "three that agree with each other are not believed"
+    assert beside_m(air, 3)[1] < 8.0, "matches win in the end"
 
 
 def test_without_strides_two_overrule_it():
-    air = air_of(Channel.COMMAND)
-    air.fly(60)
-    air.lose_gps()
-    air.fly(30)
-    air.map_off = np.array([80.0, 0.0])
-    air.fly(3)
-    led_m, _ = off_m(air)
-    assert np.hypot(*(led_m - air.map_off)) < 15.0
+    assert beside_m(without_gps(air_of(Channel.COMMAND), 30), 3)[1] < 15.0
 
 
 def test_matches_win_where_a_slow_copter_sees_the_same_places_for_long():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=7.0)
     air.places = lambda step: tuple(range(step // 150, step // 150 + 12))  # those of 36 s
-    air.fly(60)
-    air.lose_gps()
-    air.fly(30)
-    air.map_off = np.array([80.0, 0.0])
-    air.fly(15)
-    led_m, _ = off_m(air)
-    assert np.hypot(*(led_m - air.map_off)) < 8.0
+    assert beside_m(without_gps(air, 30), 15)[1] < 8.0
