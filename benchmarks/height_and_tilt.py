@@ -18,6 +18,7 @@ import numpy as np
 import walks
 from base import Row
 
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import markdown
 from edgevpr.frames.images import read_image
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
@@ -159,7 +160,7 @@ def errors(match, image, reference, onto: np.ndarray) -> tuple[float, float, flo
     shift = (centre - middle(reference)) / (max(reference.shape[:2]) / 32) - match.shift_cells
     rotation_deg = match.rotation_deg - math.degrees(math.atan2(step[1], step[0]))
     ratio = math.hypot(*step) * max(image.shape[:2]) / max(reference.shape[:2])
-    return math.hypot(*shift), abs((rotation_deg + 180) % 360 - 180), abs(match.height_ratio / ratio - 1)
+    return math.hypot(*shift), abs(shorter_deg(rotation_deg)), abs(match.height_ratio / ratio - 1)
 
 
 def middle(image: np.ndarray) -> np.ndarray:

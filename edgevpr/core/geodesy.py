@@ -11,6 +11,11 @@ D = TypeVar("D", float, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
 
+def shorter_deg(turn_deg: D) -> D:
+    """Return the shorter of the two turns that lead to the same direction, -180..180 (a scalar or an array)."""
+    return (turn_deg + 180) % 360 - 180
+
+
 def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_deg: D) -> D:
     """Return the distance in metres between points (scalars, or arrays that broadcast); NaN where one is NaN."""
     north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
@@ -29,8 +34,7 @@ def _north_m_and_turn(
     lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
 ) -> tuple[Any, Any]:
     north_m = np.radians(np.subtract(other_lat_deg, lat_deg)) * EARTH_RADIUS_M
-    turn_deg = (np.subtract(other_lon_deg, lon_deg) + 180) % 360 - 180  # the shorter way, also across the date line
-    return north_m, np.radians(turn_deg)
+    return north_m, np.radians(shorter_deg(np.subtract(other_lon_deg, lon_deg)))  # also across the date line
 
 
 def metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
@@ -46,7 +50,7 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     `offset_m`."""
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
-    return lat_deg + north_deg, (lon_deg + east_deg + 180) % 360 - 180
+    return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
 
 
 def axes_of(up_deg: float) -> Doubles:

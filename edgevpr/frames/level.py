@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import shrunk
 from edgevpr.frames.lens import CalibratedLens, Remap, sight_of
@@ -118,7 +119,7 @@ def levelled(
     zoom = taking.own_m / footprint_m if taking.own_m and footprint_m else 1.0
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
         zoom = 1.0
-    turn_deg = abs(((taking.top_deg or 0.0) + 180) % 360 - 180)
+    turn_deg = abs(shorter_deg(taking.top_deg or 0.0))
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
         view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=aside, focal=focal)

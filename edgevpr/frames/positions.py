@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file, write_whole
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 
 ALT_M = (-1000.0, 100_000.0)  # plausible altitudes
@@ -228,12 +229,12 @@ class Track:
             return GeoTag()
         one, other = (np.array(_numbers_of(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
         way = other - one
-        way[_ANGLES] = (way[_ANGLES] + 180) % 360 - 180  # the shorter turn
+        way[_ANGLES] = shorter_deg(way[_ANGLES])
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
         between: list[Any] = [None if math.isnan(number) else number for number in (one + share * way).tolist()]
         lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = between
         return GeoTag(
-            position=Position(lat_deg, (lon_deg + 180) % 360 - 180, alt_m),
+            position=Position(lat_deg, shorter_deg(lon_deg), alt_m),
             heading_deg=None if heading_deg is None else heading_deg % 360,
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,

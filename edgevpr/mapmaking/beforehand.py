@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import at_work
 from edgevpr.frames.exif import fov_deg_of, is_at_zero, read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
@@ -104,7 +105,7 @@ def _seen(uri: str, mask: Mask | None) -> tuple[bool, str]:
             if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
                 continue
             found += 1
-            if abs((seen.rotation_deg + 180) % 360 - 180) >= _TURNED_DEG or abs(seen.shift_share[1]) >= _MOVED_UP:
+            if abs(shorter_deg(seen.rotation_deg)) >= _TURNED_DEG or abs(seen.shift_share[1]) >= _MOVED_UP:
                 clearly += 1
             elif abs(seen.shift_share[0]) >= _MOVED_ASIDE and abs(seen.scale - 1) <= _AS_LARGE:
                 aside += 1

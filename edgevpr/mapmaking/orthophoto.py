@@ -16,6 +16,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resized
 
@@ -197,7 +198,7 @@ class Orthophoto:
         try:
             columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
             (lon_deg,), (lat_deg,) = self._through(columns, rows, WGS84)
-            self.middle = Position(lat_deg, (lon_deg + 180) % 360 - 180)
+            self.middle = Position(lat_deg, shorter_deg(lon_deg))
             lons_deg, lats_deg = self.outline(WGS84)
         except (CPLE_BaseError, RasterioError):
             lats_deg = lons_deg = np.array([np.nan])

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.mavlink.messages import POSITION_FIX
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -66,7 +67,7 @@ class Attitudes:
         if before is None or after is None:
             return before or after
         step_s = after.t_s - before.t_s
-        changed_deg = [(other - one + 180) % 360 - 180 for one, other in zip(before[1:4], after[1:4], strict=True)]
+        changed_deg = [shorter_deg(other - one) for one, other in zip(before[1:4], after[1:4], strict=True)]
         share = (t_s - before.t_s) / step_s
         roll_deg, pitch_deg, yaw_deg = (
             one + share * change for one, change in zip(before[1:4], changed_deg, strict=True)

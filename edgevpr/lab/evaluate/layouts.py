@@ -17,7 +17,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import offset_m
+from edgevpr.core.geodesy import offset_m, shorter_deg
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Position
 from edgevpr.frames.images import list_images
@@ -130,4 +130,4 @@ def _near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Double
 def _apart_deg(one: GeoTag, other: GeoTag) -> float:
     if one.heading_deg is None or other.heading_deg is None:
         raise UsageError("--within-deg needs the heading of every picture (yaw_deg in positions.csv): leave it out.")
-    return abs((one.heading_deg - other.heading_deg + 180) % 360 - 180)
+    return abs(shorter_deg(one.heading_deg - other.heading_deg))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 from edgevpr.runtime.recognise.locate import in_sd, matrix_of
 from edgevpr.runtime.recognise.perspective import Lean
@@ -67,7 +68,7 @@ class PositionedMatch:
         """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
         if self.turn_deg is None or turn_deg is None:
             return True
-        return abs((self.turn_deg - turn_deg + 180) % 360 - 180) <= _TURNED_DEG
+        return abs(shorter_deg(self.turn_deg - turn_deg)) <= _TURNED_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +168,7 @@ def positioned(event: Recognition, frame: HeardFrame) -> PositionedMatch | None:
         return None
     turn_deg, shown_deg, told_deg = None, event.located.heading_deg, event.view.up_deg
     if shown_deg is not None and told_deg is not None:
-        turn_deg = (shown_deg - told_deg + 180) % 360 - 180
+        turn_deg = shorter_deg(shown_deg - told_deg)
     return PositionedMatch(
         frame=frame,
         position=event.located.position,

@@ -21,6 +21,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import PlaceError
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -69,7 +70,7 @@ class Overlay:
         """Relative pose of the query as in a tie of `mapmaking.graph`: its offset, right + i up, and the logarithm of
         its scale + i times its counter-clockwise rotation."""
         dx, dy = self.shift_share
-        turned = np.radians((self.rotation_deg + 180) % 360 - 180)
+        turned = np.radians(shorter_deg(self.rotation_deg))
         return complex(dx, -dy), complex(np.log(self.scale or 1.0), -turned)
 
 

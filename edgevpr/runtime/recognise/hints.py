@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m
+from edgevpr.core.geodesy import distance_m, shorter_deg
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
@@ -55,7 +55,7 @@ class Hints:
                 return False
         if self.heading_deg is None or place.heading_deg is None or turned_deg is None or heading_within_deg is None:
             return True
-        off_deg = (turned_deg - (self.heading_deg - place.heading_deg) + 180) % 360 - 180
+        off_deg = shorter_deg(turned_deg - (self.heading_deg - place.heading_deg))
         return abs(off_deg) <= heading_within_deg
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import nines
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
@@ -265,7 +266,7 @@ def _is_at_rest(match: FineMatch | None) -> bool:
     """Return True if a match has about no shift, rotation or change of height."""
     if match is None or match.rotation_deg is None or match.shift_cells is None:
         return False
-    off_deg = abs((match.rotation_deg + 180) % 360 - 180)
+    off_deg = abs(shorter_deg(match.rotation_deg))
     if off_deg > _AT_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _AT_REST_HEIGHT:
         return False
     return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from edgevpr.core.geodesy import axes_of
+from edgevpr.core.geodesy import axes_of, shorter_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import agreement
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
@@ -58,7 +58,7 @@ class Strides:
             return None
         if found.shift_share is None or found.rotation_deg is None or found.scale is None:
             return None
-        turned_deg = (found.rotation_deg - (view.up_deg - start.up_deg) + 180) % 360 - 180
+        turned_deg = shorter_deg(found.rotation_deg - (view.up_deg - start.up_deg))
         stretched = found.scale * start.footprint_m / view.footprint_m
         if abs(turned_deg) > _MOST_TURN_DEG or not 1 / _MOST_SCALE < stretched < _MOST_SCALE:
             return None
