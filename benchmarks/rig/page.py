@@ -120,13 +120,13 @@ Flown with edgevpr at {_commits(found)}; {result["date"]}, {result["machine"]["c
 
 ![tracks](rig.jpg)
 
+White: where the aircraft was, from the loss of GPS on. Green: where its autopilot took it to be, with edgevpr. Red:
+where it took it to be without edgevpr, in another flight, whose own true track is dotted.
+
 ![claims](rig-claims.jpg)
 
 Metres over the seconds after the loss. Blue: the error of the autopilot's estimate. Dots: of each position when it was
 sent. Grey: twice the accuracy that was claimed with it. Below, green and red: queries accepted and refused.
-
-White: where the aircraft was, from the loss of GPS on. Green: where its autopilot took it to be, with edgevpr. Red:
-where it took it to be without edgevpr, in another flight, whose own true track is dotted.
 """
 
 
