@@ -23,6 +23,7 @@ HOME = 47.0, 8.0
 GPS_SD_M = 1.0
 _STEP_S = 0.02
 _REPORT_STEPS, _STATE_STEPS = 10, 5  # five reports and ten states a second
+_FARTHEST_STEPS = 250  # between two frames that share ground
 _GRAVITY_M_S2 = 9.80665
 _DRIFT_M_S = 5.0  # as edgevpr takes an autopilot's own position to go wrong
 _PICTURE = np.zeros((8, 8), np.uint8)
@@ -54,7 +55,8 @@ class Air:
     (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
     of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
     With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right);
-    without `matches`, no place is accepted. `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot
+    without `matches`, no place is accepted. Without GPS, a frame is taken every `stride_s` for its stride only
+    (None: none is). `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot
     follows it until it `reject_gps`."""
 
     def __init__(
@@ -74,6 +76,7 @@ class Air:
         bias=(0.0, 0.0),
         attitude=(0.0, 0.0),
         stride_sd_m=None,
+        stride_s=None,
         seed=7,
     ):
         self.navigator, self.rng = navigator, np.random.default_rng(seed)
@@ -82,6 +85,7 @@ class Air:
         self.said_sd_m = said_sd_m or fix_sd_m
         self.wind, self.map_off, self.bias = map(np.array, (wind, map_off, bias))
         self.every_steps, self.late_steps = round(every_s / _STEP_S), round(late_s / _STEP_S)
+        self.stride_steps = stride_s and round(stride_s / _STEP_S)
         self.step, self.at_m, self.gps_off_m, self.has_gps = 0, np.zeros(2), np.zeros(2), True
         self.has_receiver, self.spoofed_m_s = True, np.zeros(2)  # the speed that it has made up
         self.off_m = np.zeros(2)  # by how much the autopilot is wrong
@@ -135,6 +139,8 @@ class Air:
                 self.hear_state(self.states[-1][1])
             if self.step % self.every_steps == 0 and self.sees:
                 self.waiting.append((self.step, self.vehicle))
+            if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
+                self._see(self.step, self.vehicle, is_query=False)
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
                 self._look(*self.waiting.popleft())
             if self.t_s >= self.between_due_s and (fix := self.navigator.fix_between(self.t_s)):
@@ -148,13 +154,16 @@ class Air:
         if self.matches:
             self.match(step, vehicle)
         else:
-            event = Recognition(frame=Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S), vehicle=vehicle)
-            event.stride = self._stride(step)
-            self.navigator.hear_frame(event)
+            self._see(step, vehicle)
+
+    def _see(self, step, vehicle, is_query=True) -> None:
+        event = Recognition(frame=Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S), vehicle=vehicle)
+        event.stride = self._stride(step)
+        self.navigator.hear_frame(event, is_query)
 
     def _stride(self, step) -> Stride | None:
         before, self.strode = self.strode, step
-        if self.stride_sd_m is None or before is None:
+        if self.stride_sd_m is None or before is None or step - before > _FARTHEST_STEPS:
             return None
         east_m, north_m = (self.way[step] - self.way[before]) * self.stretch
         turned = complex(east_m, north_m) * np.exp(-1j * self.turn)

@@ -133,6 +133,16 @@ class ToAutopilot:
             self._tell(event, used_mah)
         return replace(event, fix=fix, last_fix=last)
 
+    def saw(self, event: Recognition) -> None:
+        """Let the navigator know the motion that a picture shows which is no query."""
+        with self._link.turn("saw"):
+            self._navigator.hear_frame(event, is_query=False)
+
+    def wants_strides(self) -> bool:
+        """Tell whether the position rests on matches, so that the motion between two of them is of use."""
+        with self._link.turn("wants strides"):
+            return not self._navigator.has_gps
+
     def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):

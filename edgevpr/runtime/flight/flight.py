@@ -161,15 +161,12 @@ class Flight:
 
     def _turn(self) -> None:
         """Run one pass of the loop, with one frame at most."""
-        source, clock, meter = self._crew.source, self._crew.clock, self._crew.meter
+        source, clock, meter, pace = self._crew.source, self._crew.clock, self._crew.meter, self._pace
         self._vitals.beat()
         self._commands.obey()
-        if (wait_s := self._pace.wait_s()) > 0:
-            clock.sleep(min(wait_s, _TURN_S))
-            return
-        is_paused = self._commands.is_paused
-        if is_paused and not source.is_live:  # a recording waits
-            clock.sleep(_TURN_S)
+        is_paused, is_query = self._commands.is_paused, (wait_s := pace.wait_s()) <= 0
+        if (not is_query and not self._is_time_for_stride()) or (is_paused and not source.is_live):  # a recording waits
+            clock.sleep(_TURN_S if is_query else min(wait_s, _TURN_S))
             return
         with meter.timed() as reading:
             try:
@@ -180,7 +177,8 @@ class Flight:
             meter.load.busy(reading.cost)
         if frame is None:
             return
-        self._pace.taken(source.step_s)
+        if is_query:
+            pace.taken(source.step_s)
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
         recogniser, link = self._crew.recogniser, self._crew.link
@@ -189,10 +187,25 @@ class Flight:
                 if isinstance(frame, ImageError):
                     event = recogniser.unread(frame)
                 else:
-                    event = recogniser.step(frame, link.vehicle_at(frame.t_mono_s) if link else None)
-            self._tell(replace(event, steps=replace(event.steps, read=reading.cost)))
+                    take = recogniser.step if is_query else recogniser.stride
+                    event = take(frame, link.vehicle_at(frame.t_mono_s) if link else None)
+            event = replace(event, steps=replace(event.steps, read=reading.cost))
+            if is_query:
+                self._tell(event)
+            elif self._crew.autopilot:
+                meter.count(event)
+                self._crew.autopilot.saw(event)
         meter.load.busy(work.cost)
         self._governing.look()  # here, so that each reading covers a whole number of queries
+
+    def _is_time_for_stride(self) -> bool:
+        """Tell whether to take a picture that is no query, for the motion that it shows: between rare queries, while
+        the autopilot has no GPS. The pictures of a recording are all queries."""
+        crew = self._crew
+        if crew.autopilot is None or not crew.source.is_live or not crew.recogniser.measures_strides:
+            return False
+        is_due = not self._commands.is_paused and self._pace.is_time_for_stride()
+        return is_due and crew.autopilot.wants_strides()
 
     def _tell(self, event: Recognition) -> None:
         """Report an event to the autopilot, then to all observers, which also get the report of its fix. An exception

@@ -19,7 +19,7 @@ _GPS_ALIKE = 2.0
 _GPS_VELOCITY_SD = 0.3  # m/s
 _UNKNOWN_M = 1e4
 _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
-_FOLLOWED_S = 4.0  # after the frame of the last stride
+_FOLLOWED_S = 4.0  # after the frame of the last stride, and the longest time between two queries
 _MOST_ALIKE = 16.0  # fixes of the same ground that count as one
 
 
@@ -47,6 +47,7 @@ class Navigation:
         self._framed: Point | None = None  # of the path, when the last frame was taken
         self._fixed_m: Doubles | None = None  # the last fix, from the origin of the path
         self.has_gps, self._gps_s, self._fixed_s, self._strode_s = False, -math.inf, -math.inf, -math.inf
+        self._asked_s, self._asks_every_s = -math.inf, math.inf  # the last query's frame, and the time before it
 
     @property
     def known_s(self) -> float:
@@ -54,8 +55,9 @@ class Navigation:
         return max(self._fixed_s, self._strode_s, self._gps_s)
 
     def is_followed_at(self, t_s: float) -> bool:
-        """Tell whether the path is followed from frame to frame, by strides that it does not contradict."""
-        return t_s - self._strode_s <= _FOLLOWED_S
+        """Tell whether the path is followed from frame to frame, by strides that it does not contradict, and queries
+        are so frequent that several can contradict it soon."""
+        return max(t_s - self._strode_s, self._asks_every_s) <= _FOLLOWED_S
 
     def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
         """Process a report of the autopilot. A path of velocities (`RECKONED`) goes on with the reported velocity. If
@@ -90,8 +92,10 @@ class Navigation:
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
-    def hear_frame(self, frame: HeardFrame) -> None:
-        """Process a frame, whatever is recognised in it."""
+    def hear_frame(self, frame: HeardFrame, is_query: bool = True) -> None:
+        """Process a frame, whatever is recognised in it, or one that is no query and only shows its stride."""
+        if is_query:
+            self._asks_every_s, self._asked_s = frame.t_s - self._asked_s, frame.t_s
         path, before = self._unbroken, self._framed
         self._framed = there = path.at(frame.t_s) if path else None
         if path is None or there is None:

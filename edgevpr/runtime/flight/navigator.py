@@ -101,11 +101,12 @@ class Navigator(Listener):
             self._attitude = attitude
             self._navigation.hear_acceleration(t_s, acceleration_m_s2)
 
-    def hear_frame(self, event: Recognition) -> None:
-        """Process the frame of an event without an accepted match: its motion since the frame before."""
+    def hear_frame(self, event: Recognition, is_query: bool = True) -> None:
+        """Process the frame of an event without an accepted match, or of one that is no query: its motion since the
+        frame before."""
         with self._lock:
             if frame := self._frame(event):
-                self._navigation.hear_frame(frame)
+                self._navigation.hear_frame(frame, is_query)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""

@@ -6,6 +6,7 @@ that is not accepted with hints is therefore followed by one without (`Prior`). 
 not follow each other: each is asked with what is said to be known of it (`Told`).
 """
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -16,10 +17,14 @@ from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expectation
+from edgevpr.runtime.recognise.locate import Located
 
 TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
 TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _FIX_GOOD_FOR_S = 60.0
+# The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
+# the best one with: it is as large as what is told of recorded queries, and reaches over so many places.
+_SURE_MASS, _SURE_SD, _OVER_PLACES, _FASTEST_M_S = 0.99, 4.0, 5.0, 30.0
 # Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
 _NEEDED = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
@@ -74,6 +79,7 @@ class Prior:
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
         self.looks_again = self._are_believed = True
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
+        self._followed: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
         self._known: Hints | None = None
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
@@ -81,7 +87,8 @@ class Prior:
 
         `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown. It
         has flown from the autopilot's position if that has GPS (without, it drifts, and our own fix is better), else
-        from our last fix if that is at most a minute old.
+        from our last fix if that is at most a minute old. Without a highest speed, the area is where the flight so far
+        puts the aircraft, if it is sure.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
@@ -92,6 +99,12 @@ class Prior:
             known = None
         if known and self._reach_m_s:
             reach = Reach(known[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - known[1]))
+        if self._followed and self._reach_m_s is None:
+            area, t_s = self._followed
+            flown_m = _FASTEST_M_S * abs(frame.t_mono_s - t_s)
+            if abs(frame.t_mono_s - t_s) <= _FIX_GOOD_FOR_S:
+                least_m = max(TOLD_REACH_M, _OVER_PLACES * margin_m)
+                reach = Reach(area.position, least_m + area.radius_m + flown_m)
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None
@@ -111,6 +124,13 @@ class Prior:
             self.height_ratio = found.match.height_ratio
         if accepted and found.place.position:
             self._last_fix = found.place.position, t_mono_s
+
+    def follow(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
+        """Keep where the flight so far puts the aircraft (None: unknown), with the probability `mass` that it is near
+        there. It holds until the next is sure too, or for a minute."""
+        if estimate and mass >= _SURE_MASS:
+            east_m2, _, north_m2 = estimate.covariance_m2
+            self._followed = Reach(estimate.position, _SURE_SD * math.sqrt(east_m2 + north_m2)), t_mono_s
 
 
 class Told:
@@ -140,6 +160,9 @@ class Told:
         uses_heading = "heading" in self._known and self._heading_within_deg is not None
         reach = Reach(frame.position, TOLD_REACH_M) if "reach" in self._known and frame.position else None
         return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
+
+    def follow(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
+        """Keep nothing, as `learn` does."""
 
     def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
         """Learn nothing: the next query is another flight's."""

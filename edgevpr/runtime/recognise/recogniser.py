@@ -145,9 +145,7 @@ class Recogniser:
             with self.meter.step("encode"):
                 event.descriptor = descriptor = self.technique.encode(picture.image, picture.mask)
             looked = Verification(self.technique.spec, picture, self.index, self.place_map)
-            if preparation.strides and picture.view.is_laid:
-                with self.meter.step("stride"):
-                    event.stride = preparation.strides.to(frame.t_mono_s, picture.view, looked.landmarks)
+            self._measure_stride(event, looked)
             verdict, where = self._recognise(event, frame, looked, descriptor)
             event.accepted, event.reason = verdict.accepted, verdict.reason
             if event.accepted and where:
@@ -160,6 +158,32 @@ class Recogniser:
         self._told += len(event.left_out)
         event.steps, event.cost = self.meter.steps(), self.meter.cost()
         return event
+
+    @property
+    def measures_strides(self) -> bool:
+        """True if the motion between two frames is measured."""
+        return self._preparation.strides is not None
+
+    def stride(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
+        """Measure the motion from the frame before to this one, and nothing else. Never raises an Exception."""
+        self.meter.begin()
+        event = Recognition(frame=frame, vehicle=vehicle)
+        try:
+            with self.meter.step("prepare"):
+                event.picture = picture = self._preparation.picture(frame, vehicle)
+            self._measure_stride(event, Verification(self.technique.spec, picture, self.index, self.place_map))
+        except Exception as error:
+            _log.debug("%s failed", frame.name, exc_info=True)
+            event.failed, event.reason = True, _sentence(error)
+        event.steps, event.cost = self.meter.steps(), self.meter.cost()
+        return event
+
+    def _measure_stride(self, event: Recognition, looked: Verification) -> None:
+        """Measure the stride of a frame from the one before, if its picture lies on the ground."""
+        strides = self._preparation.strides
+        if strides and event.frame and event.view.is_laid:
+            with self.meter.step("stride"):
+                event.stride = strides.to(event.frame.t_mono_s, event.view, looked.landmarks)
 
     def unread(self, error: Exception) -> Recognition:
         """Return the event of a frame that could not even be read."""
@@ -195,6 +219,8 @@ class Recogniser:
             verdict = Verdict(False, objection)
         if self._prior:
             self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+            if event.followed:
+                self._prior.follow(event.followed.estimate, event.followed.mass, frame.t_mono_s)
         return verdict, where
 
     def _found(self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor) -> _Judged:

@@ -9,7 +9,7 @@ from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import Frame, Position, Receiver
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -19,6 +19,7 @@ from edgevpr.techniques import create
 pytestmark = pytest.mark.slow
 
 PLACES = 5
+FAR_APART = {"source.fov_deg": 66.0, "source.rate_hz": 0.1}
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +86,27 @@ def test_nothing_that_the_autopilot_says_ends_a_flight(place_map, tmp_path, said
     with caplog.at_level(logging.CRITICAL):
         queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, **said)
     assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("is_live", "has_gps", "before_s"), [(True, False, 2.0), (True, True, 10.0), (False, False, 10.0)]
+)
+def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
+    place_map, tmp_path, is_live, has_gps, before_s
+):
+    clock = FakeClock()
+
+    def vehicle():
+        level = {"heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0, "height_m": 80.0}
+        gps = Receiver(50.0, 8.0, 1.0, clock.now_s) if has_gps else None
+        return vehicle_at(50.0, 8.0, clock.now_s, velocity_m_s=(0.0, 0.0), has_gps=has_gps, gps=gps, **level)
+
+    source = FakeSource([textured(20, 256, 256)] * 11, clock, is_live=is_live)
+    flown = Flight(place_map, tmp_path / "f.jsonl", clock, FakeLink(clock, vehicle=vehicle), **FAR_APART)
+    lines = flown.fly(source)
+    queries = of_kind(lines, "query")
+    strides = [query["stride"]["from_s"] - query["t_frame_s"] for query in queries[1:]]
+    assert strides == [pytest.approx(-before_s, abs=0.25)] * (len(queries) - 1)
+    assert len(queries) == (3 if before_s < 10.0 else 11), "the others are no queries"
+    assert not of_kind(lines, "unusable")
+    assert flown.end["queries"] == len(queries)

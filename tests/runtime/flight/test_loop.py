@@ -100,6 +100,20 @@ def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
     assert pace.wait_s() == pytest.approx(1.0)
 
 
+def test_between_frames_that_are_far_apart_pictures_are_due_for_their_strides(clock):
+    pace, due_s = Pace(0.1, clock.clock), []
+    pace.taken()
+    for _ in range(100):
+        clock.now_s += 0.1
+        if pace.is_time_for_stride():
+            due_s.append(10.0 - pace.wait_s())
+    assert due_s == pytest.approx([2.0, 4.0, 6.0, 8.0], abs=0.15)
+    pace.taken()
+    pace.rate_hz = 0.5
+    clock.now_s += 3.0
+    assert not pace.is_time_for_stride(), "queries show it themselves"
+
+
 def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lowered(clock):
     pace = Pace(2.0, clock.clock)
     pace.taken(3.0)

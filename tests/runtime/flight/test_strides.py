@@ -107,3 +107,20 @@ def test_matches_win_where_a_slow_copter_sees_the_same_places_for_long():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=7.0)
     air.places = lambda step: tuple(range(step // 150, step // 150 + 12))  # those of 36 s
     assert beside_m(without_gps(air, 30), 15)[1] < 8.0
+
+
+RARE = {"every_s": 10.0, "stride_s": 2.0, "stride_sd_m": 0.2}
+
+
+def test_between_queries_ten_seconds_apart_the_position_is_carried_by_pictures_that_are_no_queries():
+    def largest_m(**how):
+        return lengths(without_gps(air_of(Channel.COMMAND, **RARE | how), 60).errors_m[-59:]).max()
+
+    assert largest_m() < 20.0
+    assert largest_m(stride_s=None) > 40.0
+
+
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
+def test_rare_matches_overrule_such_a_path_by_two(channel):
+    air = without_gps(air_of(channel, **RARE), 60)
+    assert beside_m(air, 25)[1] < 15.0

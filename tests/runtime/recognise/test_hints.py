@@ -1,5 +1,7 @@
 """What is known beforehand narrows a query, and never keeps the next one from looking everywhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, expected_of
+from edgevpr.runtime.recognise.locate import Located
 
 HOME = Position(50.0, 8.0)
 WITHIN_DEG = 22.5
@@ -29,6 +32,21 @@ def index():
         lon_deg=lon_deg,
         heading_deg=heading_deg,
         rows=np.zeros((5, 1)),
+        mean=None,
+    )
+
+
+@pytest.fixture
+def long_index():
+    """Forty places every 100 m to the north."""
+    lat_deg = np.array([north(100 * place).lat_deg for place in range(40)])
+    none = np.full(40, np.nan, np.float16)
+    return PlaceIndex(
+        place_ids=np.arange(1, 41),
+        lat_deg=lat_deg,
+        lon_deg=np.full(40, 8.0),
+        heading_deg=none,
+        rows=np.zeros((40, 1)),
         mean=None,
     )
 
@@ -126,6 +144,20 @@ def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can
         seen.append(prior.hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
         prior.learn(found(metres), accepted, float(number))
     assert seen == [True, False, True, False, True, True, False]
+
+
+def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_index):
+    prior, frame = Prior(None, None, is_live=True), Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=10.0)
+    there = Located(position=north(2000), covariance_m2=(9.0, 0.0, 16.0))
+    prior.follow(there, 0.98, 10.0)
+    prior.follow(None, 1.0, 10.0)
+    assert prior.hints(frame, None, long_index, 50.0) is None
+    prior.follow(there, 0.99, 10.0)
+    assert prior.hints(frame, None, long_index, 50.0) == Hints(Reach(north(2000), 320.0))
+    assert prior.hints(frame, None, long_index, 100.0) == Hints(Reach(north(2000), 520.0)), "five places on every side"
+    prior.follow(there, 0.5, 12.0)
+    assert prior.hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == Hints(Reach(north(2000), 440.0))
+    assert prior.hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
 def test_the_next_query_is_looked_for_from_the_height_of_the_last_match():
