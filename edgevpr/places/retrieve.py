@@ -105,13 +105,13 @@ def scan(query: Query) -> Scan:
     return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hint)
 
 
-def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbour_m: float = 0.0) -> Ranking:
+def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m: float = 0.0) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
     If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
     compared, under all hypotheses of the expected height if nothing else is expected: exact, but slow.
-    If all candidates are within `neighbour_m` metres of the best one, the best-scanned places elsewhere are compared as
+    If all candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as
     well, for the margin. Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the
     score is that of the comparison times the mean of the scan score and 1: for a wrong place the two are nearly
     independent. If `expected.in_reach` is known, the candidates are places in reach, and five out of reach are compared
@@ -134,7 +134,7 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, neighbou
     if len(looks.scores) < np.count_nonzero(readable):
         compared = list(looks.scores)
         best = max(compared, key=looks.scores.__getitem__)
-        others = elsewhere(index, best, np.arange(len(index)), neighbour_m)
+        others = elsewhere(index, best, np.arange(len(index)), apart_m)
         rivals = np.count_nonzero(others[compared])
         if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others[compared] = False

@@ -101,7 +101,7 @@ def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(r
     technique, place_map = ruler_map
     index = load_index(place_map, technique, 10_000)
     query = technique.encode(43)
-    ranking = rank(technique, query, place_map, index, candidates=3, neighbour_m=150.0)
+    ranking = rank(technique, query, place_map, index, candidates=3, apart_m=150.0)
     assert technique.compared == 3 + 5
     assert margin(ranking, index, 150.0) is not None
     assert named(ranking, index, place_map, 1)[0].place.source_image == "44"

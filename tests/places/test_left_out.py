@@ -122,7 +122,7 @@ def test_where_most_cannot_be_read_the_file_is_at_fault_and_all_come_back_with_i
 def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
     technique, place_map, index = ruler
     place_map.left_out.update({16: "gone", 14: "gone"})
-    ranking = rank(technique, technique.encode(142), place_map, index, candidates=1, neighbour_m=200.0)
+    ranking = rank(technique, technique.encode(142), place_map, index, candidates=1, apart_m=200.0)
     assert not {13, 15} & set(ranking.slots.tolist())
     assert margin(ranking, index, 200.0) is not None
 

@@ -109,6 +109,8 @@ class Recogniser:
         self._prior, self._follower = prior, follower
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
+        # Places nearer to each other show the same ground: neither is a rival of the other.
+        self._footprint_m = place_map.footprint_m() or 0.0
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
@@ -253,7 +255,7 @@ class Recogniser:
             scanned = scan(query)
         with self.meter.step("compare"):
             candidates = self.candidates and max(1, round(part * self.candidates))
-            return compare(query, scanned, candidates, self.rule.neighbour_m)
+            return compare(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))
 
     def _judged(
         self, event: Recognition, ranking: Ranking, looked: Verification, followed: Followed | None = None

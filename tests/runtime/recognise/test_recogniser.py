@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, ModelError
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -158,3 +158,21 @@ def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.take(Matcher(walk.technique, walk.index, walk.rule))
     assert walk.accuracy_m == 20.0
     assert load_config(None).mavlink.min_accuracy_m == 5.0
+
+
+def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path, clock):
+    """A place 60 m on is beyond `neighbour_m`, and half of its ground is the same."""
+    technique, ground, side_px = create("cohog", {"camera": "nadir"}), textured(9, 256, 2048), 256
+    pose = Pose(up_deg=0.0, footprint_m=128.0, covariance_m2=(1.0, 0.0, 1.0))
+
+    def cut(east_m):
+        at = Position(50.0, 8.0 + east_m / (111_195 * np.cos(np.radians(50.0))))
+        image = np.ascontiguousarray(ground[:, 2 * east_m : 2 * east_m + side_px])
+        return Frame(image=image, name=f"{east_m}", t_mono_s=0.0, position=at, heading_deg=0.0, pose=pose)
+
+    with PlaceMap.create(tmp_path / "dense.gpkg", technique.spec) as place_map:
+        build_map(map(cut, range(0, 880, 20)), technique, place_map, meter_with(clock))
+        matcher = Matcher(technique, load_index(place_map, technique, 10**6), RULE)
+        event = Recogniser(matcher, place_map, meter_with(clock), WalkSettings(candidates=8)).step(cut(400))
+    away_m = 20.0 * abs(np.array(event.ranking.compared_slots) - event.ranking.compared_slots[0])
+    assert (away_m > 140).sum() >= 3
