@@ -2,6 +2,7 @@
 real `edgevpr run` beside a simulated plane that loses GPS on the way. `edgevpr simulate rehearsal` does it."""
 
 import math
+import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -56,13 +57,11 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
     ground = read_ground(mission.place_map)
     references = album_of_map(mission.map_images, ground)
     orthophoto = Orthophoto(mission.orthophoto)
-    taken = write_rehearsal(folder, orthophoto, list(mission.shots), mission.fov_deg, mission.seed)
-    written = sum(1 for _ in progress(taken, len(mission.shots), "taking pictures"))
-    if lacking := len(mission.shots) - written:
-        raise UsageError(
-            f"{mission.orthophoto} does not cover the track: {lacking} of {len(mission.shots)} pictures would show "
-            "ground beyond it. Give one that reaches a picture's width beyond the track on all sides."
-        )
+    try:
+        _take_pictures(mission, folder, orthophoto)
+    except UsageError:
+        shutil.rmtree(folder)  # so that the command can be given again, with another track
+        raise
     gps_until_s = min(_MOST_GPS_S, _GPS_SHARE * span_s)
     _fly(mission, folder, gps_until_s)
     flown = _read(folder)
@@ -72,6 +71,17 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
     flown.flight.notes = (answer_of(found),)
     _write_page(folder, flown.flight, ground, references)
     return found
+
+
+def _take_pictures(mission: Mission, folder: Path, orthophoto: Orthophoto) -> None:
+    """Write the pictures. Raises UsageError if some would show ground beyond the orthophoto."""
+    taken = write_rehearsal(folder, orthophoto, list(mission.shots), mission.fov_deg, mission.seed)
+    written = sum(1 for _ in progress(taken, len(mission.shots), "taking pictures"))
+    if lacking := len(mission.shots) - written:
+        raise UsageError(
+            f"{mission.orthophoto} does not cover the track: {lacking} of {len(mission.shots)} pictures would show "
+            "ground beyond it. Give one that reaches a picture's width beyond the track on all sides."
+        )
 
 
 def answer_of(found: Foreseen) -> str:
