@@ -146,14 +146,15 @@ def _require_seed(args: Namespace) -> None:
 
 def simulate_rehearsal(args: Namespace) -> int:
     """Run `simulate rehearsal`: rehearse a mission over a map, and print what to expect of it."""
-    from edgevpr.lab.simulate.mission import Mission, answer_of, rehearse, thinned
+    from edgevpr.lab.simulate.mission import Mission, answer_of, rehearse
 
     _require_seed(args)
     shots, numbers = _shots_of(args, _REHEARSED)
     mission = Mission(
         place_map=args.map,
-        shots=thinned(shots, numbers["every_m"]),
+        shots=shots,
         orthophoto=args.orthophoto,
+        every_m=numbers["every_m"],
         fov_deg=numbers["fov_deg"],
         seed=args.seed,
         map_images=args.map_images,

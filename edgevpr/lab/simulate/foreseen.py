@@ -1,5 +1,5 @@
-"""What a rehearsed mission lets expect of the real one: its log, judged by where the aircraft truly was. `mission`
-flies it."""
+"""Judges a rehearsed mission by where the aircraft truly was, and says what to expect of the real one. `mission` flies
+it."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

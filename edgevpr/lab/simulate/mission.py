@@ -1,45 +1,57 @@
 """A mission rehearsed over a map: pictures along it from another orthophoto than the map's, flown in real time by a
 real `edgevpr run` beside a simulated plane that loses GPS on the way. `edgevpr simulate rehearsal` does it."""
 
+import logging
 import math
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
+from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import write_whole
 from edgevpr.core.text import progress
-from edgevpr.core.types import Place
+from edgevpr.core.types import Frame, Place
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.foreseen import Flown, Foreseen, expect, late_s, with_truth
 from edgevpr.lab.simulate.motion import read_track
 from edgevpr.lab.simulate.processes import autopilot_process, started
 from edgevpr.lab.simulate.rehearsal import SPEED_M_S, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.power.boards import load_board
 from edgevpr.review.album import Album, album_of_map
 from edgevpr.review.logged import LoggedFlight, read_flight, value
 from edgevpr.review.matchpage import thresholds_of
 from edgevpr.review.overhead import read_ground
 from edgevpr.review.page import page_of
 from edgevpr.runtime.flight.flightlog import flight_of
+from edgevpr.runtime.recognise.opening import open_recogniser
 
 _MOST_GPS_S, _GPS_SHARE = 20.0, 0.25  # of the flight with GPS, from which its filter starts
 _LEAST_S = 40.0
 _POLLED_S = 1.0
+_TRIED, _SPARE = 4, 1.5  # searches that are timed, and the time for a query in times the slowest of them
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mission:
     """A mission to rehearse: the file of its map, the pictures to take (see `read_shots`) of the ground of
-    `orthophoto`, their angle of view, the seed of their sway, and the pictures of the map, for the page."""
+    `orthophoto`, the least way between two, their angle of view, the seed of their sway, and the pictures of the map,
+    for the page."""
 
     place_map: str
     shots: Sequence[GeoTag]
     orthophoto: str
+    every_m: float
     fov_deg: float
     seed: int
     map_images: Sequence[str]
@@ -57,6 +69,7 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
     ground = read_ground(mission.place_map)
     references = album_of_map(mission.map_images, ground)
     orthophoto = Orthophoto(mission.orthophoto)
+    mission = replace(mission, shots=thinned(mission.shots, _paced_m(mission)))
     try:
         _take_pictures(mission, folder, orthophoto)
     except UsageError:
@@ -71,6 +84,26 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
     flown.flight.notes = (answer_of(found),)
     _write_page(folder, flown.flight, ground, references)
     return found
+
+
+def _paced_m(mission: Mission) -> float:
+    """Return the way between two pictures: `every_m`, or as far as one is flown while this computer searches the whole
+    map in vain. A camera's late pictures are dropped, a recording's are not: each would be later than the one before.
+    """
+    keys = {"map": mission.place_map, "source.camera": "nadir", "source.fov_deg": mission.fov_deg}
+    config = load_config(None, keys)
+    recogniser = open_recogniser(config, load_board(config.board))
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    image, took_s = np.ascontiguousarray(noise.repeat(4, 0).repeat(4, 1)), []
+    for number in range(_TRIED):
+        began_s = time.perf_counter()
+        recogniser.step(Frame(image=image, name="noise", t_mono_s=float(number)))
+        took_s.append(time.perf_counter() - began_s)
+    recogniser.place_map.close()
+    needed_m = SPEED_M_S * _SPARE * max(took_s[1:])  # the first one is slower than any later
+    if needed_m > mission.every_m:
+        _log.info("a query takes up to %.1f s here: pictures come every %.0f m", max(took_s[1:]), needed_m)
+    return max(needed_m, mission.every_m)
 
 
 def _take_pictures(mission: Mission, folder: Path, orthophoto: Orthophoto) -> None:

