@@ -69,10 +69,11 @@ def test_a_flight_that_knew_its_place_all_the_way_is_to_work():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"wrong_s": 60}, "1 accepted matches are wrong, by up to 200 m"),
+        ({"wrong_s": 60}, "1 of the accepted matches wrong, by up to 200 m"),
         ({"own_off_m": 70.0}, "up to 70 m off"),
         ({"refused": range(100)}, "nothing is recognised for 99 s"),
-        ({"refused": range(20, 85)}, "nothing is recognised for 66 s"),
+        ({"refused": range(20, 52)}, "nothing is recognised for 33 s"),
+        ({"refused": range(0, 99, 2), "seconds": 99}, "only 49 of 99 pictures"),
         ({"seconds": 15}, "no position without GPS"),
     ],
 )
