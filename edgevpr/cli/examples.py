@@ -58,10 +58,13 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("which board?", "--places 2000 --board rpi-zero-2w,rpi-4b,rpi-5"),
     ),
     "eval": (("techniques on a data set", "--data my_set/ --techniques cohog,hog --camera nadir"),),
-    "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv"),),
+    "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv --gps-s 30"),),
     "simulate flight": (
         ("a generated mapping flight", "mapping"),
         ("a later one over the same ground", "later --which query"),
+    ),
+    "simulate rehearsal": (
+        ("a mission over this year's ground", "valley.gpkg rehearsed --orthophoto now.tif --track mission.plan"),
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
     "models list": (("which networks there are", ""),),

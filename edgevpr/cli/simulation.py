@@ -1,23 +1,32 @@
-"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller, and
-demonstrate all steps from map to match."""
+"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller,
+rehearse a mission over a map, and demonstrate all steps from map to match."""
 
+import math
 import signal
-from argparse import Namespace
+from argparse import Namespace, _ArgumentGroup
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_parameters, command, group, parameters_of, show
+from edgevpr.cli.shared import add_json, add_map_images, add_parameters, command, group, parameters_of, positive, show
+from edgevpr.cli.wording import of_rehearsal
 from edgevpr.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from edgevpr.frames.positions import GeoTag
 
 # The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
+_Numbers = Mapping[str, tuple[float | None, float, float, str]]
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
-_NUMBERS = {
+_NUMBERS: _Numbers = {
     "height_m": (None, 1.0, 10_000.0, "over the ground (default: that of the track)"),
     "every_m": (20.0, 1.0, 1e6, "from picture to picture of a mission (20)"),
     "fov_deg": (66.0, 5.0, 120.0, "angle of view across the picture (66)"),
 }
+# A second of the way, which leaves time for a query, and lets one picture show most of the next.
+_REHEARSED: _Numbers = {**_NUMBERS, "every_m": (10.0, 1.0, 1e6, "from picture to picture, flown at 10 m/s (10)")}
 
 
 def add(commands: Any) -> None:
@@ -32,6 +41,12 @@ def add(commands: Any) -> None:
     autopilot.add_argument(
         "--no-gps", action="store_true", help="it has lost GPS, as it always has without --track: then it takes fixes"
     )
+    autopilot.add_argument(
+        "--gps-s",
+        type=positive,
+        metavar="X",
+        help="GPS is lost X seconds after the start of --track, as a wind of 6 m/s comes up that it does not know",
+    )
     add_parameters(autopilot, f"a parameter of the vehicle, e.g. {_PARAMETER}, as if set before it was started")
     add_json(autopilot)
     text = "write a flight, generated or over an orthophoto: images and positions.csv"
@@ -39,17 +54,30 @@ def add(commands: Any) -> None:
     flight.add_argument("out", metavar="DIR")
     flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (default), or a later one")
     flight.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another landscape and sway (1)")
-    over = flight.add_argument_group("over an orthophoto")
-    over.add_argument("--orthophoto", metavar="FILE", help="as for `map build`: needs rasterio")
+    _add_over(flight.add_argument_group("over an orthophoto"), _NUMBERS)
+    text = "fly a mission over another orthophoto than the map's, and say what to expect of it; GPS is lost on the way"
+    rehearsal = command(simulations, "rehearsal", simulate_rehearsal, text)
+    rehearsal.add_argument("map", metavar="MAP")
+    rehearsal.add_argument("out", metavar="DIR", help="a new folder, for pictures, log and report.html")
+    rehearsal.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another sway (1)")
+    _add_over(rehearsal.add_argument_group("the flight"), _REHEARSED, required=True)
+    add_map_images(rehearsal)
+    add_json(rehearsal)
+    demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
+    demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
+
+
+def _add_over(over: _ArgumentGroup, numbers: _Numbers, required: bool = False) -> None:
+    """Add the flags of a flight over an orthophoto."""
+    over.add_argument("--orthophoto", required=required, metavar="FILE", help="as for `map build`: needs rasterio")
     over.add_argument(
         "--track",
+        required=required,
         metavar="FILE",
         help="a mission, or a positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
     )
-    for name, (*_, text) in _NUMBERS.items():
+    for name, (*_, text) in numbers.items():
         over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
-    demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
 
 
 def simulate_autopilot(args: Namespace) -> int:
@@ -60,15 +88,17 @@ def simulate_autopilot(args: Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it says what it has heard
     track = read_track(args.track) if args.track else None
     has_gps = track is not None and not args.no_gps
+    if args.gps_s and not has_gps:
+        raise UsageError("--gps-s goes with --track, and without --no-gps: there is no GPS to be lost.")
+    flight: dict[str, Any] = {"track": track, "gps": has_gps, "gps_until_s": args.gps_s or math.inf}
     parameters = parameters_of(args.param, _PARAMETER)
-    show(run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=has_gps, parameters=parameters), args.json)
+    show(run_autopilot(args.link, vehicle=args.vehicle, parameters=parameters, **flight), args.json)
     return 0
 
 
 def simulate_flight(args: Namespace) -> int:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
-    if args.seed < 0:
-        raise UsageError(f"--seed is {args.seed}: give 0 or more.")
+    _require_seed(args)
     if args.orthophoto is None:
         if said := [name for name in ("track", *_NUMBERS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
@@ -84,15 +114,10 @@ def simulate_flight(args: Namespace) -> int:
 
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import read_shots, write_rehearsal
+    from edgevpr.lab.simulate.rehearsal import write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
-    numbers: dict[str, Any] = {}
-    for name, (usual, least, most, _) in _NUMBERS.items():
-        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
-        if value is not None and not least <= value <= most:  # false for NaN
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
-    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
+    shots, numbers = _shots_of(args, _NUMBERS)
     taken = write_rehearsal(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
@@ -100,6 +125,43 @@ def _fly_over(args: Namespace) -> str:
         f"{args.out}: {written} images in images/, where they were taken in positions.csv"
         f"{beyond if written < len(shots) else ''}"
     )
+
+
+def _shots_of(args: Namespace, known: _Numbers) -> "tuple[list[GeoTag], dict[str, Any]]":
+    """Return the pictures to take along the track, and the numbers that the flags give."""
+    from edgevpr.lab.simulate.rehearsal import read_shots
+
+    numbers: dict[str, Any] = {}
+    for name, (usual, least, most, _) in known.items():
+        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
+        if value is not None and not least <= value <= most:  # false for NaN
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
+    return read_shots(args.track, numbers["height_m"], numbers["every_m"]), numbers
+
+
+def _require_seed(args: Namespace) -> None:
+    if args.seed < 0:
+        raise UsageError(f"--seed is {args.seed}: give 0 or more.")
+
+
+def simulate_rehearsal(args: Namespace) -> int:
+    """Run `simulate rehearsal`: rehearse a mission over a map, and print what to expect of it."""
+    from edgevpr.lab.simulate.mission import Mission, answer_of, rehearse
+
+    _require_seed(args)
+    shots, numbers = _shots_of(args, _REHEARSED)
+    mission = Mission(
+        place_map=args.map,
+        shots=shots,
+        orthophoto=args.orthophoto,
+        every_m=numbers["every_m"],
+        fov_deg=numbers["fov_deg"],
+        seed=args.seed,
+        map_images=args.map_images,
+    )
+    found = rehearse(mission, Path(args.out))
+    show(found, args.json, of_rehearsal(answer_of(found), found, args.out))
+    return 0
 
 
 def run_demo(args: Namespace) -> int:

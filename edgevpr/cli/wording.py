@@ -9,6 +9,7 @@ from edgevpr.cli.shared import lines_of
 from edgevpr.core.text import aligned, nines, shown
 
 if TYPE_CHECKING:
+    from edgevpr.lab.simulate.foreseen import Foreseen
     from edgevpr.mapmaking.making import MadeMap
     from edgevpr.mapmaking.refine import Refined
     from edgevpr.places.examine import MapCheck
@@ -127,6 +128,29 @@ def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
     yield f"{found['alike']} of {found['alike'] + len(others)} queries end alike{largest}"
     if why_ended:
         yield f"It ends before the flight: {why_ended}."
+
+
+def of_rehearsal(answer: str, found: "Foreseen", folder: str) -> Iterator[str]:
+    """Yield what a rehearsed mission lets expect: the answer, its figures, and where nothing was recognised."""
+    yield answer
+    known_s = f"{found.gps_until_s:.0f} s"
+    yield f"  queries          {found.queries} along {found.way_m / 1e3:.1f} km, with GPS for the first {known_s}"
+    yield f"  accepted         {found.accepted}, {found.wrong} of them wrong ({found.wrong_from_m:.0f} m off or more)"
+    yield f"  longest gap      {found.longest_gap_s:.0f} s without an accepted match"
+    for name, error in (
+        ("matches off by", found.match_error),
+        ("positions sent", found.sent_error),
+        ("autopilot", found.autopilot_error),
+    ):
+        said = "there were none"
+        if error:
+            said = f"median {error.median_m:.1f} m, 90 % within {error.p90_m:.1f} m, largest {error.most_m:.1f} m"
+        yield f"  {name:<16} {said}{'' if name == 'matches off by' else ', without GPS'}"
+    for each in found.unrecognised:
+        where = f"{each.lasts_s:.0f} s around {each.lat_deg:.5f}, {each.lon_deg:.5f}"
+        beyond = "" if each.on_map else ", beyond the map"
+        yield f"  nothing found    {each.from_m / 1e3:.2f} to {each.to_m / 1e3:.2f} km of the way: {where}{beyond}"
+    yield f"  page             {folder}/report.html"
 
 
 def _first(texts: list[str]) -> list[str]:

@@ -75,9 +75,12 @@ class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
     `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
-    seconds after its start; it is `span_s` long."""
+    seconds after its start; it is `span_s` long. `truth` names the positions by which matches are judged, and `notes`
+    are sentences for the head of its page."""
 
     path: Path
+    truth: str = "GPS"
+    notes: tuple[str, ...] = ()
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album
 from edgevpr.review.html import figure, figures, heading, section
-from edgevpr.review.logged import LoggedQuery, read_lines
+from edgevpr.review.logged import LoggedFlight, read_lines
 from edgevpr.review.queries import few, layers_of, steps_of
 from edgevpr.review.steps import Explored, Thresholds, counts, stepped
 from edgevpr.runtime.recognise.confidence import model_of
@@ -46,13 +46,14 @@ def match_page_of(
     ("seen") and of the map ("place"), `name` is that of the map, `lens` that of the camera. `sure` judged the matches
     (None: they were judged by fixed limits)."""
     flight = read_lines(map(dict, lines), Path())
+    flight.truth = "GPS tags"
     queries = flight.queries
     refused = (few(query.reason) for query in queries if not query.accepted)
-    above = [heading(f"Matches in {name}", [f"{len(queries)} pictures"]), section("", _figures(queries))]
+    above = [heading(f"Matches in {name}", [f"{len(queries)} pictures"]), section("", _figures(flight))]
     explored = Explored(
         unit="query",
         ground=ground,
-        layers=layers_of(ground, flight, "GPS tags"),
+        layers=layers_of(ground, flight),
         steps=[
             replace(step, title=step.title.partition(" – ")[2], t_s=None, lanes=()) for step in steps_of(ground, flight)
         ],
@@ -64,7 +65,8 @@ def match_page_of(
     return stepped(f"Matches in {name}", above, explored, [section("Why matches were refused", counts(refused))])
 
 
-def _figures(queries: Sequence[LoggedQuery]) -> str:
+def _figures(flight: LoggedFlight) -> str:
+    queries, truth = flight.queries, flight.truth
     placed = [query for query in queries if query.at]
     off_m = [query.off_m for query in queries if query.off_m is not None]
     accuracies_m = [query.accuracy_m for query in placed if query.accuracy_m is not None]
@@ -72,8 +74,8 @@ def _figures(queries: Sequence[LoggedQuery]) -> str:
         "queries": str(len(queries)),
         "accepted": f"{sum(query.accepted for query in queries)}",
         "accuracy, median": figure(median(accuracies_m) if accuracies_m else None, "m"),
-        "from GPS tags, median": figure(median(off_m) if off_m else None, "m"),
-        "from GPS tags, most": figure(max(off_m, default=None), "m"),
+        f"from {truth}, median": figure(median(off_m) if off_m else None, "m"),
+        f"from {truth}, most": figure(max(off_m, default=None), "m"),
     }
     return figures(known)
 

@@ -61,7 +61,7 @@ def page_of(
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
     `no_ground` is a sentence on why there is no `ground`. `thresholds` are those of other precisions (None: unknown).
     """
-    queries, moments = flight.queries, list(enumerate(worst(flight.queries), start=1))
+    queries, moments = flight.queries, list(enumerate(worst(flight.queries, flight.truth), start=1))
     positions = ((str(at), query.at or query.autopilot_at or query.gps_at) for at, (query, _) in moments)
     time = text(flight.start, "time") or next((text(each.line, "time") for each in queries), None)
     title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
@@ -70,7 +70,7 @@ def page_of(
     fixes = [query.fix for query in queries if query.fix and query.fix.outcome is not FixOutcome.CONTINUOUS]
     above = [
         heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
-        section("", _figures(queries, len(flight.between))),
+        section("", _figures(flight)),
         notes(_notes(flight, bool(ground), no_ground)),
     ]
     below = [
@@ -109,7 +109,8 @@ def lens_of(start: Mapping[str, Any]) -> "Lens | None":
     return Lens(fov_deg, up_deg or 0.0)
 
 
-def _figures(queries: Sequence[LoggedQuery], between: int) -> str:
+def _figures(flight: LoggedFlight) -> str:
+    queries, between = flight.queries, len(flight.between)
     outcomes = Counter(query.fix.outcome for query in queries if query.fix)
     sent = sum(outcomes[outcome] for outcome in (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED))
     accepted = sum(query.accepted for query in queries)
@@ -120,8 +121,8 @@ def _figures(queries: Sequence[LoggedQuery], between: int) -> str:
         "accepted": f"{accepted}{share}",
         "fixes sent": f"{sent} <small>and {between} between matches</small>" if between else str(sent),
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
-        "from GPS, median": figure(median(off_m) if off_m else None, "m"),
-        "from GPS, most": figure(max(off_m, default=None), "m"),
+        f"from {flight.truth}, median": figure(median(off_m) if off_m else None, "m"),
+        f"from {flight.truth}, most": figure(max(off_m, default=None), "m"),
         "charge": figure(_most(queries, "totals", "used_mah"), "mAh"),
         "RAM, most": figure(_most(queries, "costs", "rss_mb"), "MB"),
         "hottest": figure(_most(queries, "board", "temperature_c"), "°C"),
@@ -147,7 +148,7 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
         ),
         (not no_ground, no_ground),
     ]
-    return [sentence for is_there, sentence in known if not is_there]
+    return [*flight.notes, *(sentence for is_there, sentence in known if not is_there)]
 
 
 def _charts(flight: LoggedFlight) -> str:
@@ -160,7 +161,7 @@ def _charts(flight: LoggedFlight) -> str:
         Series(name, name, _points((query, query.confidence) for query in queries if query.accepted is accepted), True)
         for name, accepted in (("accepted", True), ("refused", False))
     ]
-    off_gps = Series("from GPS", "gps", _points((query, query.off_m) for query in queries), True)
+    off_gps = Series(f"from {flight.truth}", "gps", _points((query, query.off_m) for query in queries), True)
     accuracy = Series("accuracy, 1 sigma", "accepted", _points((query, query.accuracy_m) for query in queries), True)
     took = [
         over("encode", "gps", 1e3, "costs", "t_encode_s"),
@@ -191,24 +192,26 @@ def _over(queries: Sequence[LoggedQuery], *keys: str) -> Points:
     return _points((query, number(query.line, *keys)) for query in queries)
 
 
-def worst(queries: Sequence[LoggedQuery]) -> list[Moment]:
+def worst(queries: Sequence[LoggedQuery], truth: str = "GPS") -> list[Moment]:
     """Return the worst moments, at most `_MOST`, each (query, sentence on why it is shown). The kinds that could have
-    been dangerous come first, and of each kind the worst moments."""
+    been dangerous come first, and of each kind the worst moments. `truth` names the positions by which matches are
+    judged."""
     chosen: list[Moment] = []
     shown_of = Counter[int]()
-    for kind, _, query, sentence in sorted([*_dangers(queries), *_silences(queries)], key=lambda each: each[:2]):
+    for kind, _, query, sentence in sorted([*_dangers(queries, truth), *_silences(queries)], key=lambda each: each[:2]):
         if shown_of[kind] < _OF_A_KIND and all(abs(query.t_s - other.t_s) > _NEAR_S for other, _ in chosen):
             shown_of[kind] += 1
             chosen.append((query, sentence))
     return chosen[:_MOST]
 
 
-def _dangers(queries: Sequence[LoggedQuery]) -> Iterator[_Ranked]:
+def _dangers(queries: Sequence[LoggedQuery], truth: str) -> Iterator[_Ranked]:
     """Yield the queries that may be worth a look: those of kind 0 to 2 could have been dangerous."""
+    doubt = ": one of both is wrong" if truth == "GPS" else ""
     for query in queries:
         why = query.fix.why if query.fix else None
         if query.off_m is not None and query.off_m > _FAR_M:
-            yield 0, -query.off_m, query, f"The match lies {query.off_m:.0f} m from GPS: one of both is wrong."
+            yield 0, -query.off_m, query, f"The match lies {query.off_m:.0f} m from {truth}{doubt}."
         elif query.fix and query.fix.outcome is FixOutcome.REFUSED:
             yield 1, 0.0, query, f"The autopilot refused the fix: {why}."
         elif why and why.startswith("held back"):  # not sent because it contradicts the autopilot

@@ -57,16 +57,15 @@ def _became(flight: LoggedFlight) -> list[list[str]]:
     ]
 
 
-def layers_of(ground: Sequence[Place], flight: LoggedFlight, gps: str = "GPS") -> list[Layer]:
-    """Return the layers of the drawing, from the bottom to the top. Those without points are left out. `gps` names the
-    positions of the receiver."""
+def layers_of(ground: Sequence[Place], flight: LoggedFlight) -> list[Layer]:
+    """Return the layers of the drawing, from the bottom to the top. Those without points are left out."""
     queries = flight.queries
     layers = [
         Layer("places of the map", "places", [[at_of(place) for place in ground]]),
         Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
-        Layer(gps, "gps", _known_ways(query.gps_at for query in queries), "line"),
+        Layer(flight.truth, "gps", _known_ways(query.gps_at for query in queries), "line"),
         Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), "line"),
         Layer("refused there", "missed", [[at for query in queries if (at := _missed_at(query))]]),
         Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
@@ -92,12 +91,12 @@ def steps_of(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
     places = {place.place_id: place for place in ground}
     lane_of = {name: at for at, (name, *_) in enumerate(lanes_of(flight))}
     return [
-        _step(query, places.get(query.place or 0), [lane_of[name] for name in names])
+        _step(query, places.get(query.place or 0), [lane_of[name] for name in names], flight.truth)
         for query, names in zip(flight.queries, _became(flight), strict=True)
     ]
 
 
-def _step(query: LoggedQuery, place: Place | None, lanes: Sequence[int]) -> Step:
+def _step(query: LoggedQuery, place: Place | None, lanes: Sequence[int], truth: str) -> Step:
     fix = query.fix
     known = {
         "found": query.place_at,
@@ -114,7 +113,7 @@ def _step(query: LoggedQuery, place: Place | None, lanes: Sequence[int]) -> Step
         pictures.append(("place", image, f"place found: {image}"))
     return Step(
         title=f"{clock(query.t_s)} – {query.name}: {'accepted' if query.accepted else 'refused'}",
-        said=[found(query), _where(query), query.reason, fixed or ""],
+        said=[found(query), _where(query, truth), query.reason, fixed or ""],
         groups=[verdict, *([NUMBER.sub("…", fixed)] if fixed else [])],
         at={name: at for name, at in known.items() if at},
         circle_m=query.accuracy_m if query.at else None,
@@ -135,9 +134,9 @@ def found(query: LoggedQuery) -> str:
     return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{sure}"
 
 
-def _where(query: LoggedQuery) -> str:
+def _where(query: LoggedQuery, truth: str) -> str:
     good = "" if query.accuracy_m is None else f", good to {figure(query.accuracy_m, 'm')}"
-    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from GPS"
+    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from {truth}"
     return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{good}{off}" if query.at else ""
 
 

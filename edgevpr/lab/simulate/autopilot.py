@@ -3,6 +3,7 @@ port and to the clock. Used by `edgevpr simulate` and by tests. A *companion* is
 that runs edgevpr."""
 
 import logging
+import math
 import select
 import threading
 import time
@@ -47,17 +48,19 @@ def run_autopilot(
     track: FlownTrack | None = None,
     vehicle: str = "arduplane",
     gps: bool = False,
+    gps_until_s: float = math.inf,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
     """Simulate an autopilot at `link_url` with `serve`. Its UTC is that of this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
-    and accepts no fix. `parameters` (name to value as text) are set before the start. Raises LinkError if the link
-    cannot be opened, UsageError for an unknown parameter, and for a wrong value.
+    and accepts no fix, until `gps_until_s` seconds of the track (see `FlightController`). `parameters`
+    (name to value as text) are set before the start. Raises LinkError if the link cannot be opened, UsageError for an
+    unknown parameter, and for a wrong value.
     """
     motion = AlongTrack(track) if track else Motion()
-    controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
+    controller = FlightController(vehicle, motion, gps=gps, gps_until_s=gps_until_s, start_utc_s=time.time())
     for name, text in parameters.items():
         controller.brain.parameters.set_written(name, text)
     return serve(controller, link_url, stop)

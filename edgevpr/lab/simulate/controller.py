@@ -20,21 +20,30 @@ VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "px4-plane": lambda motion: Px4("plane", motion),
 }
 _HEARTBEAT_HZ = 1.0
+_UNKNOWN_WIND_M_S = 6.0
 # Messages that do not exist where the position of the vehicle is unknown.
 _WHERE = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN}
 
 
 class FlightController:
     """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
-    start. `start_utc_s` is its UTC at the start, seconds since 1970. `answers` are the replies (MAV_RESULT)
+    start; with it, it loses GPS `gps_until_s` seconds after the start of its track, as a wind of 6 m/s comes up that it
+    does not know. `start_utc_s` is its UTC at the start, seconds since 1970. `answers` are the replies (MAV_RESULT)
     to the fixes received, and `reports` the functions that make its messages, by message number. `brain` is the
     simulated firmware."""
 
     def __init__(
-        self, vehicle: str, motion: Motion, *, gps: bool, system_id: int = 1, start_utc_s: float = 1_770_000_000.0
+        self,
+        vehicle: str,
+        motion: Motion,
+        *,
+        gps: bool,
+        gps_until_s: float = math.inf,
+        system_id: int = 1,
+        start_utc_s: float = 1_770_000_000.0,
     ) -> None:
         self.brain = VEHICLES[vehicle](motion)
-        self.vehicle, self.system_id = vehicle, system_id
+        self.vehicle, self.system_id, self._gps_until_s = vehicle, system_id, gps_until_s
         self.answers: list[int] = []
         known = {**REPORTS, self.brain.filter_report: FILTER_REPORTS[self.brain.filter_report]}
         self.reports: dict[int, Report] = {
@@ -66,6 +75,10 @@ class FlightController:
         said = []
         while self.brain.now_s + STEP_S <= now_s:
             self.brain.step(STEP_S)
+            if self.brain.truth.t_s >= self._gps_until_s:
+                self._gps_until_s = math.inf
+                self.set("SIM_GPS1_ENABLE", 0)
+                self.set("SIM_WIND_SPD", _UNKNOWN_WIND_M_S)
             for number, interval_s in self._interval_s.items():
                 if self.brain.now_s >= self._due_s[number]:
                     self._due_s[number] = max(self._due_s[number] + interval_s, self.brain.now_s)

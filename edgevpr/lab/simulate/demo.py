@@ -1,8 +1,5 @@
 """The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
 
-import socket
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.core.types import Position
@@ -29,6 +25,7 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.lab.simulate.processes import autopilot_process, run_to_end
 from edgevpr.runtime.flight.flightlog import flight_of
 
 _SEED = 1
@@ -120,26 +117,10 @@ def _fly(folder: Path) -> None:
     """Map the first flight of a demonstration and fly the second one."""
     first, second = folder / "flight-1" / "images", folder / "flight-2" / "images"
     map_path, log_path = folder / "map.gpkg", folder / "flight.jsonl"
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
-    build = ("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
-    fly = ("--link", f"udpout:{address}", "--log", log_path)
     # The flight controller is started first: it listens long before the map is built.
-    command = _command("simulate", "autopilot", "--link", f"udpin:{address}")
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as autopilot:
-        try:
-            for step in (build, ("run", "--map", map_path, "--source", second, *_CAMERA, *fly)):
-                done = subprocess.run(_command(*step), stdout=subprocess.DEVNULL)
-                if done.returncode:
-                    said = f"`{' '.join(done.args[2:])}` ended with exit code {done.returncode}"
-                    raise EdgevprError(f"{said}: see what it said above.")
-        finally:
-            autopilot.terminate()
-
-
-def _command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "edgevpr", *map(str, arguments)]
+    with autopilot_process() as link:
+        run_to_end("map", "build", map_path, "--images", first, *_CAMERA, "--technique", "cohog", "--no-calibrate")
+        run_to_end("run", "--map", map_path, "--source", second, *_CAMERA, "--link", link, "--log", log_path)
 
 
 def read_answers(log_path: Path, mapped: Path, flown: Path) -> list[JudgedAnswer]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import moved, offset_m, shorter_deg
 from edgevpr.frames.positions import read_positions
 
 
@@ -95,8 +95,8 @@ def read_track(csv_path: str | Path) -> list[TrueState]:
 
 
 def truth_at(track: FlownTrack, t_s: float) -> TrueState:
-    """Return the state on a track at `t_s` seconds from its start. Before and after the track the vehicle stands still.
-    Height and angles are not interpolated: they are those of the point passed last."""
+    """Return the state on a track at `t_s` seconds from its start. Before and after the track the vehicle stands
+    still."""
     leg = bisect_right(track, t_s, key=lambda state: state.t_s)  # it ends at the point of this index
     passed = track[max(0, leg - 1)]
     if not 0 < leg < len(track):
@@ -104,14 +104,21 @@ def truth_at(track: FlownTrack, t_s: float) -> TrueState:
     ahead = track[leg]
     share = (t_s - passed.t_s) / (ahead.t_s - passed.t_s)
     way_m = from_to(passed.lat_deg, passed.lon_deg, ahead.lat_deg, ahead.lon_deg)
+    angles = {name: getattr(passed, name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
     return replace(
         passed,
         lat_deg=passed.lat_deg + share * (ahead.lat_deg - passed.lat_deg),
         lon_deg=passed.lon_deg + share * (ahead.lon_deg - passed.lon_deg),
         alt_m=passed.alt_m + share * (ahead.alt_m - passed.alt_m),
+        height_m=_between(passed.height_m, ahead.height_m - passed.height_m, share),
         velocity_m_s=way_m / (ahead.t_s - passed.t_s),
+        **{name: _between(angle, shorter_deg(getattr(ahead, name) - angle), share) for name, angle in angles.items()},
         t_s=t_s,
     )
+
+
+def _between(value: float, change: float, share: float) -> float:
+    return value if math.isnan(change) else value + share * change
 
 
 def from_to(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> complex:

@@ -19,7 +19,7 @@ from edgevpr.mapmaking.cuttings import MOST_WITHOUT_DATA, extent_words
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
-_SPEED_M_S = 10.0
+SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # the most roll, pitch and yaw off a track that tells none
 _START_UTC_S = 1_771_029_000.0
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # the shadows stay those of the orthophoto
@@ -48,7 +48,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
         if (way_m := float(distance_m(*here, *there))) > 0:
             east_m, north_m = offset_m(*here, *there)
             course_deg = float(np.degrees(np.arctan2(east_m, north_m)) % 360)
-        t_s += way_m / _SPEED_M_S if number else 0.0
+        t_s += way_m / SPEED_M_S if number else 0.0
         heading_deg = course_deg if shot.heading_deg is None else shot.heading_deg
         flown.append(replace(shot, height_m=over_m, heading_deg=heading_deg, t_utc_s=t_s))
     return flown

@@ -92,7 +92,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
     assert north == sorted(north)
     assert len(set(north)) >= 2, "on the way, too"
     assert (seen[-1].lat_deg, seen[-1].lon_deg, seen[-1].alt_m, seen[-1].heading_deg) == (50.002, 8.0, 110.0, 90.0)
-    assert seen[0].heading_deg in (0.0, 90.0)
+    assert 0 <= seen[0].heading_deg <= 90
     east_m_s, north_m_s = seen[-1].velocity_m_s
     assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
 
@@ -125,6 +125,29 @@ def test_it_says_how_fast_it_flies_along_the_track():
     assert [each.imag for each in velocities] == pytest.approx([each.imag for each in expected], abs=0.01), (
         "north first"
     )
+
+
+def test_between_two_points_of_a_track_it_turns_the_shorter_way_and_keeps_what_is_not_known():
+    one = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=2, heading_deg=350, height_m=80)
+    other = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=-2, heading_deg=20, height_m=90, t_s=2)
+    here = truth_at([one, other], 1.0)
+    assert (here.roll_deg, here.heading_deg % 360, here.height_m) == pytest.approx((0, 5, 85))
+    assert math.isnan(here.pitch_deg)
+    assert truth_at([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
+
+
+def test_it_loses_gps_on_its_way_in_a_wind_that_it_does_not_know():
+    ends = (0.0, 50.0), (60.0, 50.01)
+    track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=8.0, alt_m=0.0) for t_s, lat_deg in ends]
+    controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=20)
+    controller.brain.motion.begin(0.0)
+    controller.advance(19.5)
+    assert (controller.brain.receivers.first.fix_type, round(controller.error_m, 1)) == (6, 0)
+    controller.advance(22.0)
+    assert controller.brain.receivers.first.fix_type == 1
+    controller.advance(40.0)
+    assert 60 < controller.error_m < 6 * 20
+    assert controller.hear(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
