@@ -13,8 +13,9 @@ from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
+from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
 from edgevpr.mapmaking.missions import Area
-from edgevpr.mapmaking.orthophoto import CRS, WGS84, Orthophoto, geometry_mask, local_crs, rasterio, transform
+from edgevpr.mapmaking.orthophoto import Orthophoto
 
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
