@@ -84,7 +84,7 @@ def simulate_flight(args: Namespace) -> int:
 
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import read_shots, write_rehearsal
+    from edgevpr.lab.simulate.rehearsal import ground_under, read_shots, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
@@ -93,7 +93,8 @@ def _fly_over(args: Namespace) -> str:
         if value is not None and not least <= value <= most:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
-    taken = write_rehearsal(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
+    orthophoto = Orthophoto(args.orthophoto, ground_under(shots, numbers["fov_deg"]))
+    taken = write_rehearsal(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
     return (

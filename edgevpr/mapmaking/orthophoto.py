@@ -1,6 +1,7 @@
 """An orthophoto, from which pictures of squares of ground are cut: sides in metres on the ground, true north at the
 top. `cuttings` makes the frames of a map from them."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -8,12 +9,14 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
-from edgevpr.core.errors import SourceError
+from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resized
+from edgevpr.mapmaking.addresses import AddressTiles, described_wmts, host_of, is_address
 from edgevpr.mapmaking.georaster import (
     CRS,
+    HALF_WORLD_M,
     WGS84,
     CPLE_BaseError,
     GeoRaster,
@@ -22,7 +25,8 @@ from edgevpr.mapmaking.georaster import (
     rasterio,
     transform,
 )
-from edgevpr.mapmaking.tiles import TileFolder
+from edgevpr.mapmaking.tilefiles import tiles_in
+from edgevpr.mapmaking.tiles import TILE_PX, FolderTiles, Ground, TileRaster
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
@@ -30,16 +34,39 @@ _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
-class Orthophoto:
-    """An open orthophoto. `extent_deg` is its bounding box (south, west, north, east), `middle` its middle, and
-    `resolution_m` the length in metres of a pixel on the ground in the middle."""
+def _raster_of(source: str | Path, ground: Ground | None) -> GeoRaster | TileRaster:
+    """Open a file, a folder of tiles, or an address, see `Orthophoto`."""
+    if is_address(source):
+        address = str(source)
+        if ground is None:
+            raise UsageError(f"{host_of(address)} has tiles of the whole Earth: give --area.")
+        if address.lower().startswith("wmts:"):
+            return GeoRaster(described_wmts(address), host_of(address), ground.extent_deg)
+        return TileRaster(AddressTiles(address), ground)
+    path, kind = Path(source), ""
+    if not path.exists() and "#" in path.name:
+        path, kind = path.with_name(path.name.rpartition("#")[0]), path.name.rpartition("#")[2]
+    if not path.exists():
+        raise SourceError(f"There is no orthophoto {source}: check the name.")
+    if path.is_dir():
+        return TileRaster(FolderTiles(path), ground)
+    store = tiles_in(path, kind)
+    return TileRaster(store, ground) if store else GeoRaster(path)
 
-    def __init__(self, path: str | Path) -> None:
-        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
-        self.path = Path(path)
-        if not self.path.exists():
-            raise SourceError(f"There is no orthophoto {path}: check the name.")
-        self._raster = TileFolder(self.path) if self.path.is_dir() else GeoRaster(self.path)
+
+class Orthophoto:
+    """An open orthophoto. `name` names it in messages, and `short_name` the pictures cut from it. `extent_deg` is its
+    bounding box (south, west, north, east), `middle` its middle, and `resolution_m` the length in metres of a pixel on
+    the ground in the middle."""
+
+    def __init__(self, source: str | Path, ground: Ground | None = None) -> None:
+        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, PMTiles, a tile cache (FILE#MAP if it has several
+        maps), a folder of map tiles, or an address of tiles. `ground`: that of tiles which is wanted (None: all).
+        Raises SourceError, and UsageError for an address or a map that is not said in full."""
+        self._raster = _raster_of(source, ground)
+        self.name, self.short_name = self._raster.name, self._raster.short_name
+        is_mercator = self._raster.crs == CRS.from_epsg(3857)
+        self._turn = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
             columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
             (lon_deg,), (lat_deg,) = self._through(columns, rows, WGS84)
@@ -50,8 +77,8 @@ class Orthophoto:
         if not np.isfinite((lats_deg, lons_deg)).all():
             self.close()
             raise SourceError(
-                f"{path}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to latitude "
-                "and longitude: export it with another, such as UTM or EPSG:4326."
+                f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to "
+                "latitude and longitude: export it with another, such as UTM or EPSG:4326."
             )
         lons_deg = self.middle.lon_deg + (lons_deg - self.middle.lon_deg + 180) % 360 - 180
         self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
@@ -74,12 +101,15 @@ class Orthophoto:
     def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
         """Convert points (N, 2), in metres (east, north) of `at`, to pixels (column, row), float64 (N, 2). Whole
         numbers are the corners of pixels."""
-        raster = self._raster
-        x, y = (np.array(each) for each in transform(local_crs(at), raster.crs, *points_m.T))
-        if raster.crs.is_geographic:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
+        return np.column_stack(self._in_file(*transform(local_crs(at), self._raster.crs, *points_m.T)))
+
+    def _in_file(self, x: Sequence[float], y: Sequence[float]) -> tuple[Doubles, Doubles]:
+        """Convert points from the coordinate system of the file to pixels: columns and rows, float64 (N,) each."""
+        raster, across = self._raster, np.array(x)
+        if self._turn:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
             middle, _ = _moved(raster.transform, raster.width / 2, raster.height / 2)
-            x += 360 * np.round((middle - x) / 360)
-        return np.column_stack(_moved(~raster.transform, x, y))
+            across += self._turn * np.round((middle - across) / self._turn)
+        return _moved(~raster.transform, across, np.array(y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
@@ -92,7 +122,7 @@ class Orthophoto:
         if not np.isfinite(corners).all():
             return _nothing(side_px)
         across_px = np.hypot(*(corners[1] - corners[0]))
-        shrink = 1 << min(int(np.log2(max(across_px / side_px, 1))), _MOST_HALVINGS)
+        shrink = _shrink(across_px, side_px)
         size = np.array([self._raster.width, self._raster.height])
         low = np.clip(corners.min(axis=0) - 2 * shrink, 0, size).astype(int) // shrink * shrink
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
@@ -115,6 +145,29 @@ class Orthophoto:
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen
 
+    def to_fetch(
+        self, lat_deg: Doubles, lon_deg: Doubles, footprint_m: float, side_px: int
+    ) -> tuple[int, Iterator[None]] | None:
+        """Return how many tiles the pictures that `cut` makes at the places `lat_deg` and `lon_deg` need from an
+        address, and the steps that fetch them. GDAL, which reads WMTS, fetches them later, less those that it has kept.
+        None: it is no address."""
+        raster = self._raster
+        store = raster.store if isinstance(raster, TileRaster) else None
+        if not isinstance(store, AddressTiles) and not (isinstance(raster, GeoRaster) and raster.host):
+            return None
+        across_px = footprint_m / self.resolution_m
+        shrink = _shrink(across_px, side_px)
+        tile_px = raster.tile_px if isinstance(raster, TileRaster) else TILE_PX * shrink
+        middles = np.column_stack(self._in_file(*transform(WGS84, raster.crs, lon_deg, lat_deg)))
+        reach_px = across_px / 2 + 2 * shrink
+        low, high = (((middles + side) // tile_px).astype(int) for side in (-reach_px, reach_px))
+        steps = np.indices((high - low).max(axis=0) + 1).reshape(2, -1).T
+        tiles = np.unique(np.concatenate([np.minimum(low + step, high) for step in steps]), axis=0)
+        if not isinstance(raster, TileRaster) or not isinstance(store, AddressTiles):
+            return len(tiles), iter(())
+        missing = store.missing(raster.zoom, (raster.tile_at(*each) for each in tiles.tolist()))
+        return len(missing), store.fetch(raster.zoom, missing)
+
     def close(self) -> None:
         """Close the file."""
         self._raster.close()
@@ -123,6 +176,11 @@ class Orthophoto:
 def _moved(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
+
+
+def _shrink(across_px: float, side_px: int) -> int:
+    """Return by which power of two the pixels of a file are averaged when so many become `side_px`."""
+    return 1 << min(int(np.log2(max(across_px / side_px, 1))), _MOST_HALVINGS)
 
 
 def _nothing(side_px: int) -> tuple[Image, Bools]:
