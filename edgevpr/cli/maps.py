@@ -126,7 +126,8 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
-    return Cuttings(orthophoto=args.orthophoto, **{name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO})
+    about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}
+    return Cuttings(orthophoto=args.orthophoto, **about)
 
 
 def map_build(args: Namespace) -> int:

@@ -24,8 +24,8 @@ _UNITS = {
 
 
 class Parser(ArgumentParser):
-    """Parser of a command; where a word is wrong, its error names the one that may be meant. What begins with a negative
-    number is a value, such as that of `--area -35.36,149.16,500`, and no flag."""
+    """Parser of a command; where a word is wrong, its error names the one that may be meant. What begins as a negative
+    number, as in `--area -35.36,149.16,500`, is a value and no flag."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

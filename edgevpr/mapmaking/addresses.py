@@ -153,7 +153,7 @@ def described_wmts(address: str) -> str:
             root.remove(found)
     cache = ElementTree.SubElement(root, "Cache")
     kept = {"Path": _cache_folder(address), "MaxSize": _WMTS_CACHE_BYTES, "Expires": _WMTS_CACHE_S}
-    asked = {"UserAgent": _AGENT, "Timeout": _TIMEOUT_S, "MaxConnections": _CONNECTIONS}
+    asked = {"UserAgent": _AGENT, "Timeout": _TIMEOUT_S}
     for parent, values in ((cache, kept), (root, asked)):
         for name, value in values.items():
             ElementTree.SubElement(parent, name).text = str(value)

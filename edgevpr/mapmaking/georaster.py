@@ -18,6 +18,7 @@ from edgevpr.core.types import Position
 
 # Size of GDAL's cache in MB, read when it is first used. The default is a twentieth of the RAM.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
+os.environ.setdefault("GDAL_MAX_CONNECTIONS", "2")  # to a server of tiles, out of politeness
 
 try:
     import rasterio as rasterio
@@ -88,7 +89,9 @@ class GeoRaster:
             raise SourceError(f"{self.name} has nothing of the area: check the address and the area.")
         (column, row), (self.width, self.height) = low.tolist(), (high - low).tolist()
         self._first = column, row
-        self.transform = self._data.window_transform(Window(column, row, self.width, self.height))
+        at = self.transform
+        x, y = at.c + at.a * column + at.b * row, at.f + at.d * column + at.e * row
+        self.transform = rasterio.Affine(at.a, at.b, x, at.d, at.e, y)
 
     def _colour_bands(self) -> list[int]:
         """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError."""
