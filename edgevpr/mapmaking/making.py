@@ -120,7 +120,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, here, pictures = map_path(order.path), load_board("this"), order.pictures
     is_new = not (order.append and path.exists())
-    if isinstance(pictures, Cuttings) and "://" in pictures.orthophoto and not pictures.attribution:
+    if isinstance(pictures, Cuttings) and "://" in str(pictures.orthophoto) and not pictures.attribution:
         raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
     mask, lens = (None, None) if isinstance(pictures, Cuttings) else (mask_of(config.source.mask), config.source.lens)
     if is_new:
