@@ -33,7 +33,7 @@ from edgevpr.core.text import progress
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import Cuttings, FlownPictures
 
-_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area")
+_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "attribution")
 _OF_A_RECORDING = ("positions", "rate_hz")
 
 
@@ -87,6 +87,7 @@ def _add_build(build: ArgumentParser) -> None:
     build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places a second of a video (default: all)")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
     build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure it is")
+    build.add_argument("--attribution", metavar="TEXT", help="the owner of the orthophoto, as its terms ask for")
     build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
     add_json(build)
 
@@ -95,11 +96,18 @@ def _add_pictures(parser: ArgumentParser) -> None:
     """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
     add_recording(parser, required=False)
     flags = parser.add_argument_group("of an orthophoto, in place of --images")
-    flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
+    flags.add_argument(
+        "--orthophoto",
+        metavar="FILE",
+        help="GeoTIFF, VRT, MBTiles, PMTiles, the tile cache of QGroundControl or Mission Planner, a folder of tiles "
+        "(z/x/y.png), or the address of tiles (https://.../{z}/{x}/{y}.png, WMTS:https://...) that you may use",
+    )
     flags.add_argument("--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture")
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
     flags.add_argument(
-        "--area", metavar="FILE", help="only over this: a mission or GeoJSON (a path: a footprint on either side)"
+        "--area",
+        metavar="AREA",
+        help="only over this: a mission or GeoJSON (a path: a footprint on either side), or LAT,LON,RADIUS_M",
     )
 
 
@@ -118,7 +126,8 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
-    return Cuttings(orthophoto=args.orthophoto, **{name: getattr(args, name) for name in _OF_AN_ORTHOPHOTO})
+    about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}
+    return Cuttings(orthophoto=args.orthophoto, **about)
 
 
 def map_build(args: Namespace) -> int:

@@ -24,7 +24,12 @@ _UNITS = {
 
 
 class Parser(ArgumentParser):
-    """Parser of a command; where a word is wrong, its error names the one that may be meant."""
+    """Parser of a command; where a word is wrong, its error names the one that may be meant. What begins as a negative
+    number, as in `--area -35.36,149.16,500`, is a value and no flag."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message: str) -> NoReturn:
         wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)|unrecognized arguments: (\S+)", message)
@@ -95,7 +100,7 @@ def add_map_images(parser: ArgumentParser) -> None:
         default=[],
         metavar="DIR",
         help="folder with the pictures that the map was made of, repeatable, or its film; if it was cut from an "
-        "orthophoto, that file",
+        "orthophoto, that file or address",
     )
 
 

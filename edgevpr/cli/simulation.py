@@ -114,11 +114,12 @@ def simulate_flight(args: Namespace) -> int:
 
 def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import write_rehearsal
+    from edgevpr.lab.simulate.rehearsal import ground_under, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     shots, numbers = _shots_of(args, _NUMBERS)
-    taken = write_rehearsal(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
+    orthophoto = Orthophoto(args.orthophoto, ground_under(shots, numbers["fov_deg"]))
+    taken = write_rehearsal(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
     return (

@@ -82,6 +82,8 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
         yield f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; {seen}"
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
+    if info.attribution:
+        yield f"  cut from    {info.attribution}"
     if confidence:
         yield f"  confidence  {confidence}"
     yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM"

@@ -1,11 +1,12 @@
 """Distances and projections on the Earth, for flights of some metres to some kilometres. Angles are in degrees."""
 
 import math
+from collections.abc import Iterable
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from edgevpr.core.arrays import Degrees, Doubles, Floats
+from edgevpr.core.arrays import Degrees, Doubles, Floats, LatLon
 
 D = TypeVar("D", float, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
@@ -51,6 +52,15 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
     return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
+
+
+def extent_of(points: Iterable[LatLon]) -> tuple[float, float, float, float]:
+    """Return the bounding box of points (lat, lon): south, west, north, east. East is above 180 degrees if the shorter
+    way from point to point crosses the antimeridian."""
+    lats_deg, lons_deg = zip(*points, strict=True)
+    if max(lons_deg) - min(lons_deg) > 180:
+        lons_deg = tuple(lon_deg % 360 for lon_deg in lons_deg)
+    return min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg)
 
 
 def axes_of(up_deg: float) -> Doubles:

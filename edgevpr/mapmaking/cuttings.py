@@ -2,23 +2,29 @@
 picture that a camera looking straight down would take there, with north at the top."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Ints
+from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
+from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
 from edgevpr.mapmaking.missions import Area
-from edgevpr.mapmaking.orthophoto import CRS, WGS84, Orthophoto, geometry_mask, local_crs, rasterio, transform
+from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.runtime.recognise.landmarks import describe
 
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
+_BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
@@ -74,7 +80,7 @@ class OrthophotoSource(RecordingSource):
         numbers = zip((lattice.rows[at], lattice.columns[at]), lattice.shape, strict=True)
         # With leading zeros, so that names sort in the order of the numbers.
         row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
-        name = f"{decoded_name(self._orthophoto.path.name)}_r{row}_c{column}"
+        name = f"{decoded_name(self._orthophoto.short_name)}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
         position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
@@ -89,6 +95,29 @@ class OrthophotoSource(RecordingSource):
         return Frame(
             image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=self._pose
         )
+
+    def forecast(self, spacing_m: float, technique: Technique) -> str:
+        """Return how much is to be done for a map, in words. It takes one place to try."""
+        lattice, middle = self._lattice, self.total // 2
+        to_fetch = self.to_fetch()
+        began_s = time.perf_counter()
+        at = Position(float(lattice.lat_deg[middle]), float(lattice.lon_deg[middle]))
+        with suppress(ImageError):
+            image, _ = self._orthophoto.cut(at, self._footprint_m, SIDE_PX)
+            technique.encode(image)
+            describe(image)
+        each_s = time.perf_counter() - began_s
+        spec = technique.spec
+        place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
+        size = f"{self.total * spacing_m**2 / 1e6:.2f} km2 of ground, {self.total * place_bytes / 1e6:.1f} MB"
+        tiles = f", of {to_fetch[0]} tiles to fetch from {self._orthophoto.name}" if to_fetch else ""
+        whole_s = self.total * each_s
+        lasts = f"{math.ceil(whole_s)} s" if whole_s < 100 else f"{whole_s / 60:.0f} min"
+        return f"{self.total} places will be cut{tiles}: {size}, about {lasts} without calibration"
+
+    def to_fetch(self) -> tuple[int, Iterator[None]] | None:
+        """See `Orthophoto.to_fetch`."""
+        return self._orthophoto.to_fetch(self._lattice.lat_deg, self._lattice.lon_deg, self._footprint_m, SIDE_PX)
 
     def close(self) -> None:
         """Close the orthophoto."""
@@ -113,7 +142,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     ):
         if not 0 < given_m <= most_m:  # false for NaN
             raise UsageError(
-                f"{flag} is {given_m:g}, and {orthophoto.path} is {size_m[0]:.0f} m by {size_m[1]:.0f} m: give more "
+                f"{flag} is {given_m:g}, and {orthophoto.name} is {size_m[0]:.0f} m by {size_m[1]:.0f} m: give more "
                 "than 0 and no more than that."
             )
     low, high = low + footprint_m / 2, high - footprint_m / 2
@@ -128,7 +157,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
         area_low, area_high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         if not ((area_low <= high) & (area_high >= low)).all():  # false for what cannot be projected, too
             raise UsageError(
-                f"The area does not touch {orthophoto.path}: it is at {extent_words(area.extent_deg)}, the orthophoto "
+                f"The area does not touch {orthophoto.name}: it is at {extent_words(area.extent_deg)}, the orthophoto "
                 f"at {extent_words(orthophoto.extent_deg)}."
             )
         begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
@@ -146,7 +175,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     _require_bounded(len(rows), _MOST_PLACES, spacing_m)
     if not len(rows):
         raise UsageError(
-            f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.path}: give a smaller spacing."
+            f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.name}: give a smaller spacing."
         )
     lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
     shape = (int(count[1]), int(count[0]))

@@ -29,6 +29,7 @@ from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_o
 from edgevpr.runtime.recognise.recogniser import Preparation
 
 if TYPE_CHECKING:
+    from edgevpr.mapmaking.cuttings import OrthophotoSource
     from edgevpr.mapmaking.refine import Refined
 
 _log = logging.getLogger(__name__)
@@ -57,23 +58,26 @@ class FlownPictures:
 class Cuttings:
     """Pictures that are cut from an orthophoto, at the places of a grid.
 
-    `footprint_m`: ground length of a picture's side. `spacing_m`: distance between neighbouring places.
-    `area`: file that limits the places, see `missions.read_area` (None: the whole orthophoto)."""
+    `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side. `spacing_m`: distance between
+    neighbouring places. `area`: file or circle that limits the places, see `missions.read_area` (None: the whole
+    orthophoto). `attribution`: the owner's words, which a map keeps (None: none are asked for)."""
 
     orthophoto: str
     footprint_m: float
     spacing_m: float
     area: str | None = None
+    attribution: str | None = None
 
-    def open(self, only: Collection[str] | None = None) -> Source:
+    def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
         from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of
         from edgevpr.mapmaking.missions import read_area
         from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
+        from edgevpr.mapmaking.tiles import ground_of
 
         area = read_area(self.area) if self.area else None
-        orthophoto = Orthophoto(self.orthophoto)
+        orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, self.footprint_m) if area else None)
         lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area)
         return OrthophotoSource(orthophoto, lattice, self.footprint_m, time.monotonic, only=only)
 
@@ -116,6 +120,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, here, pictures = map_path(order.path), load_board("this"), order.pictures
     is_new = not (order.append and path.exists())
+    if isinstance(pictures, Cuttings) and "://" in str(pictures.orthophoto) and not pictures.attribution:
+        raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
     mask, lens = (None, None) if isinstance(pictures, Cuttings) else (mask_of(config.source.mask), config.source.lens)
     if is_new:
         source, technique = _opened(order, config, None, mask)
@@ -131,6 +137,9 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         try:
             if isinstance(pictures, FlownPictures):
                 _say_beforehand(pictures, config, technique, source.total, len(place_map) if order.calibrate else None)
+            else:
+                place_map.add_attribution(pictures.attribution)
+                _say_and_fetch(source, pictures.spacing_m, technique, shown)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 technique,
@@ -164,6 +173,18 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             refined=refined,
             calibration=calibration,
         )
+
+
+def _say_and_fetch(source: Source, spacing_m: float, technique: Technique, shown: Shown) -> None:
+    """Say how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map."""
+    from edgevpr.mapmaking.cuttings import OrthophotoSource
+
+    assert isinstance(source, OrthophotoSource)  # opened by `Cuttings`
+    _log.info("%s", source.forecast(spacing_m, technique))
+    if to_fetch := source.to_fetch():
+        count, steps = to_fetch
+        for _ in shown(steps, count, "fetching tiles"):
+            pass
 
 
 def _say_beforehand(
@@ -226,7 +247,7 @@ def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None, mask: M
     if is_cut and camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     camera = "nadir" if is_cut else camera
-    source = order.pictures.open()
+    source: Source = order.pictures.open()
     name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS if is_cut else None)
     asks_camera = camera is None and place_map is None and "camera" not in order.parameters
     if isinstance(order.pictures, FlownPictures) and asks_camera and (not name or camera_setting(name, "nadir")):

@@ -3,6 +3,7 @@ part of an orthophoto from which a map is made."""
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
+from edgevpr.core.geodesy import extent_of, moved
 
 _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
@@ -18,6 +20,8 @@ _WAYPOINT_COLUMNS = 12
 # off, spline, and take off and land of a VTOL. Others, such as a region of interest, have a position to look at.
 _FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
+_CIRCLE = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
+_CIRCLE_CORNERS, _MOST_RADIUS_M = 72, 200_000.0
 
 Ring = list[LatLon]
 
@@ -40,17 +44,24 @@ class Area:
     paths: tuple[tuple[Waypoint, ...], ...]
 
     @property
-    def extent_deg(self) -> tuple[float, float, float, float]:
-        """The bounding box of polygons and paths: (south, west, north, east) in degrees."""
+    def points(self) -> list[LatLon]:
+        """All corners of polygons and points of paths."""
         points = [(way.lat_deg, way.lon_deg) for path in self.paths for way in path]
-        points += [point for rings in self.polygons for ring in rings for point in ring]
-        return (*map(min, zip(*points, strict=True)), *map(max, zip(*points, strict=True)))
+        return points + [point for rings in self.polygons for ring in rings for point in ring]
+
+    @property
+    def extent_deg(self) -> tuple[float, float, float, float]:
+        """The bounding box of polygons and paths: (south, west, north, east) in degrees, see `extent_of`."""
+        return extent_of(self.points)
 
 
 def read_area(path: str | Path) -> Area:
-    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or GeoJSON in degrees. Raises UsageError for a
-    file that is none of them, holds no position, or has one outside -90..90 or -180..180 degrees."""
+    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or GeoJSON in degrees; or the circle that the text
+    LAT,LON,RADIUS_M tells. Raises UsageError for a file that is none of them, holds no position, or has one outside
+    -90..90 or -180..180 degrees."""
     try:
+        if _CIRCLE.fullmatch(str(path)):
+            return _circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
         area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
     except OSError as error:
@@ -62,10 +73,20 @@ def read_area(path: str | Path) -> Area:
         ) from None
     if not area.polygons and not area.paths:
         raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
-    south, west, north, east = area.extent_deg
-    if not (-90 <= south <= north <= 90 and -180 <= west <= east <= 180):
+    if any(abs(lat_deg) > 90 or abs(lon_deg) > 180 for lat_deg, lon_deg in area.points):
         raise UsageError(f"{path} has positions beyond the globe: they must be degrees of WGS-84.")
     return area
+
+
+def _circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
+    if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MOST_RADIUS_M):
+        raise UsageError(
+            f"--area {lat_deg:g},{lon_deg:g},{radius_m:g}: write LAT,LON,RADIUS_M, in degrees of WGS-84 and metres (at "
+            f"most {_MOST_RADIUS_M:,.0f})."
+        )
+    turns = (2 * math.pi * corner / _CIRCLE_CORNERS for corner in range(_CIRCLE_CORNERS + 1))
+    ring = [moved(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
+    return Area(((ring,),), ())
 
 
 def _of_lines(lines: list[str]) -> Area:

@@ -76,8 +76,8 @@ def merge(paths: Sequence[str], out: Path, watch: Watch = unwatched) -> tuple[li
     copied, places that were there already) as numbers, and True if one of them was calibrated: `out` is not.
 
     A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). The
-    mask hash is copied if all have the same, and so is the lens. Raises MapError if the techniques differ or a file
-    cannot be read or written, and PlaceError if a place is damaged.
+    mask hash is copied if all have the same, and so is the lens; attributions are all copied. Raises MapError if the
+    techniques differ or a file cannot be read or written, and PlaceError if a place is damaged.
     """
     with ExitStack() as stack:
         unfinished = stack.enter_context(mapfiles.whole_or_none(out))
@@ -90,6 +90,8 @@ def merge(paths: Sequence[str], out: Path, watch: Watch = unwatched) -> tuple[li
                 merged.record_mask(*masks)
             if len(lenses) == 1:
                 merged.record_lens(*lenses)
+            for each in maps:
+                merged.add_attribution(each.attribution)
             return [_absorb(merged, each, watch) for each in maps], any(each.calibration is not None for each in maps)
 
 
@@ -186,12 +188,13 @@ def _worth_of(place: Place) -> float:
 
 
 def _copy(place_map: PlaceMap, out: Path, places: Iterable[Examined]) -> int:
-    """Make the map `out` from the undamaged ones of `places`, with the same ids, mask hash, lens and calibration;
+    """Make the map `out` from the undamaged ones of `places`, with the same ids and the same texts beside them;
     return how many places it has."""
     copied = 0
     with PlaceMap.create(out, place_map.spec) as copy:
         copy.record_mask(place_map.mask_sha256)
         copy.record_lens(place_map.lens)
+        copy.add_attribution(place_map.attribution)
         copy.record_calibration(place_map.calibration)
         with copy.transaction():
             for each in places:

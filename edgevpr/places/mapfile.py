@@ -24,6 +24,7 @@ from edgevpr.places.mapfiles import is_of_one_row, sentences
 from edgevpr.places.rows import Content, Unreadable, Values
 
 _OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
+_OWNERS = "; "  # between the words of several owners
 _OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
 _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
 
@@ -97,6 +98,17 @@ class PlaceMap(MapConnection):
         and nothing is stored. Raises MapError."""
         if path is not None:
             self._record_beside(mapspec.LENS, Path(path).name)
+
+    @property
+    def attribution(self) -> str | None:
+        """Owners of the orthophotos that places were cut from, in their own words; None: none is known."""
+        return self._text_beside(mapspec.ATTRIBUTION)
+
+    def add_attribution(self, text: str | None) -> None:
+        """Store an owner's words beside those that are there (None: nothing is stored). Raises MapError."""
+        if text:
+            words = [*(self.attribution or text).split(_OWNERS), *text.split(_OWNERS)]
+            self._record_beside(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
 
     @property
     def calibration(self) -> str | None:

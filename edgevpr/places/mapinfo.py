@@ -32,7 +32,7 @@ class MapInfo:
     the value, or if another program wrote it in another form. `with_position` and `with_pose` are numbers of places.
     `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
     `footprint_m` is the mean length on the ground of a picture's longest side, and `position_sd_m` the standard
-    deviation of the positions along one axis, as root mean square."""
+    deviation of the positions along one axis, as root mean square. `attribution` names the owners of orthophotos."""
 
     path: str
     spec: TechniqueSpec
@@ -45,6 +45,7 @@ class MapInfo:
     with_pose: int
     footprint_m: float | None
     position_sd_m: float | None
+    attribution: str | None
     file_bytes: int
 
 
@@ -77,6 +78,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         with_pose=with_pose,
         footprint_m=footprint_m,
         position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
+        attribution=place_map.attribution,
         file_bytes=place_map.path.stat().st_size,
     )
 

@@ -20,7 +20,8 @@ _BEFORE_RELEASE = 4  # format version in maps made before the first release; the
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MOST_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
-BESIDE = MASK, LENS, CALIBRATION = ("mask_sha256", "lens", "calibration")  # keys of texts that a map may lack
+# Keys of texts that a map may lack.
+BESIDE = MASK, LENS, ATTRIBUTION, CALIBRATION = ("mask_sha256", "lens", "attribution", "calibration")
 _MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
@@ -51,7 +52,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
         # The others are read only when they are needed: a map can be used without them.
-        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?)", BESIDE)
+        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", BESIDE)
         stored = {key: json.loads(value) for key, value in said.fetchmany(_MOST_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:

@@ -117,10 +117,13 @@ class CutAlbum(Album):
 
     def __init__(self, orthophoto: str | Path, places: Iterable[Place]) -> None:
         from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
+        from edgevpr.mapmaking.tiles import ground_of
 
         super().__init__([])
-        self._orthophoto = Orthophoto(orthophoto)
-        self._places = {place.source_image: place for place in places}
+        self._places = {place.source_image: place for place in places if place.position and place.pose}
+        at = [(place.position, place.pose) for place in self._places.values() if place.position and place.pose]
+        points = [(position.lat_deg, position.lon_deg) for position, _ in at]
+        self._orthophoto = Orthophoto(orthophoto, ground_of(points, max(pose.footprint_m for _, pose in at)))
 
     def __bool__(self) -> bool:
         """Return True: there is an orthophoto to cut from."""
@@ -190,7 +193,7 @@ def album_of(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Mappi
 def album_of_map(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
     """Return the album of a map's pictures. `sources` are folders of pictures, or a film; of a map that was cut from an
     orthophoto, the orthophoto. Raises EdgevprError for one that cannot be used."""
-    if sources and any(place.pose and place.pose.is_surveyed for place in places):
+    if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return CutAlbum(sources[0], places)
     return album_of(sources)
 

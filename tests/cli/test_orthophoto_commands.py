@@ -108,6 +108,11 @@ def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, cap
             "give nadir",
         ),
         (["--orthophoto", "GROUND", "--footprint-m", "8000", "--spacing-m", "20"], 2, "--footprint-m is 8000"),
+        (
+            ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--area", "-35.36,149.16,500"],
+            2,
+            "The area does not touch",
+        ),
         (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),
     ],
 )

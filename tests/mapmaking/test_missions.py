@@ -5,6 +5,7 @@ import json
 import pytest
 
 from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import distance_m
 from edgevpr.mapmaking.missions import Waypoint, read_area
 
 WAYPOINTS = """QGC WPL 110
@@ -113,3 +114,17 @@ def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_p
         read_area(tmp_path / "picture")
     with pytest.raises(UsageError, match="cannot"):
         read_area(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(("lat_deg", "lon_deg"), [(50.0, 11.9), (-35.36, 149.16), (-17.0, -179.9999)])
+def test_an_area_may_be_a_circle(lat_deg, lon_deg):
+    area = read_area(f"{lat_deg}, {lon_deg},500")
+    (((*corners, last),),) = area.polygons
+    assert last == pytest.approx(corners[0])
+    assert all(distance_m(lat_deg, lon_deg, *corner) == pytest.approx(500, rel=0.01) for corner in corners)
+    south, west, north, east = area.extent_deg
+    assert (south + north) / 2 == pytest.approx(lat_deg)
+    assert 0 < east - west < 0.02
+    for said in (f"{lat_deg},{lon_deg},0", f"{lat_deg},{lon_deg},9000000", "95,11,500", "50,190,500"):
+        with pytest.raises(UsageError, match="RADIUS_M"):
+            read_area(said)

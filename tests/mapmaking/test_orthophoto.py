@@ -72,6 +72,25 @@ def test_longitudes_may_count_from_0_to_360(tmp_path):
     assert Orthophoto(path).extent_deg[1] == pytest.approx(11.9, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("crs", "west"), [("EPSG:4326", 179.999), ("EPSG:4326", -180.001), ("EPSG:3857", 20037398.0), ("EPSG:32660", None)]
+)
+def test_a_file_over_the_antimeridian_is_one_picture(tmp_path, crs, west):
+    from rasterio.warp import transform
+
+    (x,), (y,) = transform("EPSG:4326", crs, [179.999], [-17.0])
+    pixel = 1e-5 if crs == "EPSG:4326" else 1.1
+    to_crs = rasterio.Affine(pixel, 0, x if west is None else west, 0, -pixel, y + 100 * pixel)
+    bands = np.full((3, 200, 200), 90, np.uint8)
+    bands[:, :, 100:] = 200
+    orthophoto = Orthophoto(write_raster(tmp_path / "o.tif", bands, crs, to_crs))
+    _, west_deg, _, east_deg = orthophoto.extent_deg
+    assert 0 < east_deg - west_deg < 0.01
+    for lon_deg in (179.99995, -179.99995):
+        _, valid = orthophoto.cut(type(HOME)(-17.0, lon_deg), 40.0, 50)
+        assert valid.all()
+
+
 @pytest.mark.parametrize("pixel_m", [0.05, 0.07, 0.45])
 def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
     path = marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))

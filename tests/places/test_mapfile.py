@@ -200,6 +200,8 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
         place_map.record_mask("m")
         place_map.record_lens("/camera/lens.yaml")
         place_map.record_calibration("how sure")
+        for owner in ("Survey of X", None, "City of Y", "Survey of X"):
+            place_map.add_attribution(owner)
     assert shrink(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
     with contextlib.closing(sqlite3.connect(map_path)) as db, db:
         db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 2")
@@ -207,6 +209,7 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
         for each in (repaired, small):
             assert (each.mask_sha256, each.lens, each.calibration) == ("m", "lens.yaml", "how sure")
+            assert each.attribution == "Survey of X; City of Y"
             for place in each.places():
                 assert place.source_image == f"{place.place_id - 1:05d}.jpg"
         assert len(repaired) == 9
@@ -323,3 +326,14 @@ def test_a_place_of_bytes_is_known_again_where_a_few_of_them_differ(tmp_path):
 def unit(rng, shape):
     values = rng.normal(0, 1, shape)
     return values / np.linalg.norm(values)
+
+
+def test_one_map_of_several_names_the_owners_of_all(tmp_path):
+    paths = [tmp_path / f"{owner}.gpkg" for owner in ("Y", "None", "X")]
+    for path in paths:
+        with PlaceMap.create(path, SPEC) as place_map:
+            assert place_map.attribution is None
+            place_map.add_attribution(None if path.stem == "None" else path.stem)
+    merge(list(map(str, paths)), tmp_path / "all.gpkg")
+    with PlaceMap.open(tmp_path / "all.gpkg") as merged:
+        assert merged.attribution == "Y; X"

@@ -1,6 +1,7 @@
 """A flight over an orthophoto, as a rehearsal before the real one: pictures, and where they were taken. The track is
 read from a positions.csv, or follows the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from edgevpr.lab.simulate.generated import wander, write_shots
 from edgevpr.mapmaking.cuttings import MOST_WITHOUT_DATA, extent_words
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.tiles import Ground, ground_of
 
 SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # the most roll, pitch and yaw off a track that tells none
@@ -66,6 +68,13 @@ def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     over_m = np.interp(at_m, way_m[known], heights_m[known]).tolist() if known.any() else [None] * len(at_m)
     places = zip(np.interp(at_m, way_m, lat_deg).tolist(), np.interp(at_m, way_m, lon_deg).tolist(), strict=True)
     return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
+
+
+def ground_under(shots: list[GeoTag], fov_deg: float) -> Ground:
+    """Return the ground that the pictures show, for tiles of it."""
+    points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
+    highest_m = max(shot.height_m or 0.0 for shot in shots)
+    return ground_of(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
 
 
 def poses_of(shots: list[GeoTag], seed: int) -> list[CameraPose]:
@@ -126,7 +135,7 @@ def write_rehearsal(
     first = next(names, None)
     if first is None:
         raise UsageError(
-            f"No picture of the track shows {orthophoto.path}, which is at {extent_words(orthophoto.extent_deg)}: "
+            f"No picture of the track shows {orthophoto.name}, which is at {extent_words(orthophoto.extent_deg)}: "
             "pictures that leave it are not taken."
         )
     yield first
