@@ -8,12 +8,14 @@ import math
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
+from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.flight.herald import Herald, Trouble
+from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -39,6 +41,8 @@ _GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
+_SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
+_GPS_DOUBTED_S = 300.0  # before GPS was found to be wrong: it may have been led away slowly
 
 _log = logging.getLogger(__name__)
 
@@ -222,6 +226,67 @@ class GpsWatch:
         self._against.append((seen, off_m))
         is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN
         self.is_wrong = self.is_wrong or is_proven
+
+
+class Surveyor:
+    """Reports where the map lies and where the camera looks (see `survey`), once each is known and is not as it should
+    be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is wrong: then nothing is
+    learnt of it."""
+
+    def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig) -> None:
+        mount_deg = source.mount_ahead_deg, source.mount_right_deg
+        self._herald, self._gps, self._taken = herald, gps, 0
+        self._sightings = Sightings(mount_deg, source.gimbal)
+        self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}
+        self._expected |= {"ahead_deg": mount_deg[:1], "right_deg": mount_deg[1:]}
+        self._told = self._expected.copy()
+
+    def tell(self, event: Recognition) -> None:
+        """Take the match of an event, if GPS is right, and report what has become known by it."""
+        if self._gps.is_wrong:
+            if event.frame:
+                self._sightings.forget(event.frame.t_mono_s - _GPS_DOUBTED_S)
+        elif self._sightings.take(event):
+            self._taken += 1
+            if self._taken % _SURVEYED_EVERY == 0 and (found := self._sightings.result()):
+                self._report(
+                    found, {name for name, each in found.measures.items() if each.differs_from(self._told[name])}
+                )
+
+    def end(self) -> None:
+        """Report everything that is known now."""
+        if found := self._sightings.result():
+            self._report(found, {name for name, each in found.measures.items() if each.is_known})
+
+    def _report(self, found: Surveyed, names: set[str]) -> None:
+        """Write a line of all that is known, if `names` has any, and say what of them is not as it should be."""
+        clear = {name: each for name, each in found.measures.items() if each.differs_from(self._expected[name])}
+        sentences = {name: _surveyed(name, each) for name, each in clear.items()}
+        if names:
+            said = "; ".join(sentence for sentence, _ in sentences.values())
+            self._herald.note("survey", said=said or "map and camera are as GPS says", **found.fields())
+        for name in names:
+            self._told[name] = found.measures[name].value
+        for name, (sentence, ground) in sentences.items():
+            if name in names:
+                self._herald.say(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
+
+
+def _surveyed(name: str, found: Measure) -> tuple[str, str]:
+    """Return a result of the survey as a sentence, and in a few words."""
+    first = found.value[0]
+    if name == "off_m":
+        (east_m, north_m), sides = found.value, ("west east", "south north")
+        ways = [(abs(off_m), side.split()[off_m > 0]) for off_m, side in zip((east_m, north_m), sides, strict=True)]
+        long, short = (joint.join(f"{off_m:.1f} m {side}" for off_m, side in ways) for joint in (" and ", ", "))
+        return f"the map lies {long} of GPS, +-{found.sd:.1f} m", f"map lies {short} of GPS"
+    if name == "scale":
+        size = f"{abs(first):.1%} too {'large' if first > 0 else 'small'}"
+        return f"the map is {size}, +-{found.sd:.1%}", f"map is {size}"
+    sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
+    side, key = sides[first > 0], f"source.mount_{name}"
+    looks = f"looks {abs(first):.1f} degrees {side} of straight down"
+    return f"the camera {looks}, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
