@@ -10,6 +10,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.text import beside
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -276,10 +277,8 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
     """Return a result of the survey as a sentence, and in a few words."""
     first = found.value[0]
     if name == "off_m":
-        (east_m, north_m), sides = found.value, ("west east", "south north")
-        ways = [(abs(off_m), side.split()[off_m > 0]) for off_m, side in zip((east_m, north_m), sides, strict=True)]
-        long, short = (joint.join(f"{off_m:.1f} m {side}" for off_m, side in ways) for joint in (" and ", ", "))
-        return f"the map lies {long} of GPS, +-{found.sd:.1f} m", f"map lies {short} of GPS"
+        there = f"{beside(*found.value)} of GPS"
+        return f"the map lies {there}, +-{found.sd:.1f} m", f"map {there}"
     if name == "scale":
         size = f"{abs(first):.1%} too {'large' if first > 0 else 'small'}"
         return f"the map is {size}, +-{found.sd:.1%}", f"map is {size}"
