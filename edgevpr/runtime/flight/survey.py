@@ -5,6 +5,9 @@ The match of a picture is off the receiver by the sum of all three, and they are
 offset of the map stays, a mount turns with the heading and grows with the height, a scale grows across the map. Where a
 flight cannot tell two of them apart, as the offset and the mount on a straight line, the standard deviations of both
 are large, and neither is told.
+
+A mount alone makes receiver and map contradict each other as soon as the aircraft turns. So matches count while GPS is
+held to be wrong too; but then all of the flight must say the same, what came before such doubts and what came after.
 """
 
 import math
@@ -19,6 +22,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.runtime.flight.consistency import HeardFrame, positioned
 from edgevpr.runtime.flight.navigation import reckons_by_gps
+from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _EVERY_S = 5.0  # matches that are nearer in time count once
@@ -34,28 +38,31 @@ _ATTITUDE_SD, _LEVEL_SD_DEG = math.tan(math.radians(0.5)), 0.3  # for one pictur
 _BEFORE = np.diag(1 / np.square([1e4, 1e4, 0.5, 0.5, 0.02, 0.1]))
 _FEWEST, _LEAST_ALIKE = 20, 0.7  # matches, and the share of them that must agree
 _WRONG = 4.0  # standard deviations: matches that are off by more do not count
+# Where some matches were taken while GPS was held to be wrong: the share of the others in each half of the flight, the
+# standard deviation (m) by which a half must know the offset, and the standard deviations by which halves may differ.
+_UNDOUBTED, _HALF_KNOWS_M, _HALVES_AGREE = 0.1, 2.0, 4.0
 _SOFT_ROUNDS, _HARD_ROUNDS, _SOFT = 6, 3, 2.0
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median length of a deviation on two axes, over its standard deviation
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sighting:
     """A match beside GPS: it is `off_m` (2,) metres east and north of it, which is the product of `look` (2, 6) and
     what is sought. The variance of each axis, m2, has a part `own_m2` and one that it shares with its neighbours in
-    time, `shared_m2`, of which it says as much as one of `alike` matches."""
+    time, `shared_m2`, of which it says as much as one of `alike` matches. `is_doubted`: GPS was held to be wrong."""
 
-    t_s: float
     look: Doubles
     off_m: Doubles
     own_m2: float
     shared_m2: float
     alike: float
+    is_doubted: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
     """A result with its standard deviation (of each axis). It `is_known` with one of at most `worst_sd`. Values that
-    are nearer than `least` to each other are the same in a flight."""
+    are nearer than `least` to each other count as the same."""
 
     value: tuple[float, ...]
     sd: float
@@ -66,9 +73,9 @@ class Measure:
     def is_known(self) -> bool:
         return self.sd <= self.worst_sd
 
-    def differs_from(self, other: tuple[float, ...]) -> bool:
-        """Tell whether it is known, and clearly another value."""
-        return self.is_known and math.dist(self.value, other) > max(self.least, 3 * self.sd)
+    def differs_from(self, other: tuple[float, ...], times: float = 1.0) -> bool:
+        """Tell whether it is known, and clearly another value: by so many `times` of the least that counts."""
+        return self.is_known and math.dist(self.value, other) > max(times * self.least, 3 * self.sd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,12 +118,9 @@ class Sightings:
         self._origin: Position | None = None
         self._taken_s = -math.inf
 
-    def forget(self, t_s: float) -> None:
-        """Forget the sightings since `t_s`."""
-        self._kept = deque((each for each in self._kept if each.t_s < t_s), maxlen=_MOST)
-
-    def take(self, event: Recognition) -> bool:
-        """Take an event for a sighting, if it can be one and the last was long enough ago; return True if it was."""
+    def take(self, event: Recognition, is_doubted: bool = False) -> bool:
+        """Take an event for a sighting, if it can be one and the last was long enough ago; return True if it was. GPS
+        `is_doubted` while it is held to be wrong."""
         vehicle, where, view = event.vehicle, event.located, event.view
         if event.frame is None or event.frame.t_mono_s - self._taken_s < _EVERY_S:
             return False
@@ -136,7 +140,10 @@ class Sightings:
         look[:, 4] = offset_m(self._origin.lat_deg, self._origin.lon_deg, at.lat_deg, at.lon_deg)
         off_m = np.array(offset_m(at.lat_deg, at.lon_deg, seen.position.lat_deg, seen.position.lon_deg))
         own_m2 = float(np.trace(seen.scatter_m2)) / 2
-        self._kept.append(Sighting(t_s, look, off_m, own_m2, vehicle.gps.sd_m**2, alike))
+        shared_m2 = vehicle.gps.sd_m**2
+        self._kept.append(
+            Sighting(look=look, off_m=off_m, own_m2=own_m2, shared_m2=shared_m2, alike=alike, is_doubted=is_doubted)
+        )
         self._taken_s = t_s
         return True
 
@@ -158,16 +165,15 @@ class Sightings:
 
     def result(self) -> Surveyed | None:
         """Return what the sightings say; None if they are too few, or do not agree."""
-        if len(self._kept) < _FEWEST or self._origin is None:
+        kept = list(self._kept)
+        if len(kept) < _FEWEST or self._origin is None:
             return None
-        way, covariance, counts = fitted(list(self._kept))
-        if counts.mean() < _LEAST_ALIKE:
-            return None
-        middle_m = np.mean(
-            [each.look[:, 4] for each, counts_it in zip(self._kept, counts, strict=True) if counts_it], 0
-        )
+        way, covariance, counts = fitted(kept)
+        middle_m = np.mean([each.look[:, 4] for each in kept], axis=0)
         there = np.eye(6)
         there[:2, 4] = middle_m
+        if counts.mean() < _LEAST_ALIKE or not _explains_doubts(kept, counts, there):
+            return None
         way, covariance = there @ way, there @ covariance @ there.T
         sd = np.sqrt(np.diag(covariance))
         angles_deg = np.degrees(np.arctan(way[2:4])) + self._mount_deg
@@ -208,6 +214,22 @@ def fitted(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
             counts = (miss <= _WRONG * scatter).astype(float)
     covariance: Doubles = scatter**2 * np.linalg.inv(normal)
     return way, covariance, counts > 0
+
+
+def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles) -> bool:
+    """Tell whether a fit of sightings, of which it `counts` some (n,), leaves no reason to hold GPS for wrong. A
+    receiver that is led away says something else before than after, and something else than what nobody doubted.
+    `there` (6, 6) takes what is sought to the middle of the ground."""
+    doubted = np.array([each.is_doubted for each in sightings])
+    if not doubted.any():
+        return True
+    halves = np.array_split(np.arange(len(sightings)), 2)
+    if min(np.mean(~doubted[half]) for half in halves) < _UNDOUBTED or counts[~doubted].mean() < _LEAST_ALIKE:
+        return False
+    (one, of_one, _), (other, of_other, _) = (fitted([sightings[at] for at in half]) for half in halves)
+    worst_m2 = max(np.diag(there @ covariance @ there.T)[:2].max() for covariance in (of_one, of_other))
+    off_sd = in_sd(there @ (one - other), there @ (of_one + of_other) @ there.T)
+    return worst_m2 <= _HALF_KNOWS_M**2 and off_sd <= _HALVES_AGREE
 
 
 def _beside(vehicle: Vehicle, t_s: float) -> Position:

@@ -43,7 +43,7 @@ _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver m
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
-_GPS_DOUBTED_S = 300.0  # before GPS was found to be wrong: it may have been led away slowly
+_ANEW = 3.0  # times the least that counts: a result that was told is told anew when it has changed by more
 
 _log = logging.getLogger(__name__)
 
@@ -231,8 +231,8 @@ class GpsWatch:
 
 class Surveyor:
     """Reports where the map lies and where the camera looks (see `survey`), once each is known and is not as it should
-    be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is wrong: then nothing is
-    learnt of it."""
+    be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is held to be wrong: what
+    was reported is taken back where that contradicts it."""
 
     def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig) -> None:
         mount_deg = source.mount_ahead_deg, source.mount_right_deg
@@ -240,24 +240,33 @@ class Surveyor:
         self._sightings = Sightings(mount_deg, source.gimbal)
         self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}
         self._expected |= {"ahead_deg": mount_deg[:1], "right_deg": mount_deg[1:]}
-        self._told = self._expected.copy()
+        self._told: dict[str, tuple[float, ...]] = {}
 
     def tell(self, event: Recognition) -> None:
-        """Take the match of an event, if GPS is right, and report what has become known by it."""
-        if self._gps.is_wrong:
-            if event.frame:
-                self._sightings.forget(event.frame.t_mono_s - _GPS_DOUBTED_S)
-        elif self._sightings.take(event):
+        """Take the match of an event, and report what has become known by it."""
+        if self._sightings.take(event, self._gps.is_wrong):
             self._taken += 1
-            if self._taken % _SURVEYED_EVERY == 0 and (found := self._sightings.result()):
-                self._report(
-                    found, {name for name, each in found.measures.items() if each.differs_from(self._told[name])}
-                )
+            if self._taken % _SURVEYED_EVERY == 0:
+                self._look(is_end=False)
 
     def end(self) -> None:
         """Report everything that is known now."""
-        if found := self._sightings.result():
-            self._report(found, {name for name, each in found.measures.items() if each.is_known})
+        self._look(is_end=True)
+
+    def _look(self, is_end: bool) -> None:
+        found, names = self._sightings.result(), set[str]()
+        if found is None:
+            if self._told:
+                self._told.clear()
+                said = "what was said of map and camera is taken back, GPS contradicts it"
+                self._herald.tell("survey", Severity.WARNING, said, ground="map and camera: not so, see log", said=said)
+            return
+        for name, each in found.measures.items():
+            before = self._told.get(name)
+            is_news = each.differs_from(self._expected[name]) if before is None else each.differs_from(before, _ANEW)
+            if is_news or (is_end and each.is_known):
+                names.add(name)
+        self._report(found, names)
 
     def _report(self, found: Surveyed, names: set[str]) -> None:
         """Write a line of all that is known, if `names` has any, and say what of them is not as it should be."""
@@ -266,8 +275,7 @@ class Surveyor:
         if names:
             said = "; ".join(sentence for sentence, _ in sentences.values())
             self._herald.note("survey", said=said or "map and camera are as GPS says", **found.fields())
-        for name in names:
-            self._told[name] = found.measures[name].value
+        self._told |= {name: found.measures[name].value for name in names}
         for name, (sentence, ground) in sentences.items():
             if name in names:
                 self._herald.say(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
