@@ -259,7 +259,9 @@ class Surveyor:
             if self._told:
                 self._told.clear()
                 said = "what was said of map and camera is taken back, GPS contradicts it"
-                self._herald.tell("survey", Severity.WARNING, said, ground="map and camera: not so, see log", said=said)
+                self._herald.tell(
+                    "survey", Severity.WARNING, said, ground="map and camera are unknown again", said=said
+                )
             return
         for name, each in found.measures.items():
             before = self._told.get(name)
@@ -292,8 +294,8 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
         return f"the map is {size}, +-{found.sd:.1%}", f"map is {size}"
     sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
     side, key = sides[first > 0], f"source.mount_{name}"
-    looks = f"looks {abs(first):.1f} degrees {side} of straight down"
-    return f"the camera {looks}, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
+    looks = f"looks {abs(first):.1f} degrees {side}"
+    return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
