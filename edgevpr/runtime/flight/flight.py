@@ -269,7 +269,10 @@ class Flight:
     def _end(self) -> None:
         crew, totals = self._crew, self.totals()
         systemd.notify(STOPPING=1)
-        self._surveyor.end()
+        try:
+            self._surveyor.end()
+        except Exception:
+            _log.exception("the end of the survey could not be told")
         if crew.link and crew.autopilot:
             crew.link.close()  # sends waiting messages first, so that the log's last line counts them
             crew.autopilot.log_answers()

@@ -268,15 +268,15 @@ class Surveyor:
             is_news = each.differs_from(self._expected[name]) if before is None else each.differs_from(before, _ANEW)
             if is_news or (is_end and each.is_known):
                 names.add(name)
-        self._report(found, names)
+        if names or (is_end and self._told):
+            self._report(found, names)
 
     def _report(self, found: Surveyed, names: set[str]) -> None:
-        """Write a line of all that is known, if `names` has any, and say what of them is not as it should be."""
+        """Write a line of all that is known, and say what of `names` is not as it should be."""
         clear = {name: each for name, each in found.measures.items() if each.differs_from(self._expected[name])}
         sentences = {name: _surveyed(name, each) for name, each in clear.items()}
-        if names:
-            said = "; ".join(sentence for sentence, _ in sentences.values())
-            self._herald.note("survey", said=said or "map and camera are as GPS says", **found.fields())
+        said = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera are as GPS says"
+        self._herald.note("survey", said=said, **found.fields())
         self._told |= {name: found.measures[name].value for name in names}
         for name, (sentence, ground) in sentences.items():
             if name in names:
