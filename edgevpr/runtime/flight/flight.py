@@ -31,7 +31,7 @@ from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.vitals import Vitals
-from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
+from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, ScaleWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
 from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
@@ -73,6 +73,7 @@ class Flight:
             self._vitals.tell,
             self._map_watch.tell,
             Sight(herald).tell,
+            ScaleWatch(herald).tell,
             gps.tell,
             self._surveyor.tell,
             self._log_event,
