@@ -22,6 +22,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ),
     ),
     "map refine": (("after learning in flight", "valley.gpkg --images photos/"),),
+    "map move": (("to where GPS has it, after a flight with it", "valley.gpkg --by flight.jsonl"),),
     "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
     "map info": (
         ("what is in it", "valley.gpkg"),

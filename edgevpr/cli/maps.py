@@ -1,4 +1,4 @@
-"""`edgevpr map`: make, correct, calibrate, look into, check, repair, merge and shrink place maps; and `edgevpr
+"""`edgevpr map`: make, correct, move, calibrate, look into, check, repair, merge and shrink place maps; and `edgevpr
 salience`: print how memorable, static and full of information a picture is."""
 
 from argparse import ArgumentParser, Namespace
@@ -26,7 +26,7 @@ from edgevpr.cli.shared import (
     show,
     write_out,
 )
-from edgevpr.cli.wording import of_check, of_info, of_made, of_refined
+from edgevpr.cli.wording import of_check, of_info, of_made, of_moved, of_refined
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
@@ -50,6 +50,9 @@ def add(commands: Any) -> None:
     refine = of_map("refine", map_refine, "find out where the pictures really lie, by matching them")
     refine.add_argument("--images", metavar="DIR", help="the images that the map was made of: more pictures are tied")
     add_json(refine)
+    move = of_map("move", map_move, "move it to where GPS has it, as a flight has found")
+    move.add_argument("--by", metavar="LOG", required=True, help="flight log of a flight with this map and with GPS")
+    add_json(move)
     calibrate = of_map("calibrate", map_calibrate, "find out how sure a map can be, with the pictures it is of")
     _add_pictures(calibrate)
     calibrate.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and precision")
@@ -164,6 +167,17 @@ def map_refine(args: Namespace) -> int:
     with PlaceMap.open_for_adding(args.map) as place_map:
         refined = refine_map(place_map, technique_of(place_map), args.images, progress)
     show({"map": args.map, **asdict(refined)}, args.json, of_refined(args.map, refined))
+    return 0
+
+
+def map_move(args: Namespace) -> int:
+    """Run `map move`: move the places of a map by the offset from GPS that a flight has found, and print the move."""
+    from edgevpr.mapmaking.moving import move_map
+    from edgevpr.places.mapfile import PlaceMap
+
+    with PlaceMap.open_for_adding(args.map) as place_map:
+        done = move_map(place_map, args.by)
+    show({"map": args.map, **asdict(done)}, args.json, of_moved(args.map, done))
     return 0
 
 

@@ -6,11 +6,12 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import lines_of
-from edgevpr.core.text import aligned, nines, shown
+from edgevpr.core.text import aligned, beside, nines, shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.simulate.foreseen import Foreseen
     from edgevpr.mapmaking.making import MadeMap
+    from edgevpr.mapmaking.moving import MapMove
     from edgevpr.mapmaking.refine import Refined
     from edgevpr.places.examine import MapCheck
     from edgevpr.places.mapinfo import MapInfo
@@ -87,6 +88,13 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
     if confidence:
         yield f"  confidence  {confidence}"
     yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM"
+
+
+def of_moved(path: str, done: "MapMove") -> Iterator[str]:
+    """Yield how `map move` has moved a map."""
+    yield f"{path}: {done.places} places moved {beside(done.east_m, done.north_m)}, +-{done.sd_m:.1f} m"
+    if done.scale is not None:
+        yield f"  scale       divided by {1 + done.scale:.4f}, around {done.middle[0]:.6f}, {done.middle[1]:.6f}"
 
 
 def of_check(found: "MapCheck") -> Iterator[str]:

@@ -75,6 +75,8 @@ class SourceConfig:
     up_deg: float = key(
         "--up-deg DEG", "where the top of the picture points while the nose points north (0)", within=(0, 360)
     )
+    mount_ahead_deg: float = bounded(-45, 45)
+    mount_right_deg: float = bounded(-45, 45)
     gimbal: bool
 
 

@@ -197,3 +197,9 @@ def nines(probability: float) -> str:
         return f"{probability:.4f}"
     digits = min(15, max(4, 1 - math.floor(math.log10(wrong))))
     return f"{1 - wrong:.{digits}f}"
+
+
+def beside(east_m: float, north_m: float) -> str:
+    """Write a step on the ground: "3.1 m east and 1.2 m south"."""
+    along, up = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
+    return f"{abs(east_m):.1f} m {along} and {abs(north_m):.1f} m {up}"

@@ -31,6 +31,23 @@ _SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, slots=True)
+class Mount:
+    """Constant angles by which a camera looks ahead and to the right of what is straight down for the airframe, or for
+    the gimbal that it hangs in (negative: behind, to the left)."""
+
+    ahead_deg: float = 0.0
+    right_deg: float = 0.0
+
+    def body_from_straight(self) -> Doubles:
+        """Return the rotation (3, 3) that turns a camera from straight down to where it looks, in the airframe's axes:
+        to look ahead is to turn as the airframe does with its nose up, to the right as with its left wing down."""
+        return _level_from_body(-self.right_deg, self.ahead_deg)
+
+
+STRAIGHT_DOWN = Mount()
+
+
+@dataclass(frozen=True, slots=True)
 class Lens:
     """A camera's lens, and how the camera is mounted. `fov_deg`: its field of view across the longest side of the
     picture. `up_deg`: compass direction of the picture's top while the nose points north. `calibrated`: its distortion
@@ -39,6 +56,7 @@ class Lens:
     fov_deg: float
     up_deg: float = 0.0
     calibrated: CalibratedLens | None = None
+    mount: Mount = STRAIGHT_DOWN
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,14 +180,15 @@ def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", vie
     return Levelled(warp.picture(image), None if mask.all() else mask, view)
 
 
-def leaning(frame: Frame, vehicle: Vehicle | None) -> View:
+def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
     """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`, computed
-    from the roll, pitch, heading and height of `frame`, or where the frame has none those of `vehicle`; or only
-    `reason`, if the picture is tilted too far; or neither, if too little is known. Impossible values never raise."""
+    from the `mount` and the roll, pitch, heading and height of `frame`, or where the frame has none those of `vehicle`;
+    or only `reason`, if the picture is tilted too far; or neither, if too little is known. Impossible values never
+    raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
-    ahead, right, down = _level_from_body(roll_deg, pitch_deg)[:, 2]
+    ahead, right, down = (_level_from_body(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
     if tilt_deg > MOST_TILT_DEG:
         return View(reason=f"it is tilted {tilt_deg:.0f} degrees")
@@ -196,7 +215,7 @@ class _Taking:
         roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
         self.is_attitude_known = roll_deg is not None and pitch_deg is not None
         known = (roll_deg or 0.0, pitch_deg or 0.0) if self.is_attitude_known else (0.0, 0.0)
-        self._level_from_body = _level_from_body(*known)
+        self._level_from_straight = _level_from_body(*known) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
         self._sight = sight_of(lens.calibrated, (width, height)) if lens.calibrated else None
@@ -226,7 +245,7 @@ class _Taking:
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
-        return np.asarray(_body_from_lens(up_deg).T @ self._level_from_body @ _body_from_lens(self._lens.up_deg))
+        return np.asarray(_body_from_lens(up_deg).T @ self._level_from_straight @ _body_from_lens(self._lens.up_deg))
 
     def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
         """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the attitude is unknown."""

@@ -101,12 +101,14 @@ def page_of(
 
 def lens_of(start: Mapping[str, Any]) -> "Lens | None":
     """Return the lens of the flight's camera by the first line of its log; None if it is unknown."""
-    fov_deg, up_deg = (number(start, "config", "source", name) for name in ("fov_deg", "up_deg"))
+    fov_deg, up_deg, ahead_deg, right_deg = (
+        number(start, "config", "source", name) for name in ("fov_deg", "up_deg", "mount_ahead_deg", "mount_right_deg")
+    )
     if fov_deg is None or not 0 < fov_deg < 180:
         return None
-    from edgevpr.frames.level import Lens  # with OpenCV
+    from edgevpr.frames.level import Lens, Mount  # with OpenCV
 
-    return Lens(fov_deg, up_deg or 0.0)
+    return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 
 def _figures(flight: LoggedFlight) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.types import Frame, Pose, Vehicle
-from edgevpr.frames.level import Lens, View, levelled
+from edgevpr.frames.level import Lens, Mount, View, leaning, levelled
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 
 CAMERA = Camera(noise_sigma=0)
@@ -237,3 +237,51 @@ def test_any_shape_is_levelled(shape):
     assert found.image.shape[:2] == (max(shape[:2]),) * 2
     assert found.mask.shape == found.image.shape[:2]
     assert found.mask.any()
+
+
+def turned_by(mount, heading_deg, roll_deg, pitch_deg):
+    """Heading, roll and pitch of a camera that is mounted so, of an airframe with this attitude."""
+    yaw = math.radians(heading_deg)
+    about_down = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+    body = Mount(pitch_deg, -roll_deg).body_from_straight()
+    all_of_it = about_down @ body @ mount.body_from_straight()
+    return {
+        "heading_deg": math.degrees(math.atan2(all_of_it[1, 0], all_of_it[0, 0])) % 360,
+        "roll_deg": math.degrees(math.atan2(all_of_it[2, 1], all_of_it[2, 2])),
+        "pitch_deg": math.degrees(-math.asin(all_of_it[2, 0])),
+    }
+
+
+@pytest.mark.parametrize(
+    ("mount", "attitude"),
+    [
+        (Mount(9.0, 0.0), (10.0, 0.0, 0.0)),
+        (Mount(0.0, -6.0), (120.0, 0.0, 0.0)),
+        (Mount(9.0, 4.0), (200.0, 15.0, -5.0)),
+    ],
+)
+def test_a_camera_that_does_not_look_straight_down_of_the_airframe(ground, mount, attitude):
+    """With the mount known, its picture is that of one straight above; without, it is taken to be elsewhere."""
+    heading_deg, roll_deg, pitch_deg = attitude
+    told = {"height_m": HEIGHT_M, "heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+    image = seen(ground, **turned_by(mount, *attitude))
+    found = levelled(frame_of(image, **told), None, replace(LENS, mount=mount), FOOTPRINT_M)
+    mask = np.ones((640, 640), bool) if found.mask is None else found.mask
+    assert off(found.image, from_above(ground, found.view), mask) < 0.5
+    blind = levelled(frame_of(image, **told), None, LENS, FOOTPRINT_M)
+    mask = np.ones((640, 640), bool) if blind.mask is None else blind.mask
+    assert off(blind.image, from_above(ground, blind.view), mask) > 2
+
+
+def test_a_mount_counts_as_the_attitude_of_a_level_airframe(ground):
+    told = {"heading_deg": 70.0, "height_m": HEIGHT_M}
+    image = np.zeros((48, 64), np.uint8)
+    pitched, rolled = (
+        frame_of(image, roll_deg=roll_deg, pitch_deg=pitch_deg, **told)
+        for roll_deg, pitch_deg in ((0.0, 9.0), (6.0, 0.0))
+    )
+    level = frame_of(image, roll_deg=0.0, pitch_deg=0.0, **told)
+    for mount, other in ((Mount(ahead_deg=9.0), pitched), (Mount(right_deg=-6.0), rolled)):
+        expected = levelled(other, None, LENS, FOOTPRINT_M).view
+        assert levelled(level, None, replace(LENS, mount=mount), FOOTPRINT_M).view == expected
+        assert leaning(level, None, mount) == leaning(other, None)

@@ -31,7 +31,7 @@ from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.vitals import Vitals
-from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Tally
+from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, ScaleWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
 from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
@@ -66,12 +66,16 @@ class Flight:
         self._governing = Governing(crew, self._pace)
         self._commands = Commands(crew.link, herald, crew.learner)
         self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks)
+        gps = GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot)
+        self._surveyor = Surveyor(herald, gps, config.source)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.tell,
             self._vitals.tell,
             self._map_watch.tell,
             Sight(herald).tell,
-            GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot).tell,
+            ScaleWatch(herald).tell,
+            gps.tell,
+            self._surveyor.tell,
             self._log_event,
             self._learn,
         )
@@ -266,6 +270,10 @@ class Flight:
     def _end(self) -> None:
         crew, totals = self._crew, self.totals()
         systemd.notify(STOPPING=1)
+        try:
+            self._surveyor.end()
+        except Exception:
+            _log.exception("the end of the survey could not be told")
         if crew.link and crew.autopilot:
             crew.link.close()  # sends waiting messages first, so that the log's last line counts them
             crew.autopilot.log_answers()

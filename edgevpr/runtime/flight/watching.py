@@ -8,12 +8,15 @@ import math
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
+from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.text import beside
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.flight.herald import Herald, Trouble
+from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -23,6 +26,7 @@ _KNOWN_WITH = 3  # accepted matches before the map can be left: with fewer, the 
 _LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten are nothing unusual
 _LOST, _LOST_AFTER = 0.9, 10  # probability of being lost, in so many queries in a row that are not accepted
 _FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches that find the map again, with fewer misses between two of them
+_SCALED_BY, _SCALE_SAID = 10, 1.15  # accepted matches, and the ratio of two footprints from which on it is said
 _TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to the next
 
 # In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
@@ -39,6 +43,8 @@ _GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
+_SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
+_ANEW = 3.0  # times the least that counts: a result that was told is told anew when it has changed by more
 
 _log = logging.getLogger(__name__)
 
@@ -144,6 +150,29 @@ class Sight:
             self._map.note(True)
 
 
+class ScaleWatch:
+    """Says once if pictures show clearly more or less ground than those that were cut from an orthophoto for the map: a
+    map cut to the right size finds more. It goes by the first matches that are accepted."""
+
+    def __init__(self, herald: Herald) -> None:
+        self._herald = herald
+        self._seen: list[tuple[float, float]] = []  # ground along a picture in flight, and in the map, metres
+
+    def tell(self, event: Recognition) -> None:
+        """Take the ground that the match of an event shows."""
+        pose, where = event.best and event.best.place.pose, event.located
+        if len(self._seen) == _SCALED_BY or not (where and where.height_ratio and pose and pose.is_surveyed):
+            return
+        self._seen.append((pose.footprint_m * where.height_ratio, pose.footprint_m))
+        if len(self._seen) < _SCALED_BY:
+            return
+        flown_m, cut_m = np.median(self._seen, axis=0).tolist()
+        if abs(math.log(flown_m / cut_m)) > math.log(_SCALE_SAID):
+            text = f"a picture shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m"
+            ground = f"footprint {flown_m:.0f} m, map's {cut_m:.0f} m"
+            self._herald.say(Severity.WARNING, f"{text}: --footprint-m {flown_m:.0f} finds more", ground=ground)
+
+
 class GpsWatch:
     """Compares GPS with the matches: a receiver far from them is jammed, spoofed, or wrong for a moment. It reports
     once when they contradict each other and when they agree again. Every comparison is sent to the autopilot, and the
@@ -222,6 +251,75 @@ class GpsWatch:
         self._against.append((seen, off_m))
         is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN
         self.is_wrong = self.is_wrong or is_proven
+
+
+class Surveyor:
+    """Reports where the map lies and where the camera looks (see `survey`), once each is known and is not as it should
+    be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is held to be wrong: what
+    was reported is taken back where that contradicts it."""
+
+    def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig) -> None:
+        mount_deg = source.mount_ahead_deg, source.mount_right_deg
+        self._herald, self._gps, self._taken = herald, gps, 0
+        self._sightings = Sightings(mount_deg, source.gimbal)
+        self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}
+        self._expected |= {"ahead_deg": mount_deg[:1], "right_deg": mount_deg[1:]}
+        self._told: dict[str, tuple[float, ...]] = {}
+
+    def tell(self, event: Recognition) -> None:
+        """Take the match of an event, and report what has become known by it."""
+        if self._sightings.take(event, self._gps.is_wrong):
+            self._taken += 1
+            if self._taken % _SURVEYED_EVERY == 0:
+                self._look(is_end=False)
+
+    def end(self) -> None:
+        """Report everything that is known now."""
+        self._look(is_end=True)
+
+    def _look(self, is_end: bool) -> None:
+        found, names = self._sightings.result(), set[str]()
+        if found is None:
+            if self._told:
+                self._told.clear()
+                said = "what was said of map and camera is taken back, GPS contradicts it"
+                self._herald.tell(
+                    "survey", Severity.WARNING, said, ground="map and camera are unknown again", said=said
+                )
+            return
+        for name, each in found.measures.items():
+            before = self._told.get(name)
+            is_news = each.differs_from(self._expected[name]) if before is None else each.differs_from(before, _ANEW)
+            if is_news or (is_end and each.is_known):
+                names.add(name)
+        if names or (is_end and self._told):
+            self._report(found, names)
+
+    def _report(self, found: Surveyed, names: set[str]) -> None:
+        """Write a line of all that is known, and say what of `names` is not as it should be."""
+        clear = {name: each for name, each in found.measures.items() if each.differs_from(self._expected[name])}
+        sentences = {name: _surveyed(name, each) for name, each in clear.items()}
+        said = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera are as GPS says"
+        self._herald.note("survey", said=said, **found.fields())
+        self._told |= {name: found.measures[name].value for name in names}
+        for name, (sentence, ground) in sentences.items():
+            if name in names:
+                self._herald.say(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
+
+
+def _surveyed(name: str, found: Measure) -> tuple[str, str]:
+    """Return a result of the survey as a sentence, and in a few words."""
+    first = found.value[0]
+    if name == "off_m":
+        there = f"{beside(*found.value)} of GPS"
+        return f"the map lies {there}, +-{found.sd:.1f} m", f"map {there}"
+    if name == "scale":
+        size = f"{abs(first):.1%} too {'large' if first > 0 else 'small'}"
+        return f"the map is {size}, +-{found.sd:.1%}", f"map is {size}"
+    sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
+    side, key = sides[first > 0], f"source.mount_{name}"
+    looks = f"looks {abs(first):.1f} degrees {side}"
+    return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:

@@ -15,7 +15,17 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import axes_of, moved
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
 from edgevpr.frames.lens import CalibratedLens, read_lens, sight_of
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled, View, leaning, levelled, straightened
+from edgevpr.frames.level import (
+    STRAIGHT_DOWN,
+    UNKNOWN_VIEW,
+    Lens,
+    Levelled,
+    Mount,
+    View,
+    leaning,
+    levelled,
+    straightened,
+)
 from edgevpr.frames.source import is_live
 
 GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
@@ -29,7 +39,8 @@ _log = logging.getLogger(__name__)
 
 class Levelling:
     """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they stay as they
-    are, and only the distance on the ground from the point below the camera to the picture's middle is computed.
+    are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
+    `mount` of the camera; a `lens` has its own.
 
     `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
     (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
@@ -44,9 +55,10 @@ class Levelling:
         below: bool = False,
         on_gimbal: bool = False,
         is_live: bool,
+        mount: Mount = STRAIGHT_DOWN,
     ) -> None:
         self.lens, self.footprint_m = lens, footprint_m
-        self._below, self._on_gimbal, self._is_live = below, on_gimbal, is_live
+        self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
         self._has_warned = False
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
@@ -54,10 +66,10 @@ class Levelling:
         False where the picture shows no ground (None: nowhere)."""
         if vehicle and not (self._is_live and vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
-        if self.lens is None:
-            return Levelled(frame.image, overlay, leaning(frame, vehicle))
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
+        if self.lens is None:
+            return Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount))
         picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
@@ -85,19 +97,25 @@ def levelling_of(
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = calibrated_lens(config)
         return Straightening(calibrated) if calibrated else None
-    lens = lens_of(config)
+    lens, mount = lens_of(config), mount_of(config)
     if lens is None:
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
-        if config.gimbal:
+        if config.gimbal and mount == STRAIGHT_DOWN:
             return None
-    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=config.gimbal, is_live=is_now(config))
+    on_gimbal, is_live = config.gimbal, is_now(config)
+    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
 
 
 def lens_of(config: SourceConfig) -> Lens | None:
     """Return the lens of a configuration's camera; None if it is unknown. Raises as `levelling_of`."""
     calibrated = calibrated_lens(config)
     fov_deg = sight_of(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
-    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated)
+    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, mount_of(config))
+
+
+def mount_of(config: SourceConfig) -> Mount:
+    """Return where a configuration's camera looks beside straight down."""
+    return Mount(config.mount_ahead_deg, config.mount_right_deg)
 
 
 def calibrated_lens(config: SourceConfig) -> CalibratedLens | None:

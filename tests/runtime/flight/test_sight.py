@@ -10,7 +10,7 @@ from pictures import textured
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.watching import Sight
+from edgevpr.runtime.flight.watching import ScaleWatch, Sight
 
 
 class Seen:
@@ -104,3 +104,23 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path
     lines = flight.fly(FakeSource(pictures, clock))
     assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
     assert [line["said"] for line in of_kind(lines, "sight")] == ["map left", "map found again"]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "is_surveyed", "said"),
+    [(0.8, True, ["footprint 128 m, map's 160 m"]), (1.1, True, []), (0.8, False, [])],
+)
+def test_pictures_of_another_scale_than_those_of_an_orthophoto_are_said_once(tmp_path, ratio, is_surveyed, said):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    watch = ScaleWatch(Herald(FlightLog(tmp_path / "log", clock=clock), link))
+    place = SimpleNamespace(pose=SimpleNamespace(footprint_m=160.0, is_surveyed=is_surveyed))
+    found = SimpleNamespace(best=SimpleNamespace(place=place), located=SimpleNamespace(height_ratio=ratio))
+    wrong = SimpleNamespace(best=found.best, located=SimpleNamespace(height_ratio=1.9))
+    missed = SimpleNamespace(best=found.best, located=None)
+    for event in [found, missed, wrong] * 4:
+        watch.tell(event)
+    assert link.texts() == []
+    for event in [missed, found, found, found]:
+        watch.tell(event)
+    assert [text.removeprefix("edgevpr: ") for _, text in link.texts()] == said

@@ -12,7 +12,7 @@ from fakes import vehicle_at
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, View
+from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Mount, View
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.mapmaking.mapping import build_map
@@ -248,3 +248,33 @@ def test_a_gimbal_keeps_the_camera_level_whatever_the_airframe_does():
     fixed = Levelling(Lens(66.0), is_live=True).prepare(frame, level, None)
     assert hung.view == fixed.view
     assert np.array_equal(hung.image, fixed.image)
+
+
+@pytest.mark.parametrize("fov_deg", [LENS.fov_deg, None])
+def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_gimbal(technique, fov_deg):
+    """Of a camera that looks 9 degrees ahead, the point under it is 16 m behind what it shows."""
+    said = {"source.fov_deg": fov_deg, "source.uri": "/dev/video0", "source.mount_ahead_deg": 9.0}
+    for gimbal in (False, True):
+        config = load_config(None, said | {"source.gimbal": gimbal}).source
+        frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
+        vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
+        view = levelling_of(config, technique, footprint_m=FOOTPRINT_M).prepare(frame, vehicle, None).view
+        off_m = view.lean_m if fov_deg is None else FOOTPRINT_M * np.array(view.aside)
+        assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("heading_deg", [0.0, 130.0])
+def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_without(walk, ground, heading_deg):
+    seen = frame(ground, 1, heading_deg=heading_deg, pitch_deg=9.0, told=STRAIGHT | {"heading_deg": heading_deg})
+    ahead_m = HEIGHT_M * math.tan(math.radians(9))
+    turn = math.radians(heading_deg)
+    true_m = np.array([-ahead_m * math.sin(turn), NORTH_M[1] - ahead_m * math.cos(turn)])
+    wrong_m = []
+    for mount in (Mount(9.0), STRAIGHT_DOWN):
+        event = walk(Levelling(replace(LENS, mount=mount), footprint_m=FOOTPRINT_M, is_live=False)).step(seen)
+        assert recognised(event, 1)
+        at = event.located.position
+        wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
+    assert wrong_m[0] < 2.5
+    assert wrong_m[1] == pytest.approx(ahead_m, abs=2.5)

@@ -1,0 +1,85 @@
+"""Moving of a map to where GPS has it: by the offset, and the scale, that a flight has found (see
+`runtime.flight.survey`, and the lines of kind "survey" of its log). This is the work of the command `edgevpr map move`.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Place, Position
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import identity_of
+from edgevpr.runtime.flight.flightlog import flight_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapMove:
+    """The move of so many `places`: `east_m` and `north_m` are the step of the `middle` (latitude and longitude in
+    degrees), with a standard deviation of `sd_m`. The distances from it were divided by 1 + `scale` (None: the flight
+    does not tell, and they stay)."""
+
+    places: int
+    middle: tuple[float, float]
+    east_m: float
+    north_m: float
+    sd_m: float
+    scale: float | None
+
+    def laid(self, position: Position) -> Position:
+        """Return the moved position."""
+        away_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
+        east_m, north_m = (each / (1 + (self.scale or 0.0)) for each in map(float, away_m))
+        lat_deg, lon_deg = moved(*self.middle, east_m + self.east_m, north_m + self.north_m)
+        return replace(position, lat_deg=lat_deg, lon_deg=lon_deg)
+
+
+def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
+    """Move all places of a map that is open for adding, in one transaction, by the last result in a flight log. Raises
+    UsageError if the log has none, or is not of this very map as it is now, and MapError as `PlaceMap` does."""
+    found, identity = None, None
+    for line in flight_of(log):
+        if line["kind"] == "start":
+            identity = line.get("map_identity")
+        elif line["kind"] == "survey":
+            found = line
+    if identity != asdict(identity_of(place_map)):
+        raise UsageError(
+            f"{log} is not of {place_map.path} as it is now: it is of another map, or this one was changed or moved "
+            "since: give the log of a flight with it."
+        )
+    move = _move_of(found or {}, len(place_map))
+    if move is None:
+        raise UsageError(
+            f"{log} does not say where the map lies: that takes some minutes with good GPS and accepted matches, in "
+            "which the heading changes."
+        )
+    with place_map.transaction():
+        for place in list(place_map.places()):
+            _lay(place_map, place, move)
+    return move
+
+
+def _move_of(line: dict[str, Any], places: int) -> MapMove | None:
+    """Return the move by a line of kind "survey"; None if it does not say where the map lies."""
+    match line:
+        case {
+            "off_m": [int() | float() as east_m, int() | float() as north_m],
+            "off_sd": int() | float() as sd_m,
+            "middle": {"lat_deg": float() as lat_deg, "lon_deg": float() as lon_deg},
+            "scale": int() | float() | None as scale,
+        }:
+            middle = lat_deg, lon_deg
+            return MapMove(places=places, middle=middle, east_m=-east_m, north_m=-north_m, sd_m=sd_m, scale=scale)
+    return None
+
+
+def _lay(place_map: PlaceMap, place: Place, move: MapMove) -> None:
+    if place.position is None:
+        return
+    pose = place.pose
+    if pose:  # the recorded position moves too: another refinement must not bring it back
+        recorded = pose.recorded and move.laid(pose.recorded)
+        pose = replace(pose, footprint_m=pose.footprint_m / (1 + (move.scale or 0.0)), recorded=recorded)
+    place_map.lay(place.place_id, move.laid(place.position), pose)

@@ -1,0 +1,108 @@
+"""`edgevpr map move`: a map is moved by the offset and the scale that a flight with it has found, or not at all."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from edgevpr.cli.main import main
+from edgevpr.core.contract import Descriptor
+from edgevpr.core.errors import PlaceError, UsageError
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Frame, Pose, Position
+from edgevpr.mapmaking.moving import move_map
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import identity_of
+from edgevpr.techniques import create
+
+HOME = 47.0, 8.0
+OFF_M = 3.0, -4.0
+SURVEY = {"kind": "survey", "said": "", "matches": 99, "middle": {"lat_deg": HOME[0], "lon_deg": HOME[1]}}
+FOUND = SURVEY | {"off_m": list(OFF_M), "off_sd": 0.4, "scale": None, "scale_sd": None}
+PICTURE = np.zeros((8, 8), np.uint8)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A map of two places with a pose, 500 m apart, and one without a position."""
+    spec = create("cohog", {"camera": "nadir"}).spec
+    coarse, fine = (part and np.zeros(part.shape, part.dtype) for part in (spec.coarse, spec.fine))
+    descriptor = Descriptor(coarse=coarse, fine=fine, quality=1.0)
+    pose = Pose(up_deg=10.0, footprint_m=130.0, covariance_m2=(1.0, 0.0, 1.0), recorded=Position(47.0, 8.001))
+    frame = Frame(image=PICTURE, name="0", t_mono_s=0.0, position=Position(*HOME, 300.0), pose=pose)
+    other = Position(*moved(*HOME, 500.0, 0.0))
+    with PlaceMap.create(tmp_path / "m.gpkg", spec) as place_map:
+        place_map.add(frame, descriptor)
+        place_map.add(replace(frame, name="1", position=other, pose=replace(pose, recorded=None)), descriptor)
+        place_map.add(replace(frame, name="2", position=None, pose=None), descriptor)
+    return tmp_path / "m.gpkg"
+
+
+def log_of(path, *lines):
+    """The log of a flight with the map, as it is now."""
+    log = path.with_name("flight.jsonl")
+    with PlaceMap.open(path) as place_map:
+        start = {"kind": "start", "time": "now", "t_mono_s": 0.0, "map_identity": asdict(identity_of(place_map))}
+    log.write_text("".join(json.dumps(line) + "\n" for line in (start, *lines)))
+    return log
+
+
+def places_of(path):
+    with PlaceMap.open(path) as place_map:
+        return list(place_map.places())
+
+
+def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
+    log = log_of(path, FOUND | {"off_m": [99.0, 0.0]}, FOUND)
+    before = places_of(path)
+    assert main(["map", "move", str(path), "--by", str(log)]) == 0
+    assert "3 places moved 3.0 m west and 4.0 m north, +-0.4 m" in capsys.readouterr().out
+    after = places_of(path)
+    for one, other in zip(before[:2], after[:2], strict=True):
+        step = offset_m(one.position.lat_deg, one.position.lon_deg, other.position.lat_deg, other.position.lon_deg)
+        assert step == pytest.approx((-3.0, 4.0), abs=1e-3)
+        assert replace(other.pose, recorded=None) == replace(one.pose, recorded=None)
+    assert after[0].position.alt_m == 300.0
+    recorded = after[0].pose.recorded
+    assert offset_m(47.0, 8.001, recorded.lat_deg, recorded.lon_deg) == pytest.approx((-3.0, 4.0), abs=1e-3)
+    assert after[2].position is None
+
+
+def test_a_scale_is_taken_back_around_the_middle_of_the_flight(path, capsys):
+    log = log_of(path, FOUND | {"scale": 0.01})
+    assert main(["map", "move", str(path), "--by", str(log), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scale"] == 0.01
+    first, second, _ = places_of(path)
+    at_m = offset_m(*HOME, second.position.lat_deg, second.position.lon_deg)
+    assert at_m == pytest.approx((500 / 1.01 - 3.0, 4.0), abs=1e-2)
+    assert first.pose.footprint_m == pytest.approx(130 / 1.01)
+
+
+def test_the_same_log_moves_a_map_once(path):
+    log = log_of(path, FOUND)
+    assert main(["map", "move", str(path), "--by", str(log)]) == 0
+    with PlaceMap.open_for_adding(path) as place_map, pytest.raises(UsageError, match="moved since"):
+        move_map(place_map, log)
+
+
+@pytest.mark.parametrize("lines", [(), (SURVEY | FOUND | {"off_m": None, "off_sd": None},), (FOUND, SURVEY)])
+def test_a_log_that_does_not_say_where_the_map_lies_moves_nothing(path, lines, capsys):
+    log, before = log_of(path, *lines), places_of(path)
+    assert main(["map", "move", str(path), "--by", str(log)]) != 0
+    assert "does not say where the map lies" in capsys.readouterr().err
+    assert places_of(path) == before
+
+
+def test_a_damaged_place_stops_the_whole_move(path):
+    with PlaceMap.open_for_adding(path) as place_map, place_map.transaction():
+        place_map.db.execute("UPDATE places SET heading_deg = 'north' WHERE place_id = 2")
+    log, before = log_of(path, FOUND), places_of_first(path)
+    with PlaceMap.open_for_adding(path) as place_map, pytest.raises(PlaceError):
+        move_map(place_map, log)
+    assert places_of_first(path) == before
+
+
+def places_of_first(path):
+    with PlaceMap.open(path) as place_map:
+        return next(place_map.places([1]))

@@ -1,0 +1,259 @@
+"""The survey: where a map lies beside GPS, how large it is, and where the camera looks, by the matches of a flight."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from air import HOME, match_at
+from fakes import FakeClock, FakeLink, vehicle_at
+
+from edgevpr.core.config import load_config
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Position, Receiver
+from edgevpr.frames.level import View
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.survey import Sightings
+from edgevpr.runtime.flight.watching import GpsWatch, Surveyor
+
+OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
+HEIGHT_M, SPEED_M_S, FIX_SD_M, GPS_SD_M, GPS_LASTS_S = 100.0, 15.0, 2.0, 1.0, 60.0
+SEEN = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0))
+
+
+def circle(t_s):
+    """Position (2,) and heading in a circle of 300 m."""
+    turn = t_s * SPEED_M_S / 300
+    return 300 * np.array([1 - math.cos(turn), math.sin(turn)]), math.degrees(turn)
+
+
+def eight(t_s):
+    """The like in two circles beside each other, the one to the right and the other to the left."""
+    round_s = 2 * math.pi * 300 / SPEED_M_S
+    at_m, heading_deg = circle(t_s % round_s)
+    side = 1 if t_s % (2 * round_s) < round_s else -1
+    return at_m * (side, 1), side * heading_deg
+
+
+def lanes(t_s):
+    """The like over lanes of 600 m, side by side, without the turns between them."""
+    lane, share = divmod(t_s * SPEED_M_S / 600, 1)
+    is_back = lane % 2
+    return np.array([60 * lane, 600 * (1 - share if is_back else share)]), 180.0 * is_back
+
+
+def line(t_s):
+    return np.array([0.0, SPEED_M_S * t_s]), 0.0
+
+
+def events(way, seconds, seed=1, wrong=0.0, **said):
+    """The matches of a flight, one a second, with a GPS whose error lasts; `wrong` is the share of wrong ones."""
+    rng, gps_off_m = np.random.default_rng(seed), np.zeros(2)
+    for t_s in map(float, range(seconds)):
+        at_m, heading_deg = way(t_s)
+        after_m, _ = way(t_s + 0.01)
+        heading = math.radians(heading_deg)
+        ahead, right = (
+            np.array([math.sin(heading), math.cos(heading)]),
+            np.array([math.cos(heading), -math.sin(heading)]),
+        )
+        gps_off_m = (1 - 1 / GPS_LASTS_S) * gps_off_m + rng.normal(0, GPS_SD_M * math.sqrt(2 / GPS_LASTS_S), 2)
+        mount_m = HEIGHT_M * (math.tan(math.radians(AHEAD_DEG)) * ahead + math.tan(math.radians(RIGHT_DEG)) * right)
+        fix_m = at_m + OFF_M + SCALE * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
+        if rng.random() < wrong:
+            fix_m = fix_m + rng.normal(0, 150, 2)
+        gps = moved(*HOME, *(at_m + gps_off_m))
+        velocity = np.clip((after_m - at_m) / 0.01, -SPEED_M_S, SPEED_M_S)
+        known = {"heading_deg": heading_deg % 360, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
+        known |= {"velocity_m_s": tuple(velocity), "gps": Receiver(*gps, GPS_SD_M, t_s)} | said
+        event = match_at(
+            Position(*moved(*HOME, *fix_m)), t_s, vehicle_at(*gps, t_s, **known), FIX_SD_M, (int(t_s),), SEEN
+        )
+        event.located = replace(event.located, heading_deg=heading_deg % 360)
+        yield event
+
+
+def surveyed(way, seconds, mount_deg=(0.0, 0.0), **how):
+    sightings = Sightings(mount_deg, is_level=False)
+    for event in events(way, seconds, **how):
+        sightings.take(event)
+    return sightings.result()
+
+
+def wrong_m(found):
+    """Metres (2,) by which the offset that was found is wrong in the middle of the flight."""
+    middle_m = np.array(offset_m(*HOME, found.middle.lat_deg, found.middle.lon_deg))
+    return np.array(found.off_m.value) - OFF_M - SCALE * middle_m
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.05])
+@pytest.mark.parametrize("way", [eight, lanes])
+def test_offset_scale_and_mount_are_told_apart(way, wrong):
+    for seed in range(4):
+        found = surveyed(way, 900, seed=seed, wrong=wrong)
+        assert all(each.is_known for each in found.measures.values())
+        assert np.abs(wrong_m(found)).max() < 2.5 * found.off_m.sd < 1.5
+        assert found.scale.value[0] == pytest.approx(SCALE, abs=2.5 * found.scale.sd)
+        assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=2 * found.ahead_deg.sd)
+        assert found.right_deg.value[0] == pytest.approx(RIGHT_DEG, abs=2 * found.right_deg.sd)
+
+
+def test_standard_deviations_are_honest():
+    """Over many flights the errors are as large as is said, neither half nor double of it."""
+    found = [surveyed(eight, 600, seed=seed) for seed in range(30)]
+    shares = np.array([wrong_m(each) / each.off_m.sd for each in found])
+    assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
+    shares = np.array([(each.scale.value[0] - SCALE) / each.scale.sd for each in found])
+    assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
+
+
+def test_in_one_circle_a_camera_that_looks_outwards_is_no_scale():
+    found = surveyed(circle, 900)
+    assert [name for name, each in found.measures.items() if each.is_known] == ["off_m", "ahead_deg"]
+    assert np.abs(wrong_m(found)).max() < 2.5 * found.off_m.sd
+    assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=2 * found.ahead_deg.sd)
+
+
+def test_on_a_straight_line_an_offset_is_no_mount():
+    found = surveyed(line, 900, wrong=0.05)
+    assert [name for name, each in found.measures.items() if each.is_known] == ["scale"]
+    assert found.fields()["off_m"] is None
+
+
+def test_what_is_set_of_the_mount_counts():
+    found = surveyed(lanes, 600, mount_deg=(2.0, -1.0))
+    assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG + 2.0, abs=1.0)
+    assert found.right_deg.value[0] == pytest.approx(RIGHT_DEG - 1.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"has_gps": False},
+        {"heading_deg": None},
+        {"height_m": None},
+        {"roll_deg": None},
+        {"velocity_m_s": (math.nan, 0.0)},
+        {"gps": None},
+        {"gps": Receiver(*HOME, 8.0, 0.0)},
+    ],
+)
+def test_without_gps_or_attitude_nothing_is_found(said):
+    assert surveyed(lanes, 300, **said) is None
+
+
+def test_a_position_that_may_be_ours_is_not_gps():
+    """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
+    rng = np.random.default_rng(3)
+    sightings = Sightings((0.0, 0.0), is_level=False)
+    for event in events(lanes, 900):
+        vehicle, v = event.vehicle, event.vehicle.velocity_m_s
+        late = moved(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
+        ours = moved(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
+        gps = Receiver(*late, GPS_SD_M, event.frame.t_mono_s)
+        event.vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
+        sightings.take(event)
+    found = sightings.result()
+    assert np.abs(wrong_m(found)).max() < 2.5 * found.off_m.sd
+    assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=found.ahead_deg.sd)
+
+
+class Flown:
+    """A surveyor that has heard a flight; `lines` are its lines of the log, `texts` what the ground was told."""
+
+    def __init__(self, folder, flight, **source):
+        clock = FakeClock(0.0)
+        link, config = FakeLink(clock), load_config(None, {f"source.{key}": known for key, known in source.items()})
+        with FlightLog(folder / "log", clock=clock) as flight_log:
+            herald = Herald(flight_log, link)
+            watch = GpsWatch(5.0, herald, None)
+            surveyor = Surveyor(herald, watch, config.source)
+            for event in flight:
+                clock.now_s = event.frame.t_mono_s
+                watch.tell(event)
+                surveyor.tell(event)
+            self.last = clock.now_s
+            surveyor.end()
+        self.lines = [line for line in read_log(folder / "log") if line["kind"] == "survey"]
+        self.texts = [text for _, text in link.texts() if "GPS is" not in text and "GPS agrees" not in text]
+
+
+def test_it_is_said_once_and_at_the_end(tmp_path):
+    flown = Flown(tmp_path, events(eight, 1800))
+    *_, last = flown.lines
+    assert 2 <= len(flown.lines) <= 5, "one for each that becomes known, and the end"
+    assert last["t_mono_s"] == flown.last
+    assert last["ahead_deg"] == pytest.approx(AHEAD_DEG, abs=1.0)
+    assert math.dist(last["off_m"], OFF_M + SCALE * np.array(offset_m(*HOME, *last["middle"].values()))) < 1.0
+    assert re.search(
+        r"the map lies \d+\.\d m east and \d+\.\d m south of GPS, \+-0\.\d m; the map is 1\.0% ", last["said"]
+    )
+    assert re.search(
+        r"looks 9\.\d degrees ahead of straight down, .*: set source\.mount_ahead_deg: 9\.\d;", last["said"]
+    )
+    assert re.search(
+        r"looks [23]\.\d degrees left of straight down, .*: set source\.mount_right_deg: -[23]", last["said"]
+    )
+    assert len(flown.texts) == 8, "each of four when it is known, and at the end"
+    assert all(len(text.encode()) <= 50 and not text.endswith("...") for text in flown.texts)
+
+
+def right(way=lanes, seconds=900):
+    """The matches of a map and a camera that are right."""
+    rng = np.random.default_rng(2)
+    for event in events(way, seconds):
+        at = Position(*moved(event.vehicle.lat_deg, event.vehicle.lon_deg, *rng.normal(0, FIX_SD_M, 2)))
+        event.located = replace(event.located, position=at)
+        yield event
+
+
+def test_a_map_and_a_camera_that_are_right_are_not_talked_of(tmp_path):
+    flown = Flown(tmp_path, right())
+    assert flown.texts == []
+    (end,) = flown.lines
+    assert end["off_m"] == pytest.approx([0.0, 0.0], abs=1.0)
+    assert end["ahead_deg"] == pytest.approx(0.0, abs=1.0)
+
+
+def led(law, **how):
+    """A flight whose map and camera are right, and whose receiver is led to the east by a law of time."""
+    for event in right(**how):
+        away_m = law(event.frame.t_mono_s)
+        vehicle = event.vehicle
+        there = moved(vehicle.lat_deg, vehicle.lon_deg, away_m, 0.0)
+        gps = replace(vehicle.gps, lat_deg=there[0], lon_deg=there[1])
+        event.vehicle = replace(vehicle, lat_deg=there[0], lon_deg=there[1], gps=gps)
+        yield event
+
+
+@pytest.mark.parametrize("way", [eight, circle])
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda t_s: 0.5 * t_s,
+        lambda t_s: 0.5 * max(0.0, t_s - 300),
+        lambda t_s: 15.0 * (t_s > 300),
+        lambda t_s: 100.0 * (t_s > 100),
+        lambda t_s: 40.0 * (t_s % 100 < 60),
+        lambda t_s: 40.0,
+    ],
+)
+def test_of_a_gps_that_is_wrong_nothing_is_learnt(tmp_path, law, way):
+    assert Flown(tmp_path, led(law, way=way)).lines == []
+
+
+def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
+    def then_wrong():
+        for event in events(eight, 1200):
+            if event.frame.t_mono_s > 700:
+                away = moved(event.vehicle.lat_deg, event.vehicle.lon_deg, 60.0, 0.0)
+                gps = replace(event.vehicle.gps, lat_deg=away[0], lon_deg=away[1])
+                event.vehicle = replace(event.vehicle, lat_deg=away[0], lon_deg=away[1], gps=gps)
+            yield event
+
+    flown = Flown(tmp_path, then_wrong())
+    assert flown.lines[0]["off_m"]
+    assert "off_m" not in flown.lines[-1]
+    assert "taken back" in flown.lines[-1]["said"]
