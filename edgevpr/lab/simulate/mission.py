@@ -23,7 +23,7 @@ from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.foreseen import Flown, Foreseen, expect, late_s, with_truth
 from edgevpr.lab.simulate.motion import read_track
 from edgevpr.lab.simulate.processes import autopilot_process, started
-from edgevpr.lab.simulate.rehearsal import SPEED_M_S, write_rehearsal
+from edgevpr.lab.simulate.rehearsal import ground_under, SPEED_M_S, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.review.album import Album, album_of_map
@@ -68,7 +68,7 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
         raise UsageError(f"The track is flown in {span_s:.0f} s: a rehearsal needs one of {_LEAST_S:.0f} s or more.")
     ground = read_ground(mission.place_map)
     references = album_of_map(mission.map_images, ground)
-    orthophoto = Orthophoto(mission.orthophoto)
+    orthophoto = Orthophoto(mission.orthophoto, ground_under(mission.shots, mission.fov_deg))
     mission = replace(mission, shots=thinned(mission.shots, _paced_m(mission)))
     try:
         _take_pictures(mission, folder, orthophoto)
