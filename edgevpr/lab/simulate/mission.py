@@ -23,7 +23,7 @@ from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.foreseen import Flown, Foreseen, expect, late_s, with_truth
 from edgevpr.lab.simulate.motion import read_track
 from edgevpr.lab.simulate.processes import autopilot_process, started
-from edgevpr.lab.simulate.rehearsal import ground_under, SPEED_M_S, write_rehearsal
+from edgevpr.lab.simulate.rehearsal import SPEED_M_S, ground_under, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.review.album import Album, album_of_map
