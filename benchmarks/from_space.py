@@ -4,7 +4,7 @@ The map is cut from the raster `before` of sat_marash by `edgevpr map build --or
 over `after`, months later and after an earthquake: 96 pictures of half a metre a pixel, from 120 m above the ground,
 swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` does: with heading and height, as an
 autopilot tells them, and without. Maps are cut at five scales, the footprint told being too small or too large, and of
-rasters of three resolutions. Foreign: pictures of other ground (all other sites of the set, both days, turned by eight
+rasters of four resolutions. Foreign: pictures of other ground (all other sites of the set, both days, turned by eight
 angles), told heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
@@ -37,7 +37,7 @@ SET, FOV_DEG, HEIGHT_M = "sat_marash", 66.0, 120.0
 FOOTPRINT_M = 2 * HEIGHT_M * float(np.tan(np.radians(FOV_DEG / 2)))
 SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
-SCALES, RESOLUTIONS_M = (0.65, 0.8, 1.0, 1.25, 1.5), (0.5, 1.0, 2.0)
+SCALES, RESOLUTIONS_M = (0.65, 0.8, 1.0, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0)
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 _COLUMNS = {
     "pixel m": "{resolution_m:g}",

@@ -24,6 +24,8 @@ from edgevpr.runtime.recognise.landmarks import describe
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
+# Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
+_SHARP_PX, _LEAST_PX = 100, 32
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
@@ -113,7 +115,10 @@ class OrthophotoSource(RecordingSource):
         tiles = f", of {to_fetch[0]} tiles to fetch from {self._orthophoto.name}" if to_fetch else ""
         whole_s = self.total * each_s
         lasts = f"{math.ceil(whole_s)} s" if whole_s < 100 else f"{whole_s / 60:.0f} min"
-        return f"{self.total} places will be cut{tiles}: {size}, about {lasts} without calibration"
+        across_px = self._footprint_m / self._orthophoto.resolution_m
+        few = "" if across_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
+        sharp = f"{across_px:.0f} pixels along a picture{few}"
+        return f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {lasts} without calibration"
 
     def to_fetch(self) -> tuple[int, Iterator[None]] | None:
         """See `Orthophoto.to_fetch`."""
@@ -122,6 +127,15 @@ class OrthophotoSource(RecordingSource):
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
+
+
+def require_sharp(orthophoto: Orthophoto, footprint_m: float) -> None:
+    """Raise UsageError if the raster has too few pixels for pictures with sides of `footprint_m`."""
+    if (across_px := footprint_m / orthophoto.resolution_m) < _LEAST_PX:
+        raise UsageError(
+            f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprint_m:g} m, and nothing is found "
+            f"with fewer than {_LEAST_PX}: give a sharper one."
+        )
 
 
 def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:

@@ -71,7 +71,7 @@ class Cuttings:
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
-        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of
+        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp
         from edgevpr.mapmaking.missions import read_area
         from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
         from edgevpr.mapmaking.tiles import ground_of
@@ -79,6 +79,7 @@ class Cuttings:
         area = read_area(self.area) if self.area else None
         orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, self.footprint_m) if area else None)
         lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area)
+        require_sharp(orthophoto, self.footprint_m)
         return OrthophotoSource(orthophoto, lattice, self.footprint_m, time.monotonic, only=only)
 
 

@@ -7,13 +7,15 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-from rasters import HOME, grid, ground_m, marked_raster, write_raster
+from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
 from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, lattice_of
+from edgevpr.mapmaking.making import Cuttings
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
 
@@ -159,3 +161,12 @@ def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
     cut = frames_of(source_of(path, 80.0, 20.0, only=[each.name for each in asked]))
     assert [each.name for each in cut] == sorted(each.name for each in asked)
     assert np.array_equal(cut[0].image, whole[2].image)
+
+
+def test_a_raster_says_how_sharp_its_pictures_are_and_one_that_shows_nothing_is_refused(tmp_path):
+    path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
+    fine, coarse = (Cuttings(orthophoto=str(path), footprint_m=side_m, spacing_m=20.0) for side_m in (60.0, 40.0))
+    assert ", 120 pixels along a picture, about" in fine.open().forecast(20.0, technique)
+    assert ", 80 pixels along a picture, too few to find all" in coarse.open().forecast(20.0, technique)
+    with pytest.raises(UsageError, match="has 30 pixels along a picture of 15 m"):
+        Cuttings(orthophoto=str(path), footprint_m=15.0, spacing_m=20.0).open()

@@ -2,7 +2,7 @@
 read from a positions.csv, or follows the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
 
 
-def ground_under(shots: list[GeoTag], fov_deg: float) -> Ground:
+def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     """Return the ground that the pictures show, for tiles of it."""
     points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
     highest_m = max(shot.height_m or 0.0 for shot in shots)
