@@ -154,7 +154,7 @@ def map_build(args: Namespace) -> int:
     more |= {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
-    show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made))
+    show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made, args.orthophoto is not None))
     return exit_code(unusable)
 
 
