@@ -4,16 +4,17 @@ The map is cut from the raster `before` of sat_marash by `edgevpr map build --or
 over `after`, months later and after an earthquake: 96 pictures of half a metre a pixel, from 120 m above the ground,
 swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` does: with heading and height, as an
 autopilot tells them, and without. Maps are cut at five scales, the footprint told being too small or too large, and of
-rasters of four resolutions. Foreign: pictures of other ground (all other sites of the set, both days, turned by eight
-angles), told heading and height.
+rasters of four resolutions. Foreign: pictures of other ground (all other sites of the set, both days, and all other
+sets from the air, each turned by eight angles), told heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
 edgevpr were chosen on pictures of this set, too; not on these.
 """
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import base
@@ -37,6 +38,7 @@ SET, FOV_DEG, HEIGHT_M = "sat_marash", 66.0, 120.0
 FOOTPRINT_M = 2 * HEIGHT_M * float(np.tan(np.radians(FOV_DEG / 2)))
 SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
+_SITE = "Hatay_Mimar_Sinan"  # that the rasters show
 SCALES, RESOLUTIONS_M = (0.65, 0.8, 1.0, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0)
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 _COLUMNS = {
@@ -88,10 +90,10 @@ def flown(raster: Path) -> Iterator[Frame]:
 
 
 def foreign(folder: Path) -> Iterator[Frame]:
-    """Give pictures of other ground."""
-    sites = {row["file"]: row["site"] for row in base.read_csv(folder / "sites.csv")}
+    """Give pictures of other ground: of the set's other sites, or of another set."""
+    sites = {row["file"]: row["site"] for row in base.read_csv(folder / "sites.csv")} if folder.name == SET else {}
     for path in sorted([*(folder / "ref").iterdir(), *(folder / "query").iterdir()]):
-        if "mimar" in sites.get(path.name, path.name).lower().replace(" ", ""):
+        if sites.get(path.name) == _SITE:
             continue
         image = read_image(path)
         middle = image.shape[1] / 2 - 0.5, image.shape[0] / 2 - 0.5
@@ -102,13 +104,15 @@ def foreign(folder: Path) -> Iterator[Frame]:
             yield Frame(image=turned, name=path.name, t_mono_s=0.0, heading_deg=turn_deg, height_m=HEIGHT_M)
 
 
-def matched(path: Path, frames: list[Frame], is_told: bool) -> Row:
+def matched(path: Path, frames: Iterable[Frame], is_told: bool) -> Row:
     """Match each picture alone; with `is_told`, with its heading and height."""
     fov = {"source.fov_deg": FOV_DEG} if is_told else {}
     config = walks.config(map=str(path), **{"source.camera": "nadir"}, **fov)
     recogniser = open_recogniser(config, load_board("this"), known=("heading", "height") if is_told else ())
-    right, errors_m = 0, []
+    asked = right = 0
+    errors_m = []
     for frame in frames:
+        asked += 1
         told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
         event = recogniser.step(replace(told, position=None))
         if event.failed:
@@ -123,7 +127,7 @@ def matched(path: Path, frames: list[Frame], is_told: bool) -> Row:
             errors_m.append(float(distance_m(*here, event.position.lat_deg, event.position.lon_deg)))
     recogniser.place_map.close()
     found: Row = {"known": "heading, height" if is_told else "nothing", "places": len(recogniser.index)}
-    found |= {"queries": len(frames), "right": right, "accepted": len(errors_m)}
+    found |= {"queries": asked, "right": right, "accepted": len(errors_m)}
     found |= {"wrong": sum(error_m > FOOTPRINT_M / 4 for error_m in errors_m)}
     if errors_m and np.isfinite(errors_m).all():
         found["error"] = {"median_m": round(float(np.median(errors_m)), 1)}
@@ -143,8 +147,10 @@ def measure(folder: Path, work: Path) -> list[Row]:
         for is_told in (False, True):
             rows.append({"resolution_m": resolution_m, "scale": scale} | matched(path, frames, is_told))
             print(rows[-1], flush=True)
-    others = matched(work / "0.5-1.gpkg", list(foreign(folder)), True)
-    rows.append({"resolution_m": 0.5, "scale": 1.0} | others | {"known": "foreign ground", "right": "-"})
+    others = [each for each in base.find_sets(camera="nadir") if each.name != SET]
+    for known, folders in (("foreign: other sites", [folder]), ("foreign: other sets", others)):
+        found = matched(work / "0.5-1.gpkg", chain.from_iterable(map(foreign, folders)), True)
+        rows.append({"resolution_m": 0.5, "scale": 1.0} | found | {"known": known, "right": "-"})
     return rows
 
 

@@ -65,7 +65,9 @@ def read_area(path: str | Path) -> Area:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
         area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
     except OSError as error:
-        raise UsageError(f"{path} cannot be read ({error.strerror}): give a mission file or GeoJSON.") from error
+        raise UsageError(
+            f"{path} cannot be read ({error.strerror}): give a mission file, GeoJSON, or LAT,LON,RADIUS_M."
+        ) from error
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
         raise UsageError(
             f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl and no GeoJSON that can be "
