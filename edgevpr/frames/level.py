@@ -6,7 +6,7 @@ shows. Recognition and mapping level their pictures by `runtime.recognise.levell
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -116,12 +116,14 @@ def levelled(
     *,
     overlay: Mask | None = None,
     below: bool = False,
+    scale: float = 1.0,
 ) -> Levelled:
     """Warp a picture as if it had been taken straight from above. Roll, pitch, heading and height are those of the
     frame, or where it has none those of `vehicle` (None: no report).
 
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
-    scales it until its longest side shows `footprint_m` (None, or height unknown: not scaled). Its middle shows the
+    scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The picture shows
+    `scale` times as much ground as the height tells. Its middle shows the
     same point as before or, with `below`, the point under the camera. `overlay`, bool (H, W), is False where the
     picture shows no ground (None: it shows ground everywhere). A picture of known pose is returned unchanged, and
     so is, but for the distortion of its lens, one that needs no warp or is tilted too far for one. Impossible values in
@@ -134,13 +136,14 @@ def levelled(
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
         return straightened(frame.image, overlay, view, lens.calibrated)
-    zoom = taking.own_m / footprint_m if taking.own_m and footprint_m else 1.0
+    own_m = taking.own_m and scale * taking.own_m
+    zoom = own_m / footprint_m if own_m and footprint_m else scale
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
         zoom = 1.0
     turn_deg = abs(shorter_deg(taking.top_deg or 0.0))
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
-        view = View(up_deg=taking.top_deg, footprint_m=taking.own_m, aside=aside, focal=focal)
+        view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, focal=focal)
         return straightened(frame.image, overlay, view, lens.calibrated)
 
     side = min(taking.longest_px, _LONGEST_PX)
@@ -158,7 +161,7 @@ def levelled(
         return straightened(frame.image, overlay, view, lens.calibrated)
     view = View(
         up_deg=None if taking.heading_deg is None else 0.0,
-        footprint_m=taking.own_m and taking.own_m / zoom,
+        footprint_m=own_m and own_m / zoom,
         zoom=zoom,
         focal=out_px / side,
         aside=(0.0, 0.0) if below and taking.is_attitude_known else taking.aside(turned, zoom),
@@ -178,6 +181,18 @@ def straightened(image: Image, overlay: Mask | None, view: View, lens: Calibrate
 def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", view: View) -> Levelled:
     mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
     return Levelled(warp.picture(image), None if mask.all() else mask, view)
+
+
+def enlarged(picture: Levelled, zoom: float) -> Levelled:
+    """Enlarge a picture, that is not warped otherwise, around its middle; its size stays."""
+    high_px, wide_px = picture.image.shape[:2]
+    middle = np.array([wide_px - 1, high_px - 1]) / 2
+    matrix = np.column_stack([zoom * np.eye(2), (1 - zoom) * middle])
+    image = cv2.warpAffine(picture.image, matrix, (wide_px, high_px))
+    shows = np.ones((high_px, wide_px), np.uint8) if picture.mask is None else picture.mask.astype(np.uint8)
+    mask = cv2.warpAffine(shows, matrix, (wide_px, high_px), flags=cv2.INTER_NEAREST) > 0
+    view = replace(picture.view, zoom=zoom * picture.view.zoom)
+    return Levelled(np.asarray(image, np.uint8), None if mask.all() else mask, view)
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:

@@ -22,6 +22,8 @@ from edgevpr.runtime.recognise.locate import Located
 TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
 TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _FIX_GOOD_FOR_S = 60.0
+# The limits of the scale of pictures, and the ratio from which on that of a match is none of its errors.
+_SCALES, _OFF_SCALE = (0.5, 2.0), 1.08
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as what is told of recorded queries, and reaches over so many places.
 _SURE_MASS, _SURE_SD, _OVER_PLACES, _FASTEST_M_S = 0.99, 4.0, 5.0, 30.0
@@ -77,6 +79,7 @@ class Prior:
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
+        self.scale = 1.0  # of the ground that pictures show, over what their height tells
         self.looks_again = self._are_believed = True
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
         self._followed: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
@@ -120,8 +123,11 @@ class Prior:
             self._are_believed = self._known.agree_with(found, self._heading_within_deg)
         else:
             self._are_believed = not self._are_believed
-        if accepted and found.match.height_ratio:
-            self.height_ratio = found.match.height_ratio
+        if accepted and (ratio := found.match.height_ratio):
+            self.height_ratio = ratio
+            if abs(math.log(ratio)) > math.log(_OFF_SCALE):  # between two heights that are tried, less is found
+                scale = min(max(self.scale * ratio, _SCALES[0]), _SCALES[1])
+                self.height_ratio, self.scale = self.scale * ratio / scale, scale
         if accepted and found.place.position:
             self._last_fix = found.place.position, t_mono_s
 
@@ -146,7 +152,7 @@ class Told:
         self, known: Collection[str], heading_within_deg: float | None, map_height_m: float | None = None
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
-        self.height_ratio = 1.0
+        self.height_ratio = self.scale = 1.0
         self.looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:

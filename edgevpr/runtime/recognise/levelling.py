@@ -22,6 +22,7 @@ from edgevpr.frames.level import (
     Levelled,
     Mount,
     View,
+    enlarged,
     leaning,
     levelled,
     straightened,
@@ -61,16 +62,18 @@ class Levelling:
         self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
         self._has_warned = False
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, scale: float = 1.0) -> Levelled:
         """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
-        False where the picture shows no ground (None: nowhere)."""
+        False where the picture shows no ground (None: nowhere). The picture shows `scale` times as much ground as its
+        height tells or, where that is unknown, as those of the map."""
         if vehicle and not (self._is_live and vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            return Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount))
-        picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below)
+            picture = Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount))
+            return picture if scale == 1 else enlarged(picture, scale)
+        picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
             _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
@@ -83,8 +86,8 @@ class Straightening:
     def __init__(self, lens: CalibratedLens) -> None:
         self._lens = lens
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None) -> Levelled:
-        """Straighten the picture of a frame; as `Levelling.prepare`."""
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, scale: float = 1.0) -> Levelled:
+        """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
         return straightened(frame.image, overlay, UNKNOWN_VIEW, self._lens)
 
 

@@ -13,7 +13,7 @@ from itertools import islice
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -68,12 +68,13 @@ class Preparation:
     gate: Gate | None = None
     strides: Strides | None = None
 
-    def picture(self, frame: Frame, vehicle: Vehicle | None = None) -> Levelled:
-        """Return the levelled picture of a frame, with its mask and view."""
+    def picture(self, frame: Frame, vehicle: Vehicle | None = None, scale: float = 1.0) -> Levelled:
+        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for `scale`."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         if self.levelling is None:
-            return Levelled(frame.image, mask, UNKNOWN_VIEW)
-        return self.levelling.prepare(frame, vehicle, mask)
+            picture = Levelled(frame.image, mask, UNKNOWN_VIEW)
+            return picture if scale == 1 else enlarged(picture, scale)
+        return self.levelling.prepare(frame, vehicle, mask, scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +142,7 @@ class Recogniser:
         preparation = self._preparation
         try:
             with self.meter.step("prepare"):
-                event.picture = picture = preparation.picture(frame, vehicle)
+                event.picture = picture = preparation.picture(frame, vehicle, self._scale)
             with self.meter.step("gate"):
                 event.worth = preparation.gate.look(frame.image) if preparation.gate else None
             with self.meter.step("encode"):
@@ -162,6 +163,10 @@ class Recogniser:
         return event
 
     @property
+    def _scale(self) -> float:
+        return self._prior.scale if self._prior else 1.0
+
+    @property
     def measures_strides(self) -> bool:
         """True if the motion between two frames is measured."""
         return self._preparation.strides is not None
@@ -172,7 +177,7 @@ class Recogniser:
         event = Recognition(frame=frame, vehicle=vehicle)
         try:
             with self.meter.step("prepare"):
-                event.picture = picture = self._preparation.picture(frame, vehicle)
+                event.picture = picture = self._preparation.picture(frame, vehicle, self._scale)
             self._measure_stride(event, Verification(self.technique.spec, picture, self.index, self.place_map))
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)

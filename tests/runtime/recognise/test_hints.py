@@ -160,16 +160,19 @@ def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_
     assert prior.hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
-def test_the_next_query_is_looked_for_from_the_height_of_the_last_match():
+def test_the_next_picture_is_scaled_to_the_height_of_the_last_match():
     prior = Prior(None, WITHIN_DEG, is_live=True)
-    at_height = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=0.7))
-    assert prior.height_ratio == 1.0
-    prior.learn(at_height, False, 0.0)
-    assert prior.height_ratio == 1.0
-    prior.learn(at_height, True, 1.0)
-    assert prior.height_ratio == 0.7
-    prior.learn(found(), True, 2.0)
-    assert prior.height_ratio == 0.7, "a technique that tells no height"
+
+    def learn(ratio, accepted=True):
+        prior.learn(Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio)), accepted, 0.0)
+        return prior.scale, prior.height_ratio
+
+    assert learn(0.7, accepted=False) == (1.0, 1.0)
+    assert learn(1.05) == (1.0, 1.05), "an error of the match"
+    assert learn(0.7) == (0.7, 1.0)
+    assert learn(None) == (0.7, 1.0), "a technique that tells no height"
+    assert learn(1.4) == (pytest.approx(0.98), 1.0)
+    assert learn(2.5) == (2.0, pytest.approx(1.225)), "no picture is made larger than that"
 
 
 def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights():

@@ -12,7 +12,7 @@ from fakes import vehicle_at
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Mount, View
+from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.mapmaking.mapping import build_map
@@ -278,3 +278,37 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
         wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
     assert wrong_m[0] < 2.5
     assert wrong_m[1] == pytest.approx(ahead_m, abs=2.5)
+
+
+@pytest.mark.parametrize("lens", [LENS, None])
+def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, ground, technique, lens):
+    levelling = Levelling(lens, footprint_m=FOOTPRINT_M, is_live=False)
+    follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
+    told = STRAIGHT | {"height_m": 1.25 * HEIGHT_M}
+    first, second = (
+        follow.step(frame(ground, place, told=told, height_m=1.25 * HEIGHT_M if lens is None else HEIGHT_M))
+        for place in (3, 2)
+    )
+    assert recognised(first, 3)
+    assert recognised(second, 2)
+    shown = 1.25 if lens is None else 0.8
+    assert first.best.match.height_ratio == pytest.approx(shown, rel=0.04)
+    assert second.best.match.height_ratio == pytest.approx(1.0, rel=0.04)
+    assert second.view.zoom == pytest.approx(1.0 if lens else 1.25, rel=0.04)
+    if lens:
+        assert second.view.footprint_m == pytest.approx(FOOTPRINT_M, rel=0.04)
+        assert second.located.height_m == pytest.approx(HEIGHT_M, rel=0.05)
+
+
+@pytest.mark.parametrize("zoom", [0.5, 2.0])
+def test_a_picture_is_enlarged_around_its_middle(zoom):
+    image = np.zeros((81, 121), np.uint8)
+    image[40, 60] = image[40, 60 + 12] = 255
+    picture = enlarged(Levelled(image, None, UNKNOWN_VIEW), zoom)
+    assert picture.view.zoom == zoom
+    assert picture.image[40, 60] == 255
+    assert picture.image[40, 60 + round(12 * zoom)] > 100
+    assert (picture.mask is None) == (zoom > 1)
+    if zoom < 1:
+        assert picture.mask.mean() == pytest.approx(zoom**2, rel=0.05)
+        assert not picture.mask[0].any()
