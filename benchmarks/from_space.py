@@ -3,9 +3,10 @@
 The map is cut from the raster `before` of sat_marash by `edgevpr map build --orthophoto`, and a simulated camera flies
 over `after`, months later and after an earthquake: 96 pictures of half a metre a pixel, from 120 m above the ground,
 swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` does: with heading and height, as an
-autopilot tells them, and without. Maps are cut at five scales, the footprint told being too small or too large, and of
-rasters of four resolutions. Foreign: pictures of other ground (all other sites of the set, both days, and all other
-sets from the air, each turned by eight angles), told heading and height.
+autopilot tells them, and without. As a flight they are asked in the order of the grid, its rows to and fro, and nothing
+is told: all that is known of place and scale is by the matches before. Maps are cut at five scales, the footprint told
+being too small or too large, and of rasters of four resolutions. Foreign: pictures of other ground (all other sites of
+the set, both days, and all other sets from the air, each turned by eight angles), told heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
 edgevpr were chosen on pictures of this set, too; not on these.
@@ -40,6 +41,8 @@ SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
 _SITE = "Hatay_Mimar_Sinan"  # that the rasters show
 SCALES, RESOLUTIONS_M = (0.65, 0.8, 1.0, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0)
+_NOTHING, _TOLD, _FLOWN = "nothing", "heading, height", "the flight so far"
+_STEP_S = 7.0  # from picture to picture, at 15 m/s
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 _COLUMNS = {
     "pixel m": "{resolution_m:g}",
@@ -71,7 +74,7 @@ def flown(raster: Path) -> Iterator[Frame]:
     inside_m = 0.75 * FOOTPRINT_M
     shots = []
     for row in np.linspace(inside_m, high_m - inside_m, _GRID[1]):
-        for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0]):
+        for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(shots) // _GRID[0] % 2 else 1]:
             at = Position(*moved(south, west, column, row))
             shots.append(GeoTag(position=at, height_m=HEIGHT_M, heading_deg=float(rng.uniform(0, 360))))
     for number, (shot, pose) in enumerate(zip(shots, poses_of(shots, _SEED), strict=True)):
@@ -81,7 +84,7 @@ def flown(raster: Path) -> Iterator[Frame]:
         yield Frame(
             image=image,
             name=f"{number:03d}",
-            t_mono_s=float(number),
+            t_mono_s=_STEP_S * number,
             position=shot.position,
             height_m=HEIGHT_M,
             **{name: getattr(pose, name) for name in ("heading_deg", "roll_deg", "pitch_deg")},
@@ -104,11 +107,14 @@ def foreign(folder: Path) -> Iterator[Frame]:
             yield Frame(image=turned, name=path.name, t_mono_s=0.0, heading_deg=turn_deg, height_m=HEIGHT_M)
 
 
-def matched(path: Path, frames: Iterable[Frame], is_told: bool) -> Row:
-    """Match each picture alone; with `is_told`, with its heading and height."""
-    fov = {"source.fov_deg": FOV_DEG} if is_told else {}
-    config = walks.config(map=str(path), **{"source.camera": "nadir"}, **fov)
-    recogniser = open_recogniser(config, load_board("this"), known=("heading", "height") if is_told else ())
+def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
+    """Match each picture by what is `known`: nothing, heading and height, or the pictures of the flight before it."""
+    is_told, is_flown = known == _TOLD, known == _FLOWN
+    config = walks.config(
+        map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": FOV_DEG} if is_told else {})
+    )
+    told = ("heading", "height") if is_told else ()
+    recogniser = open_recogniser(config, load_board("this"), known=told, narrowed=is_flown, follows=is_flown)
     asked = right = 0
     errors_m = []
     for frame in frames:
@@ -126,7 +132,7 @@ def matched(path: Path, frames: Iterable[Frame], is_told: bool) -> Row:
         if event.accepted and event.position:
             errors_m.append(float(distance_m(*here, event.position.lat_deg, event.position.lon_deg)))
     recogniser.place_map.close()
-    found: Row = {"known": "heading, height" if is_told else "nothing", "places": len(recogniser.index)}
+    found: Row = {"known": known, "places": len(recogniser.index)}
     found |= {"queries": asked, "right": right, "accepted": len(errors_m)}
     found |= {"wrong": sum(error_m > FOOTPRINT_M / 4 for error_m in errors_m)}
     if errors_m and np.isfinite(errors_m).all():
@@ -144,12 +150,12 @@ def measure(folder: Path, work: Path) -> list[Row]:
         tif = coarser(folder / "raster" / "before.vrt", work / f"{resolution_m:g}.tif", resolution_m)
         size = ("--footprint-m", f"{scale * FOOTPRINT_M:.1f}", "--spacing-m", f"{SPACING_M:g}")
         base.edgevpr("map", "build", path, "--orthophoto", tif, *size)
-        for is_told in (False, True):
-            rows.append({"resolution_m": resolution_m, "scale": scale} | matched(path, frames, is_told))
+        for known in (_NOTHING, _TOLD, _FLOWN):
+            rows.append({"resolution_m": resolution_m, "scale": scale} | matched(path, frames, known))
             print(rows[-1], flush=True)
     others = [each for each in base.find_sets(camera="nadir") if each.name != SET]
     for known, folders in (("foreign: other sites", [folder]), ("foreign: other sets", others)):
-        found = matched(work / "0.5-1.gpkg", chain.from_iterable(map(foreign, folders)), True)
+        found = matched(work / "0.5-1.gpkg", chain.from_iterable(map(foreign, folders)), _TOLD)
         rows.append({"resolution_m": 0.5, "scale": 1.0} | found | {"known": known, "right": "-"})
     return rows
 

@@ -25,7 +25,7 @@ SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
-_SHARP_PX, _LEAST_PX = 100, 32
+_SHARP_PX, _LEAST_PX = 150, 32
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped

@@ -165,8 +165,8 @@ def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
 
 def test_a_raster_says_how_sharp_its_pictures_are_and_one_that_shows_nothing_is_refused(tmp_path):
     path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
-    fine, coarse = (Cuttings(orthophoto=str(path), footprint_m=side_m, spacing_m=20.0) for side_m in (60.0, 40.0))
-    assert ", 120 pixels along a picture, about" in fine.open().forecast(20.0, technique)
+    fine, coarse = (Cuttings(orthophoto=str(path), footprint_m=side_m, spacing_m=20.0) for side_m in (80.0, 40.0))
+    assert ", 160 pixels along a picture, about" in fine.open().forecast(20.0, technique)
     assert ", 80 pixels along a picture, too few to find all" in coarse.open().forecast(20.0, technique)
     with pytest.raises(UsageError, match="has 30 pixels along a picture of 15 m"):
         Cuttings(orthophoto=str(path), footprint_m=15.0, spacing_m=20.0).open()

@@ -22,8 +22,8 @@ from edgevpr.runtime.recognise.locate import Located
 TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
 TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _FIX_GOOD_FOR_S = 60.0
-# The limits of the scale of pictures, and the ratio from which on that of a match is none of its errors.
-_SCALES, _OFF_SCALE = (0.5, 2.0), 1.08
+_OFF_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
+_LEAST_SCALE = 0.5
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as what is told of recorded queries, and reaches over so many places.
 _SURE_MASS, _SURE_SD, _OVER_PLACES, _FASTEST_M_S = 0.99, 4.0, 5.0, 30.0
@@ -69,7 +69,8 @@ class Hints:
 class Prior:
     """Makes the hints for each query, and decides whether hints are to be trusted.
 
-    `height_ratio` is the height to search at first, relative to that of the map's pictures (see `FineMatch`).
+    `height_ratio` is the height of the camera, relative to that of the map's pictures (see `FineMatch`), by the last
+    match; where heights are told, and pictures scaled by them, it is how far they are wrong.
     `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
     highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
     known heading, degrees (None: headings give no hint; see `TechniqueSpec`). `is_live` is False for recorded frames,
@@ -79,7 +80,6 @@ class Prior:
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
-        self.scale = 1.0  # of the ground that pictures show, over what their height tells
         self.looks_again = self._are_believed = True
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
         self._followed: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
@@ -112,9 +112,17 @@ class Prior:
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None
 
-    def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
+    def scale(self, height_ratios: Sequence[float]) -> float:
+        """Return the factor to enlarge the next picture by, so that it is as if taken from one of the `height_ratios`:
+        between two of them less is found. Of a picture from above the edges are needed too: it is enlarged no more."""
+        ratio = self.height_ratio
+        if not height_ratios or abs(math.log(ratio)) <= math.log(_OFF_SCALE):
+            return 1.0
+        return max(ratio, _LEAST_SCALE) if ratio < 1 else ratio / nearest_height(height_ratios, ratio)
+
+    def learn(self, found: Candidate, accepted: bool, t_mono_s: float, scale: float = 1.0) -> None:
         """Keep position and height of an accepted match. The next query uses hints if it agrees with them. Until there
-        is one, queries with hints and without alternate."""
+        is one, queries with hints and without alternate. Its picture was enlarged by `scale`."""
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
         if self._known is None:
@@ -123,11 +131,10 @@ class Prior:
             self._are_believed = self._known.agree_with(found, self._heading_within_deg)
         else:
             self._are_believed = not self._are_believed
-        if accepted and (ratio := found.match.height_ratio):
-            self.height_ratio = ratio
-            if abs(math.log(ratio)) > math.log(_OFF_SCALE):  # between two heights that are tried, less is found
-                scale = min(max(self.scale * ratio, _SCALES[0]), _SCALES[1])
-                self.height_ratio, self.scale = self.scale * ratio / scale, scale
+        if accepted and found.match.height_ratio:
+            height_ratio = scale * found.match.height_ratio
+            if abs(math.log(height_ratio / self.height_ratio)) > math.log(_OFF_SCALE):
+                self.height_ratio = height_ratio
         if accepted and found.place.position:
             self._last_fix = found.place.position, t_mono_s
 
@@ -152,7 +159,7 @@ class Told:
         self, known: Collection[str], heading_within_deg: float | None, map_height_m: float | None = None
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
-        self.height_ratio = self.scale = 1.0
+        self.height_ratio = 1.0
         self.looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
@@ -170,7 +177,11 @@ class Told:
     def follow(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
         """Keep nothing, as `learn` does."""
 
-    def learn(self, found: Candidate, accepted: bool, t_mono_s: float) -> None:
+    def scale(self, height_ratios: Sequence[float]) -> float:
+        """Return 1: pictures are taken as they are."""
+        return 1.0
+
+    def learn(self, found: Candidate, accepted: bool, t_mono_s: float, scale: float = 1.0) -> None:
         """Learn nothing: the next query is another flight's."""
 
 

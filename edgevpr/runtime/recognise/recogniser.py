@@ -164,7 +164,8 @@ class Recogniser:
 
     @property
     def _scale(self) -> float:
-        return self._prior.scale if self._prior else 1.0
+        """The factor to enlarge the next picture by."""
+        return self._prior.scale(self.technique.spec.height_ratios) if self._prior else 1.0
 
     @property
     def measures_strides(self) -> bool:
@@ -225,7 +226,7 @@ class Recogniser:
         if objection:
             verdict = Verdict(False, objection)
         if self._prior:
-            self._prior.learn(best, verdict.accepted, frame.t_mono_s)
+            self._prior.learn(best, verdict.accepted, frame.t_mono_s, self._scale)
             if event.followed:
                 self._prior.follow(event.followed.estimate, event.followed.mass, frame.t_mono_s)
         return verdict, where
@@ -236,7 +237,7 @@ class Recogniser:
         if prior:
             margin_m = max(self.accuracy_m, self.rule.neighbour_m)
             event.hints = prior.hints(seen_as(frame, looked.picture.view), event.vehicle, self.index, margin_m)
-        height_ratio = prior.height_ratio if prior else 1.0
+        height_ratio = prior.height_ratio / self._scale if prior else 1.0
         expected = expected_of(event.hints, height_ratio, self.index)
         ranking = self._look(descriptor, expected)
         if search:

@@ -71,14 +71,13 @@ def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monk
     assert event.best.match.height_ratio == pytest.approx(height_ratio, rel=0.05)
 
 
-def test_in_a_flight_the_next_picture_is_scaled_to_the_same_height(opened, monkeypatch):
+def test_in_a_flight_the_next_query_is_looked_for_from_the_same_height(opened, monkeypatch):
     walk, heights = recogniser(opened, monkeypatch, Prior(None, None, is_live=False))
     first, second = (walk.step(frame(place, 2.0)) for place in (1, 3))
     assert (first.accepted, second.accepted) == (True, True)
     assert heights[:5] == [1.0, 0.5, 0.7, 1.42, 2.0]
-    assert heights[5:] == [1.0], "the picture is made as large as those of the map"
-    assert (first.view.zoom, second.view.zoom) == (1.0, pytest.approx(2.0, rel=0.05))
-    assert second.best.match.height_ratio == pytest.approx(1.0, rel=0.05)
+    assert heights[5:] == [pytest.approx(2.0)]
+    assert second.view.zoom == pytest.approx(first.best.match.height_ratio / 2.0)
 
 
 def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkeypatch):

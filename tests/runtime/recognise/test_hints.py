@@ -160,19 +160,23 @@ def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_
     assert prior.hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
-def test_the_next_picture_is_scaled_to_the_height_of_the_last_match():
-    prior = Prior(None, WITHIN_DEG, is_live=True)
+def test_the_next_picture_is_scaled_to_a_height_that_is_tried():
+    prior, tried = Prior(None, WITHIN_DEG, is_live=True), (0.5, 0.7, 1.0, 1.42, 2.0)
 
     def learn(ratio, accepted=True):
-        prior.learn(Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio)), accepted, 0.0)
-        return prior.scale, prior.height_ratio
+        best = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio))
+        prior.learn(best, accepted, 0.0, prior.scale(tried))
+        return prior.height_ratio, prior.scale(tried)
 
     assert learn(0.7, accepted=False) == (1.0, 1.0)
-    assert learn(1.05) == (1.0, 1.05), "an error of the match"
-    assert learn(0.7) == (0.7, 1.0)
-    assert learn(None) == (0.7, 1.0), "a technique that tells no height"
-    assert learn(1.4) == (pytest.approx(0.98), 1.0)
-    assert learn(2.5) == (2.0, pytest.approx(1.225)), "no picture is made larger than that"
+    assert learn(1.05) == (1.0, 1.0), "an error of the match"
+    assert learn(0.8) == (0.8, 0.8)
+    assert learn(None) == (0.8, 0.8), "a technique that tells no height"
+    assert learn(0.95) == (0.8, 0.8)
+    assert learn(1.5) == (pytest.approx(1.2), pytest.approx(1.2 / 1.42)), "no more is cut off than needed"
+    assert learn(1.42 * 1.42) == (pytest.approx(1.704), pytest.approx(1.704 / 2))
+    assert learn(0.25) == (pytest.approx(0.213), 0.5), "no picture is made smaller than that"
+    assert prior.scale(()) == 1.0
 
 
 def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights():
