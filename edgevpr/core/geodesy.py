@@ -8,7 +8,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Degrees, Doubles, Floats, LatLon
 
-D = TypeVar("D", float, Floats)
+D = TypeVar("D", float, Doubles, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
 

@@ -123,11 +123,11 @@ def levelled(
 
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
     scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The picture shows
-    `scale` times as much ground as the height tells. Its middle shows the
-    same point as before or, with `below`, the point under the camera. `overlay`, bool (H, W), is False where the
-    picture shows no ground (None: it shows ground everywhere). A picture of known pose is returned unchanged, and
-    so is, but for the distortion of its lens, one that needs no warp or is tilted too far for one. Impossible values in
-    frame or vehicle never raise; ImageError is raised for a picture of another shape than the calibrated lens takes.
+    `scale` times as much ground as the height tells. Its middle shows the same point as before or, with `below`, the
+    point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None: it shows ground
+    everywhere). A picture of known pose is returned unchanged, and so is, but for the distortion of its lens, one that
+    needs no warp or is tilted too far for one. Impossible values in frame or vehicle never raise; ImageError is raised
+    for a picture of another shape than the calibrated lens takes.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
@@ -185,6 +185,8 @@ def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", vie
 
 def enlarged(picture: Levelled, zoom: float) -> Levelled:
     """Enlarge a picture, that is not warped otherwise, around its middle; its size stays."""
+    if zoom == 1:
+        return picture
     high_px, wide_px = picture.image.shape[:2]
     middle = np.array([wide_px - 1, high_px - 1]) / 2
     matrix = np.column_stack([zoom * np.eye(2), (1 - zoom) * middle])

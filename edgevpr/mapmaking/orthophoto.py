@@ -80,7 +80,7 @@ class Orthophoto:
                 f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to "
                 "latitude and longitude: export it with another, such as UTM or EPSG:4326."
             )
-        lons_deg = self.middle.lon_deg + (lons_deg - self.middle.lon_deg + 180) % 360 - 180
+        lons_deg = self.middle.lon_deg + shorter_deg(lons_deg - self.middle.lon_deg)
         self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
         metre_px = self._pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))

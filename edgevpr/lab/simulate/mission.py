@@ -23,11 +23,11 @@ from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.foreseen import Flown, Foreseen, expect, late_s, with_truth
 from edgevpr.lab.simulate.motion import read_track
 from edgevpr.lab.simulate.processes import autopilot_process, started
-from edgevpr.lab.simulate.rehearsal import SPEED_M_S, ground_under, write_rehearsal
+from edgevpr.lab.simulate.rehearsal import SPEED_M_S, footprint_m, ground_under, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.review.album import Album, album_of_map
-from edgevpr.review.logged import LoggedFlight, read_flight, value
+from edgevpr.review.logged import LoggedFlight, read_lines, value
 from edgevpr.review.matchpage import thresholds_of
 from edgevpr.review.overhead import read_ground
 from edgevpr.review.page import page_of
@@ -78,9 +78,7 @@ def rehearse(mission: Mission, folder: Path) -> Foreseen:
     gps_until_s = min(_MOST_GPS_S, _GPS_SHARE * span_s)
     _fly(mission, folder, gps_until_s)
     flown = _read(folder)
-    height_m = max(shot.height_m or 0.0 for shot in mission.shots)
-    footprint_m = 2 * height_m * math.tan(math.radians(mission.fov_deg / 2))
-    found = expect(flown, ground, footprint_m, gps_until_s)
+    found = expect(flown, ground, footprint_m(mission.shots, mission.fov_deg), gps_until_s)
     flown.flight.notes = (answer_of(found),)
     _write_page(folder, flown.flight, ground, references)
     return found
@@ -129,19 +127,16 @@ def answer_of(found: Foreseen) -> str:
 
 
 def _fly(mission: Mission, folder: Path, gps_until_s: float) -> None:
-    """Fly the pictures in `folder` with the commands themselves. Raises EdgevprError if the flight ends early."""
-    log, told = folder / "flight.jsonl", folder / "flight.txt"
+    """Fly the pictures in `folder` with the commands themselves."""
+    log = folder / "flight.jsonl"
     camera = ("--camera", "nadir", "--fov-deg", mission.fov_deg)
     track = ("--track", folder / "positions.csv", "--gps-s", gps_until_s)
-    with open(told, "w", encoding="utf-8") as said, autopilot_process(*track, said=said) as link:
+    with open(folder / "flight.txt", "w", encoding="utf-8") as said, autopilot_process(*track, said=said) as link:
         run = ("run", "--map", mission.place_map, "--source", folder / "images", *camera, "--link", link, "--log", log)
         with started(*run, said=said) as flight:
             count = len(mission.shots)
             for _ in progress(_queries_flown(flight, log), count, "flying"):
                 pass
-    if not log.is_file() or not read_flight(log).end:
-        last = told.read_text("utf-8").strip().rpartition("\n")[2].removeprefix("edgevpr: ")
-        raise EdgevprError(f"The flight has ended early: {last or 'it does not say why'}")
 
 
 def _queries_flown(flight: "subprocess.Popen[bytes]", log: Path) -> Iterator[None]:
@@ -156,8 +151,14 @@ def _queries_flown(flight: "subprocess.Popen[bytes]", log: Path) -> Iterator[Non
 
 
 def _read(folder: Path) -> Flown:
-    """Read a flight, judged by where its pictures were taken. Raises EdgevprError if they came late."""
-    flight, tags = read_flight(folder / "flight.jsonl"), read_positions(folder / "positions.csv")
+    """Read a flight, judged by where its pictures were taken. Raises EdgevprError if it ended early, or they came
+    late."""
+    log, tags = folder / "flight.jsonl", read_positions(folder / "positions.csv")
+    lines = list(flight_of(log)) if log.is_file() else []
+    flight = read_lines(lines, log)
+    if not flight.end:
+        last = (folder / "flight.txt").read_text("utf-8").strip().rpartition("\n")[2].removeprefix("edgevpr: ")
+        raise EdgevprError(f"The flight has ended early: {last or 'it does not say why'}")
     if not flight.queries:
         raise EdgevprError(f"No picture became a query: {folder / 'flight.txt'} says why.")
     began_s = min(tag.t_utc_s or 0.0 for tag in tags.values())
@@ -175,7 +176,6 @@ def _read(folder: Path) -> Flown:
     flight.queries = [
         with_truth(query, (at.lat_deg, at.lon_deg)) for query, at in zip(flight.queries, places, strict=True) if at
     ]
-    lines = list(flight_of(folder / "flight.jsonl"))
     return Flown(flight, lines, read_track(folder / "positions.csv"), start_s)
 
 

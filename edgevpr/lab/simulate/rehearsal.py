@@ -70,11 +70,15 @@ def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
 
 
+def footprint_m(shots: Sequence[GeoTag], fov_deg: float) -> float:
+    """Return how much ground the longest side of the highest picture shows."""
+    return 2 * max(shot.height_m or 0.0 for shot in shots) * math.tan(math.radians(fov_deg / 2))
+
+
 def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     """Return the ground that the pictures show, for tiles of it."""
     points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
-    highest_m = max(shot.height_m or 0.0 for shot in shots)
-    return ground_of(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
+    return ground_of(points, footprint_m(shots, fov_deg))
 
 
 def poses_of(shots: list[GeoTag], seed: int) -> list[CameraPose]:

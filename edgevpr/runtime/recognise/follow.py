@@ -21,7 +21,7 @@ from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import share_of
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
-from edgevpr.runtime.recognise.motion import Moved, moved
+from edgevpr.runtime.recognise.motion import FASTEST_M_S, Moved, moved
 from edgevpr.runtime.recognise.stride import Stride
 
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
@@ -31,7 +31,6 @@ _PROPOSED = 20  # most places that one query proposes
 # Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
 _NEAR_PLACES, _NEAR_FOOTPRINT, _HALF = 3.0, 0.25, 0.5
 _PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
-_FASTEST_M_S = 30.0  # unless the configuration says another speed
 _LEAST_SPACING_M = 5.0
 
 
@@ -95,7 +94,7 @@ class Follower:
     """
 
     def __init__(self, place_map: PlaceMap, *, fastest_m_s: float | None, is_live: bool) -> None:
-        self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or _FASTEST_M_S, is_live
+        self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or FASTEST_M_S, is_live
         self._survey: _Survey | None = None  # of the map, once it has a place
         self._belief: Belief | None = None
         self._next: Belief | None = None  # the belief after the last look, until `settle`

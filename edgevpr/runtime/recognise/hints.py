@@ -18,6 +18,7 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Expectation
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.motion import FASTEST_M_S
 
 TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
 TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
@@ -26,7 +27,7 @@ _OFF_SCALE = 1.08  # the ratio of two heights from which on it is no error of a 
 _LEAST_SCALE = 0.5
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as what is told of recorded queries, and reaches over so many places.
-_SURE_MASS, _SURE_SD, _OVER_PLACES, _FASTEST_M_S = 0.99, 4.0, 5.0, 30.0
+_SURE_MASS, _SURE_SD, _OVER_PLACES = 0.99, 4.0, 5.0
 # Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
 _NEEDED = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
@@ -104,10 +105,9 @@ class Prior:
             reach = Reach(known[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - known[1]))
         if self._followed and self._reach_m_s is None:
             area, t_s = self._followed
-            flown_m = _FASTEST_M_S * abs(frame.t_mono_s - t_s)
-            if abs(frame.t_mono_s - t_s) <= _FIX_GOOD_FOR_S:
+            if (since_s := abs(frame.t_mono_s - t_s)) <= _FIX_GOOD_FOR_S:
                 least_m = max(TOLD_REACH_M, _OVER_PLACES * margin_m)
-                reach = Reach(area.position, least_m + area.radius_m + flown_m)
+                reach = Reach(area.position, least_m + area.radius_m + FASTEST_M_S * since_s)
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None

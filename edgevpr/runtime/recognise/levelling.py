@@ -71,8 +71,7 @@ class Levelling:
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            picture = Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount))
-            return picture if scale == 1 else enlarged(picture, scale)
+            return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount)), scale)
         picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True

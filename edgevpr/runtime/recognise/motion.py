@@ -7,6 +7,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles
 
+FASTEST_M_S = 30.0  # unless the configuration says another speed
 _LONGEST_S = 3600.0  # longest time that counts
 
 

@@ -72,8 +72,7 @@ class Preparation:
         """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for `scale`."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         if self.levelling is None:
-            picture = Levelled(frame.image, mask, UNKNOWN_VIEW)
-            return picture if scale == 1 else enlarged(picture, scale)
+            return enlarged(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
         return self.levelling.prepare(frame, vehicle, mask, scale)
 
 
