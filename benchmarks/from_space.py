@@ -5,16 +5,20 @@ over `after`, months later and after an earthquake: 96 pictures of half a metre 
 swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` does: with heading and height, as an
 autopilot tells them, and without. As a flight they are asked in the order of the grid, its rows to and fro, and nothing
 is told: all that is known of place and scale is by the matches before. Maps are cut at five scales, the footprint told
-being too small or too large, and of rasters of four resolutions. Foreign: pictures of other ground (all other sites of
-the set, both days, and all other sets from the air, each turned by eight angles), told heading and height.
+being too small or too large, and of rasters of four resolutions; and at two footprints each, .72 and 1.08 times the one
+told. The patchwork is the raster with every other square of 200 m twice as bright. Foreign: pictures of other ground
+(all other sites of the set, both days, and all other sets from the air, each turned by eight angles), told heading and
+height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
-edgevpr were chosen on pictures of this set, too; not on these.
+edgevpr were chosen on pictures of this set, too; on these pictures only the two footprints, and which of them a picture
+is looked for among.
 """
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -40,17 +44,29 @@ FOOTPRINT_M = 2 * HEIGHT_M * float(np.tan(np.radians(FOV_DEG / 2)))
 SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
 _SITE = "Hatay_Mimar_Sinan"  # that the rasters show
-SCALES, RESOLUTIONS_M = (0.65, 0.8, 1.0, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0)
-_NOTHING, _TOLD, _FLOWN = "nothing", "heading, height", "the flight so far"
+TOLD, RESOLUTIONS_M, _SHARP = (1.0, 0.65, 0.8, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0), "0.5 m"
+_ONE, _TWO, _PATCH_M = (1.0,), (0.72, 1.08), 200.0
+_NOTHING, _KNOWN, _FLOWN = "nothing", "heading, height", "the flight so far"
 _STEP_S = 7.0  # from picture to picture, at 15 m/s
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 _COLUMNS = {
-    "pixel m": "{resolution_m:g}",
-    "footprint told": "{scale:.2f}",
+    "raster": "{raster}",
+    "footprint told": "{told:.2f}",
+    "cut at": "{cut_at}",
     "known": "{known}",
     **{name: f"{{{name}}}" for name in ("places", "queries", "right", "accepted", "wrong")},
     "fix error m": "{error[median_m]} / {error[p90_m]}",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Cutting:
+    """A map to be cut from a `raster`, `at` shares of the footprint that the user tells, which is `told` times the
+    camera's."""
+
+    raster: Path
+    told: float
+    at: tuple[float, ...]
 
 
 def coarser(source: Path, path: Path, pixel_m: float) -> Path:
@@ -63,6 +79,16 @@ def coarser(source: Path, path: Path, pixel_m: float) -> Path:
         layout = {"driver": "GTiff", "count": shape[0], "height": shape[1], "width": shape[2], "dtype": "uint8"}
         with rasterio.open(path, "w", crs=raster.crs, transform=affine, photometric="RGB", **layout) as out:
             out.write(bands)
+    return path
+
+
+def patchwork(source: Path, path: Path) -> Path:
+    """Write a raster of which every other square is twice as bright, as if of another day."""
+    with rasterio.open(source) as raster:
+        column, row = (np.arange(count) * raster.res[0] // _PATCH_M for count in (raster.width, raster.height))
+        factor = 1 + np.add.outer(row, column) % 2
+        with rasterio.open(path, "w", **raster.profile) as out:
+            out.write(np.minimum(factor * raster.read(), 255).astype(np.uint8))
     return path
 
 
@@ -109,7 +135,7 @@ def foreign(folder: Path) -> Iterator[Frame]:
 
 def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
     """Match each picture by what is `known`: nothing, heading and height, or the pictures of the flight before it."""
-    is_told, is_flown = known == _TOLD, known == _FLOWN
+    is_told, is_flown = known == _KNOWN, known == _FLOWN
     config = walks.config(
         map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": FOV_DEG} if is_told else {})
     )
@@ -141,23 +167,33 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
     return found
 
 
-def measure(folder: Path, work: Path) -> list[Row]:
-    frames, rows = list(flown(folder / "raster" / "after.vrt")), []
-    for resolution_m, scale in [(pixel_m, 1.0) for pixel_m in RESOLUTIONS_M] + [(0.5, each) for each in SCALES]:
-        if any((row["resolution_m"], row["scale"]) == (resolution_m, scale) for row in rows):
-            continue
-        path = work / f"{resolution_m:g}-{scale:g}.gpkg"
-        tif = coarser(folder / "raster" / "before.vrt", work / f"{resolution_m:g}.tif", resolution_m)
-        size = ("--footprint-m", f"{scale * FOOTPRINT_M:.1f}", "--spacing-m", f"{SPACING_M:g}")
-        base.edgevpr("map", "build", path, "--orthophoto", tif, *size)
-        for known in (_NOTHING, _TOLD, _FLOWN):
-            rows.append({"resolution_m": resolution_m, "scale": scale} | matched(path, frames, known))
-            print(rows[-1], flush=True)
-    others = [each for each in base.find_sets(camera="nadir") if each.name != SET]
-    for known, folders in (("foreign: other sites", [folder]), ("foreign: other sets", others)):
-        found = matched(work / "0.5-1.gpkg", chain.from_iterable(map(foreign, folders)), _TOLD)
-        rows.append({"resolution_m": 0.5, "scale": 1.0} | found | {"known": known, "right": "-"})
+def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) -> list[Row]:
+    """Cut the map, and match the pictures of the flight; over the map of the sharp raster, cut as told, foreign too."""
+    path = work / f"{cutting.raster.stem} {cutting.told:g} {len(cutting.at)}.gpkg"
+    footprints = [f"{share * cutting.told * FOOTPRINT_M:.1f}" for share in cutting.at]
+    size = ("--footprint-m", *footprints, "--spacing-m", f"{SPACING_M:g}")
+    base.edgevpr("map", "build", path, "--orthophoto", cutting.raster, *size)
+    rows = [matched(path, frames, known) for known in (_NOTHING, _KNOWN, _FLOWN)]
+    if cutting.raster.stem == _SHARP and cutting.told == 1:
+        others = [each for each in base.find_sets(camera="nadir") if each.name != SET]
+        for known, folders in (("foreign: other sites", [folder]), ("foreign: other sets", others)):
+            found = matched(path, chain.from_iterable(map(foreign, folders)), _KNOWN)
+            rows.append(found | {"known": known, "right": "-"})
+    cut_at = " and ".join(f"{share:g}" for share in cutting.at)
+    rows = [{"raster": cutting.raster.stem, "told": cutting.told, "cut_at": cut_at, **row} for row in rows]
+    print(*rows, sep="\n", flush=True)
     return rows
+
+
+def measure(folder: Path, work: Path) -> list[Row]:
+    frames, before = list(flown(folder / "raster" / "after.vrt")), folder / "raster" / "before.vrt"
+    rasters = [coarser(before, work / f"{pixel_m:g} m.tif", pixel_m) for pixel_m in RESOLUTIONS_M]
+    rasters.append(patchwork(rasters[0], work / "patchwork.tif"))
+    cuttings = [Cutting(rasters[0], told, at) for at in (_ONE, _TWO) for told in TOLD]
+    cuttings += [Cutting(raster, 1.0, _ONE) for raster in rasters[1:]]
+    with ProcessPoolExecutor() as pool:
+        waiting = [pool.submit(measured, cutting, folder, work, frames) for cutting in cuttings]
+        return [row for each in waiting for row in each.result()]
 
 
 def main() -> None:

@@ -105,7 +105,13 @@ def _add_pictures(parser: ArgumentParser) -> None:
         help="GeoTIFF, VRT, MBTiles, PMTiles, the tile cache of QGroundControl or Mission Planner, a folder of tiles "
         "(z/x/y.png), or the address of tiles (https://.../{z}/{x}/{y}.png, WMTS:https://...) that you may use",
     )
-    flags.add_argument("--footprint-m", type=float, metavar="M", help="ground along the longest side of a picture")
+    flags.add_argument(
+        "--footprint-m",
+        type=float,
+        nargs="+",
+        metavar="M",
+        help="ground along the longest side of a picture; for flights at several heights, several",
+    )
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
     flags.add_argument(
         "--area",

@@ -86,7 +86,8 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
     if info.first_time:
         yield f"  time        {info.first_time} to {info.last_time}"
     if info.with_pose:
-        seen = f"a picture shows {info.footprint_m:.0f} m of ground along its longest side"
+        shown = " or ".join(f"{each:.0f}" for each in info.footprints_m)
+        seen = f"a picture shows {shown} m of ground along its longest side"
         yield f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; {seen}"
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"

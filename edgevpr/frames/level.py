@@ -169,6 +169,12 @@ def levelled(
     return _warped(frame.image, overlay, warp, view)
 
 
+def footprint_of(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
+    """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
+    where it has none, of `vehicle`. None: unknown."""
+    return None if frame.pose else _Taking(frame, vehicle, lens).own_m
+
+
 def straightened(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
     """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
     `levelled`. Raises ImageError for a picture of another shape than the lens takes."""
@@ -190,7 +196,7 @@ def enlarged(picture: Levelled, zoom: float) -> Levelled:
     high_px, wide_px = picture.image.shape[:2]
     middle = np.array([wide_px - 1, high_px - 1]) / 2
     matrix = np.column_stack([zoom * np.eye(2), (1 - zoom) * middle])
-    image = cv2.warpAffine(picture.image, matrix, (wide_px, high_px))
+    image = cv2.warpAffine(picture.image, matrix, (wide_px, high_px), borderMode=cv2.BORDER_REPLICATE)
     shows = np.ones((high_px, wide_px), np.uint8) if picture.mask is None else picture.mask.astype(np.uint8)
     mask = cv2.warpAffine(shows, matrix, (wide_px, high_px), flags=cv2.INTER_NEAREST) > 0
     view = replace(picture.view, zoom=zoom * picture.view.zoom)

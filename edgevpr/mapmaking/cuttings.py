@@ -7,13 +7,15 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Doubles, Ints
+from edgevpr.core.arrays import Bools, Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
+from edgevpr.frames.images import resized
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
@@ -26,16 +28,23 @@ MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
 _SHARP_PX, _LEAST_PX = 150, 32
+# What a sharp picture loses at least when it is halved: of two rasters and six sets from the air, half a dozen times
+# enlarged or blurred, the sharp ones lost more than this, the others less.
+_BLURRED = 0.07
+_TRIED = 0.25, 0.5, 0.75  # places to try for blur, as shares of all
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
+_WHERE = "lat_deg", "lon_deg"
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lattice:
     """N places of a grid, in arrays (N,): `rows`, int, counted from the north, and `columns`, from the west; `lat_deg`
-    and `lon_deg` in degrees of WGS-84. `shape` is the number of (rows, columns) of the whole grid."""
+    and `lon_deg` in degrees of WGS-84. `shape` is the number of (rows, columns) of the whole grid, `footprint_m` the
+    ground along a side of each picture."""
 
+    footprint_m: float
     rows: Ints
     columns: Ints
     lat_deg: Doubles
@@ -47,86 +56,113 @@ class Lattice:
 
 
 class OrthophotoSource(RecordingSource):
-    """Gives a frame for each place of the grid `lattice`: a square of ground with sides of `footprint_m`. Places of
-    which more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the
-    names of the frames to read (None: all)."""
+    """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. Places of which
+    more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the names of
+    the frames to read (None: all)."""
 
     def __init__(
         self,
         orthophoto: Orthophoto,
-        lattice: Lattice,
-        footprint_m: float,
+        lattices: Sequence[Lattice],
         clock: Callable[[], float],
         *,
         only: Collection[str] | None = None,
     ) -> None:
         super().__init__(only)
-        self._orthophoto, self._lattice, self._footprint_m, self._clock = orthophoto, lattice, footprint_m, clock
-        self.total = len(lattice)
+        self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
+        self.total = sum(map(len, lattices))
         self.without_data = 0
         self._read = 0
+        self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
-        self._pose = Pose(
-            up_deg=0.0, footprint_m=footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2), is_surveyed=True
-        )
+        self._covariance_m2 = variance_m2, 0.0, variance_m2
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the frame of the next place, None if that place is left out. Raises ImageError for a damaged part of
         the file; the next call continues with the place after it. `timeout_s` is ignored."""
         if self.ended:
             return None
-        lattice, at = self._lattice, self._read
+        lattice, at = next(self._left)
         self._read += 1
         if self._read == self.total:
             self.end()
         numbers = zip((lattice.rows[at], lattice.columns[at]), lattice.shape, strict=True)
         # With leading zeros, so that names sort in the order of the numbers.
         row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
-        name = f"{decoded_name(self._orthophoto.short_name)}_r{row}_c{column}"
+        of_several = f"_{lattice.footprint_m:g}m" if len(self._lattices) > 1 else ""
+        name = f"{decoded_name(self._orthophoto.short_name)}{of_several}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
         position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
         try:
-            image, valid = self._orthophoto.cut(position, self._footprint_m, SIDE_PX)
+            image, valid = self._orthophoto.cut(position, lattice.footprint_m, SIDE_PX)
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise
         if valid.mean() < 1 - MOST_WITHOUT_DATA:
             self.without_data += 1
             return None
-        return Frame(
-            image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=self._pose
-        )
+        pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
+        return Frame(image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=pose)
 
     def forecast(self, spacing_m: float, technique: Technique) -> str:
-        """Return how much is to be done for a map, in words. It takes one place to try."""
-        lattice, middle = self._lattice, self.total // 2
+        """Return how much is to be done for a map, in words. It takes a few places to try."""
+        lattice = min(self._lattices, key=lambda each: each.footprint_m)
         to_fetch = self.to_fetch()
         began_s = time.perf_counter()
-        at = Position(float(lattice.lat_deg[middle]), float(lattice.lon_deg[middle]))
         with suppress(ImageError):
-            image, _ = self._orthophoto.cut(at, self._footprint_m, SIDE_PX)
+            image, _ = self._orthophoto.cut(_place_of(lattice, 0.5), lattice.footprint_m, SIDE_PX)
             technique.encode(image)
             describe(image)
         each_s = time.perf_counter() - began_s
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
-        size = f"{self.total * spacing_m**2 / 1e6:.2f} km2 of ground, {self.total * place_bytes / 1e6:.1f} MB"
+        size = f"{len(lattice) * spacing_m**2 / 1e6:.2f} km2 of ground, {self.total * place_bytes / 1e6:.1f} MB"
         tiles = f", of {to_fetch[0]} tiles to fetch from {self._orthophoto.name}" if to_fetch else ""
         whole_s = self.total * each_s
         lasts = f"{math.ceil(whole_s)} s" if whole_s < 100 else f"{whole_s / 60:.0f} min"
-        across_px = self._footprint_m / self._orthophoto.resolution_m
-        few = "" if across_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
-        sharp = f"{across_px:.0f} pixels along a picture{few}"
+        across_px = lattice.footprint_m / self._orthophoto.resolution_m
+        sharp_px = across_px / self._blur(lattice, across_px)
+        sharp = f"{across_px:.0f} pixels along a picture"
+        sharp += "" if sharp_px == across_px else f", blurred as if they were {sharp_px:.0f} at most"
+        sharp += "" if sharp_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
         return f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {lasts} without calibration"
+
+    def _blur(self, lattice: Lattice, across_px: float) -> float:
+        """Return by how much the pixels of the raster, `across_px` along a picture, are smaller than what it shows: a
+        power of two, 1 for a sharp one."""
+        side_px, images = min(SIDE_PX, round(across_px)), []
+        for share in _TRIED:
+            with suppress(ImageError):
+                images.append(self._orthophoto.cut(_place_of(lattice, share), lattice.footprint_m, side_px)[0])
+        halvings = 0
+        while images and side_px >> halvings >= _LEAST_PX and np.median(list(map(_lost, images))) < _BLURRED:
+            images, halvings = [resized(each, (side_px >> (halvings + 1),) * 2) for each in images], halvings + 1
+        return across_px / side_px * 2**halvings if halvings else 1.0
 
     def to_fetch(self) -> tuple[int, Iterator[None]] | None:
         """See `Orthophoto.to_fetch`."""
-        return self._orthophoto.to_fetch(self._lattice.lat_deg, self._lattice.lon_deg, self._footprint_m, SIDE_PX)
+        widest_m = max(lattice.footprint_m for lattice in self._lattices)
+        lat_deg, lon_deg = (np.concatenate([getattr(each, name) for each in self._lattices]) for name in _WHERE)
+        return self._orthophoto.to_fetch(lat_deg, lon_deg, widest_m, SIDE_PX)
 
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
+
+
+def _place_of(lattice: Lattice, share: float) -> Position:
+    """Return the place that comes after this share of all."""
+    at = int(share * len(lattice))
+    return Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
+
+
+def _lost(image: Image) -> float:
+    """Return what a picture loses when it is halved and doubled again: a standard deviation, as a share of its own."""
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    half = cv2.resize(grey, (len(grey) // 2,) * 2, interpolation=cv2.INTER_AREA)
+    back = cv2.resize(half, grey.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return float(np.std(grey - back) / max(np.std(grey), 1.0))
 
 
 def require_sharp(orthophoto: Orthophoto, footprint_m: float) -> None:
@@ -194,7 +230,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
     shape = (int(count[1]), int(count[0]))
     rows, columns = rows + count[1] - end[1], columns + begin[0]
-    return Lattice(rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
+    return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
 
 
 def _require_bounded(count: int, most: int, spacing_m: float) -> None:

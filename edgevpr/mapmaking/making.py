@@ -3,7 +3,7 @@ confidence. This is the work of the commands `edgevpr map build`, `map refine` a
 
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,12 +58,13 @@ class FlownPictures:
 class Cuttings:
     """Pictures that are cut from an orthophoto, at the places of a grid.
 
-    `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side. `spacing_m`: distance between
-    neighbouring places. `area`: file or circle that limits the places, see `missions.read_area` (None: the whole
-    orthophoto). `attribution`: the owner's words, which a map keeps (None: none are asked for)."""
+    `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
+    picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
+    places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
+    (None: none are asked for)."""
 
     orthophoto: str
-    footprint_m: float
+    footprint_m: float | Sequence[float]
     spacing_m: float
     area: str | None = None
     attribution: str | None = None
@@ -77,10 +78,12 @@ class Cuttings:
         from edgevpr.mapmaking.tiles import ground_of
 
         area = read_area(self.area) if self.area else None
-        orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, self.footprint_m) if area else None)
-        lattice = lattice_of(orthophoto, self.footprint_m, self.spacing_m, area)
-        require_sharp(orthophoto, self.footprint_m)
-        return OrthophotoSource(orthophoto, lattice, self.footprint_m, time.monotonic, only=only)
+        given = self.footprint_m
+        footprints_m = sorted(set(given)) if isinstance(given, Sequence) else [given]
+        orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, footprints_m[-1]) if area else None)
+        lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in footprints_m]
+        require_sharp(orthophoto, footprints_m[0])
+        return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

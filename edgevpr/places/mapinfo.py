@@ -8,13 +8,14 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.geodesy import EARTH_RADIUS_M, distance_m
 from edgevpr.core.types import Position
 from edgevpr.places import geopackage, rows
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import sentences
 
 Extent = tuple[float, float, float, float]
 
 _SUMMARY = """
-SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg), avg(footprint_m),
+SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
     avg(var_east_m2 + var_north_m2), min(CASE typeof(time) WHEN 'text' THEN time END),
     max(CASE typeof(time) WHEN 'text' THEN time END)
 FROM places
@@ -31,8 +32,9 @@ class MapInfo:
     """Summary of a map. `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees. Any field is None if no place has
     the value, or if another program wrote it in another form. `with_position` and `with_pose` are numbers of places.
     `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
-    `footprint_m` is the mean length on the ground of a picture's longest side, and `position_sd_m` the standard
-    deviation of the positions along one axis, as root mean square. `attribution` names the owners of orthophotos."""
+    `footprints_m` are the lengths on the ground of a picture's longest side (see `Layers`), and `position_sd_m` is the
+    standard deviation of the positions along one axis, as root mean square. `attribution` names the owners of
+    orthophotos."""
 
     path: str
     spec: TechniqueSpec
@@ -43,7 +45,7 @@ class MapInfo:
     last_time: str | None
     of_low_quality: int
     with_pose: int
-    footprint_m: float | None
+    footprints_m: tuple[float, ...]
     position_sd_m: float | None
     attribution: str | None
     file_bytes: int
@@ -64,7 +66,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
         summary, extent = (place_map.db.execute(query).fetchone() for query in (_SUMMARY, _EXTENT))
-    places, with_position, of_low_quality, with_pose, footprint_m, var_m2, first, last = summary
+    places, with_position, of_low_quality, with_pose, var_m2, first, last = summary
     is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
         path=str(place_map.path),
@@ -76,7 +78,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
         last_time=last,
         of_low_quality=int(of_low_quality),
         with_pose=with_pose,
-        footprint_m=footprint_m,
+        footprints_m=layers_of(place_map).footprints_m,
         position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
         attribution=place_map.attribution,
         file_bytes=place_map.path.stat().st_size,

@@ -30,7 +30,7 @@ def frames_of(source: OrthophotoSource) -> list:
 def source_of(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
     lattice = lattice_of(orthophoto, footprint_m, spacing_m, area)
-    return OrthophotoSource(orthophoto, lattice, footprint_m, float, only=only)
+    return OrthophotoSource(orthophoto, [lattice], float, only=only)
 
 
 def off_m(lattice) -> np.ndarray:

@@ -100,7 +100,7 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
     assert after_m.max() < 10
     assert abs(turned_deg).max() < 8
     assert abs(footprints_m / FOOTPRINT_M - 1).max() < 0.15
-    assert (info.with_pose, info.footprint_m) == (len(poses), pytest.approx(FOOTPRINT_M, rel=0.1))
+    assert (info.with_pose, info.footprints_m) == (len(poses), (pytest.approx(FOOTPRINT_M, rel=0.1),))
     assert 0.5 < info.position_sd_m < 6
     with PlaceMap.open(map_path) as place_map:
         assert len(recorded) == len(place_map)

@@ -23,11 +23,13 @@ from edgevpr.frames.level import (
     Mount,
     View,
     enlarged,
+    footprint_of,
     leaning,
     levelled,
     straightened,
 )
 from edgevpr.frames.source import is_live
+from edgevpr.places.layers import Layers
 
 GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
@@ -43,8 +45,8 @@ class Levelling:
     are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
     `mount` of the camera; a `lens` has its own.
 
-    `footprint_m` is the length on the ground to which the longest side of pictures is scaled, that of the map's places
-    (None: no scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
+    The longest side of pictures is scaled to a length on the ground, that of the map's places by its `layers` (None: no
+    scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
     keeps the camera level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
     """
 
@@ -52,13 +54,13 @@ class Levelling:
         self,
         lens: Lens | None,
         *,
-        footprint_m: float | None = None,
+        layers: Layers | None = None,
         below: bool = False,
         on_gimbal: bool = False,
         is_live: bool,
         mount: Mount = STRAIGHT_DOWN,
     ) -> None:
-        self.lens, self.footprint_m = lens, footprint_m
+        self.lens, self._layers = lens, layers
         self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
         self._has_warned = False
 
@@ -72,7 +74,9 @@ class Levelling:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
             return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount)), scale)
-        picture = levelled(frame, vehicle, self.lens, self.footprint_m, overlay=overlay, below=self._below, scale=scale)
+        own_m = footprint_of(frame, vehicle, self.lens) if self._layers else None
+        footprint_m = self._layers.fitting(own_m and scale * own_m) if self._layers else None
+        picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self._below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
             _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
@@ -91,7 +95,7 @@ class Straightening:
 
 
 def levelling_of(
-    config: SourceConfig, technique: Technique, *, footprint_m: float | None = None, below: bool = False
+    config: SourceConfig, technique: Technique, *, layers: Layers | None = None, below: bool = False
 ) -> Levelling | Straightening | None:
     """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
     with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
@@ -105,7 +109,7 @@ def levelling_of(
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
     on_gimbal, is_live = config.gimbal, is_now(config)
-    return Levelling(lens, footprint_m=footprint_m, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
+    return Levelling(lens, layers=layers, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
 
 
 def lens_of(config: SourceConfig) -> Lens | None:

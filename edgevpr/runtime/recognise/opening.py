@@ -11,6 +11,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.mapinfo import index_positions
@@ -60,7 +61,7 @@ def open_recogniser(
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
         if narrowed:
-            prior = _in_flight(config, technique)
+            prior = _in_flight(config, technique, place_map)
         recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -83,7 +84,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         index_positions(place_map)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior, follows = _in_flight(config, technique), config.match.follow
+        prior, follows = _in_flight(config, technique, place_map), config.match.follow
         recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
@@ -188,9 +189,10 @@ def say_other_lens(place_map: PlaceMap, lens: str | None) -> None:
         _log.info("%s was built without `source.lens`: right if its pictures had no distortion", place_map.path)
 
 
-def _in_flight(config: Config, technique: Technique) -> Prior:
+def _in_flight(config: Config, technique: Technique, place_map: PlaceMap) -> Prior:
     """Make what narrows the queries of a flight."""
-    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+    within_deg, is_live = technique.spec.heading_within_deg, is_now(config.source)
+    return Prior(config.match.reach_m_s, within_deg, is_live, layers_of(place_map))
 
 
 def _recogniser(
@@ -214,7 +216,7 @@ def _recogniser(
     if follows and match.sequence is None and kinds_of(technique.spec):
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
-    levelling = levelling_of(config.source, technique, footprint_m=place_map.footprint_m())
+    levelling = levelling_of(config.source, technique, layers=layers_of(place_map))
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     preparation = Preparation(
         levelling=levelling,

@@ -16,6 +16,7 @@ from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
@@ -110,7 +111,8 @@ class Recogniser:
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         # Places nearer to each other show the same ground: neither is a rival of the other.
-        self._footprint_m = place_map.footprint_m() or 0.0
+        self._layers = layers_of(place_map)
+        self._footprint_m = max(self._layers.footprints_m, default=0.0)
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
@@ -225,7 +227,8 @@ class Recogniser:
         if objection:
             verdict = Verdict(False, objection)
         if self._prior:
-            self._prior.learn(best, verdict.accepted, frame.t_mono_s, self._scale)
+            by_height_m = looked.picture.view.footprint_m
+            self._prior.learn(best, verdict.accepted, frame.t_mono_s, self._scale, by_height_m)
             if event.followed:
                 self._prior.follow(event.followed.estimate, event.followed.mass, frame.t_mono_s)
         return verdict, where
@@ -238,7 +241,8 @@ class Recogniser:
             event.hints = prior.hints(seen_as(frame, looked.picture.view), event.vehicle, self.index, margin_m)
         height_ratio = prior.height_ratio / self._scale if prior else 1.0
         expected = expected_of(event.hints, height_ratio, self.index)
-        ranking = self._look(descriptor, expected)
+        footprint_m = looked.picture.view.footprint_m or (prior.footprint_m if prior else None)
+        ranking = self._look(descriptor, self._layers.narrowed(expected, self.index, footprint_m))
         if search:
             ranking = search.follow(ranking, self.index, frame.t_mono_s)
         judged = self._judged(event, ranking, looked)

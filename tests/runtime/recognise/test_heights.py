@@ -1,19 +1,25 @@
 """A query from another height than the map's: looked for from there where the first look accepts nothing."""
 
+import math
+from dataclasses import replace
+
 import cv2
 import pytest
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import Frame, Pose, Position
+from edgevpr.frames.level import Lens
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -86,3 +92,50 @@ def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkey
         event = walk.step(frame(17, height_ratio))
         assert not event.failed
         assert not event.accepted
+
+
+@pytest.fixture(scope="module")
+def cut_twice(tmp_path_factory):
+    """A map of places that were cut at two footprints, 100 m and 150 m, and its index."""
+    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("layers") / "m.gpkg"
+    meter = meter_of(load_config(None), load_board("this"))
+    with PlaceMap.create(path, technique.spec) as place_map:
+        for ratio in (1.0, 1.5):
+            pose = Pose(up_deg=0.0, footprint_m=100 * ratio, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+            frames = [replace(frame(place, ratio), name=f"{place} {ratio}", pose=pose) for place in range(PLACES)]
+            build_map(frames, technique, place_map, meter)
+    with PlaceMap.open(path) as place_map:
+        yield technique, place_map, load_index(place_map, technique, 10**6), meter
+
+
+@pytest.mark.parametrize("height_m", [None, 100.0])
+def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_height(cut_twice, height_m):
+    """By the height, where it is told, from the first picture on; else by the last match."""
+    technique, place_map, index, meter = cut_twice
+    layers, scan, looked = layers_of(place_map), type(technique).coarse_scores, []
+
+    class Noting(type(technique)):
+        def coarse_scores(self, query, rows, mean, **hints):
+            looked.append(hints["in_reach"])
+            return scan(self, query, rows, mean, **hints)
+
+    fov_deg = math.degrees(2 * math.atan(0.5))  # the footprint is the height
+    levelling = Levelling(Lens(fov_deg), layers=layers, is_live=False) if height_m else None
+    noting = Noting(**technique.spec.parameters)
+    walk = Recogniser(
+        Matcher(noting, index, accept_rule(technique, load_config(None).match)),
+        place_map,
+        meter,
+        WalkSettings(candidates=50),
+        preparation=Preparation(levelling=levelling),
+        prior=Prior(None, None, is_live=False, layers=layers),
+    )
+    for place, ratio in ((1, 1.5), (3, 1.5), (2, 1.0), (0, 1.0)):
+        del looked[:]
+        asked = replace(frame(place, ratio), height_m=height_m and ratio * height_m)
+        event = walk.step(asked)
+        assert event.accepted, event.reason
+        assert event.best.place.source_image.startswith(f"{place} ")
+        if height_m or place in (3, 0):
+            assert event.best.place.pose.footprint_m == 100 * ratio
+            assert looked[0].tolist() == [ratio == 1.0] * PLACES + [ratio == 1.5] * PLACES

@@ -17,6 +17,7 @@ from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
+from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
@@ -30,6 +31,7 @@ CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))
 HEIGHT_M = 100.0
 FOOTPRINT_M = HEIGHT_M * 640 / CAMERA.focal_px
+LAYER = Layers((FOOTPRINT_M,), np.zeros(0, int), np.zeros(0, int))
 NORTH_M = (120.0, 240.0, 360.0, 480.0)
 M_PER_DEG = 111_195.0
 STRAIGHT = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
@@ -97,7 +99,7 @@ def walk(place_map, technique):
 
 
 def scaling(is_live=False):
-    return Levelling(LENS, footprint_m=FOOTPRINT_M, is_live=is_live)
+    return Levelling(LENS, layers=LAYER, is_live=is_live)
 
 
 def recognised(event, place):
@@ -258,7 +260,7 @@ def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_
         config = load_config(None, said | {"source.gimbal": gimbal}).source
         frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
         vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
-        view = levelling_of(config, technique, footprint_m=FOOTPRINT_M).prepare(frame, vehicle, None).view
+        view = levelling_of(config, technique, layers=LAYER).prepare(frame, vehicle, None).view
         off_m = view.lean_m if fov_deg is None else FOOTPRINT_M * np.array(view.aside)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
 
@@ -272,7 +274,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
     true_m = np.array([-ahead_m * math.sin(turn), NORTH_M[1] - ahead_m * math.cos(turn)])
     wrong_m = []
     for mount in (Mount(9.0), STRAIGHT_DOWN):
-        event = walk(Levelling(replace(LENS, mount=mount), footprint_m=FOOTPRINT_M, is_live=False)).step(seen)
+        event = walk(Levelling(replace(LENS, mount=mount), layers=LAYER, is_live=False)).step(seen)
         assert recognised(event, 1)
         at = event.located.position
         wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
@@ -282,7 +284,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
 
 @pytest.mark.parametrize("lens", [LENS, None])
 def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, ground, technique, lens):
-    levelling = Levelling(lens, footprint_m=FOOTPRINT_M, is_live=False)
+    levelling = Levelling(lens, layers=LAYER, is_live=False)
     follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
     told = STRAIGHT | {"height_m": 1.25 * HEIGHT_M}
     first, second = (

@@ -1,0 +1,68 @@
+"""Layers of a map: its places by the footprint at which they were cut from an orthophoto. Most maps have one.
+
+A picture is found best among places that show a little less ground than it does, in finer detail. So a flight at a
+height that its map was not cut for finds more in a map of two footprints.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Expectation
+
+# Footprint of the places that a picture is found among best, as a share of its own, by benchmarks/results/from_space.md
+_BEST_SHARE = 0.92
+_ALIKE = 1.2  # ratio of two footprints below which they are one layer
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The `footprints_m` of a map, ascending: those at which its places were cut or, of a map of one layer, the median
+    of all places (empty: unknown). Of a map of several layers, `place_ids` int64 (M,), ascending, are the places that
+    were cut, and `layer` int (M,) the number of the footprint of each."""
+
+    footprints_m: tuple[float, ...]
+    place_ids: Ints
+    layer: Ints
+
+    def fitting(self, seen_m: float | None) -> float | None:
+        """Return the footprint to look among for a picture that shows `seen_m` of ground; None if either is unknown."""
+        if not seen_m or not self.footprints_m:
+            return None
+        return self.footprints_m[int(self._nearest(_BEST_SHARE * seen_m))]
+
+    def narrowed(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
+        """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
+        any of them is in reach. Places that were not cut stay."""
+        if footprint_m is None or len(self.footprints_m) < 2:
+            return expected
+        at = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
+        is_other = (self.place_ids[at] == index.place_ids) & (self.layer[at] != self._nearest(footprint_m))
+        in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
+        return replace(expected, in_reach=in_reach) if in_reach.any() else expected
+
+    def _nearest(self, footprint_m: float | Doubles) -> Ints:
+        """Return the number of the footprint that is nearest to each of `footprint_m` by ratio."""
+        off = np.subtract.outer(np.log(footprint_m), np.log(self.footprints_m))
+        return np.asarray(np.abs(off).argmin(axis=-1))
+
+
+def layers_of(place_map: PlaceMap) -> Layers:
+    """Read the layers of a map. Raises MapError."""
+    known = [(place_id, *row) for place_id, row in place_map.scan("footprint_m, is_surveyed") if row]
+    known = [each for each in known if isinstance(each[1], float) and 0 < each[1] < math.inf]
+    cut = sorted((place_id, footprint_m) for place_id, footprint_m, is_surveyed in known if is_surveyed)
+    footprints_m: list[float] = []
+    for each_m in sorted({footprint_m for _, footprint_m in cut}):
+        if not footprints_m or each_m > _ALIKE * footprints_m[-1]:
+            footprints_m.append(each_m)
+    if len(footprints_m) > 1:
+        ids, own_m = zip(*cut, strict=True)
+        layers = Layers(tuple(footprints_m), np.array(ids), np.zeros(0, int))
+        return replace(layers, layer=layers._nearest(np.array(own_m)))
+    median = (float(np.median([each[1] for each in known])),) if known else ()
+    return Layers(median, np.zeros(0, int), np.zeros(0, int))

@@ -1,0 +1,66 @@
+"""Layers: places that were cut at several footprints, and those of them that a picture is looked for among."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from map_writer import SPEC, descriptor, frame
+
+from edgevpr.core.types import Pose
+from edgevpr.places.index import PlaceIndex
+from edgevpr.places.layers import layers_of
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import Expectation
+
+
+def layers(path, shown):
+    """The layers of a map of places that show so much ground; `shown` has (footprint_m, is_surveyed) of each."""
+    with PlaceMap.create(path, SPEC) as place_map:
+        for number, (footprint_m, is_surveyed) in enumerate(shown, start=1):
+            pose = Pose(up_deg=0.0, footprint_m=footprint_m, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=is_surveyed)
+            place_map.add(replace(frame(number), pose=pose), descriptor(number))
+    with PlaceMap.open(path) as place_map:
+        return layers_of(place_map)
+
+
+def index(*place_ids):
+    count = len(place_ids)
+    return PlaceIndex(
+        place_ids=np.array(place_ids),
+        lat_deg=np.full(count, 50.0),
+        lon_deg=np.full(count, 8.0),
+        heading_deg=np.zeros(count, np.float16),
+        rows=np.zeros((count, 1)),
+        mean=None,
+    )
+
+
+CUT = [(150.0, True), (100.0, True), (102.0, True), (150.0, True), (300.0, False)]
+
+
+def test_a_map_has_a_layer_for_each_footprint_that_it_was_cut_at(tmp_path):
+    assert layers(tmp_path / "a.gpkg", CUT).footprints_m == (100.0, 150.0)
+    assert layers(tmp_path / "b.gpkg", CUT[1:3]).footprints_m == (101.0,), "as good as one"
+    assert layers(tmp_path / "c.gpkg", [(80.0, False), (160.0, False), (90.0, False)]).footprints_m == (90.0,)
+    assert layers(tmp_path / "d.gpkg", []).footprints_m == ()
+
+
+@pytest.mark.parametrize(("seen_m", "among_m"), [(60, 100), (125, 100), (150, 150), (400, 150), (None, None)])
+def test_a_picture_is_looked_for_among_places_that_show_a_little_less(tmp_path, seen_m, among_m):
+    assert layers(tmp_path / "m.gpkg", CUT).fitting(seen_m) == among_m
+
+
+def test_a_search_leaves_out_what_was_cut_otherwise(tmp_path):
+    found = layers(tmp_path / "m.gpkg", CUT)
+    whole = index(1, 2, 3, 4, 5, 9)  # 9 was learnt since
+    assert found.narrowed(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
+    assert found.narrowed(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
+    near = Expectation(in_reach=np.array([True, True, False, False, False, False]))
+    assert found.narrowed(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
+    assert found.narrowed(near, whole, None) is near
+    assert found.narrowed(Expectation(), index(2, 3), 150.0).in_reach is None, "none of them is in reach"
+
+
+def test_a_map_of_one_layer_is_searched_whole(tmp_path):
+    expected = Expectation()
+    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrowed(expected, index(1, 2), 300.0) is expected
