@@ -55,6 +55,7 @@ _COLUMNS = {
     "cut at": "{cut_at}",
     "known": "{known}",
     **{name: f"{{{name}}}" for name in ("places", "queries", "right", "accepted", "wrong")},
+    f"accepted of {_GRID[0]} in a row": "{by_row[least]} to {by_row[most]}",
     "fix error m": "{error[median_m]} / {error[p90_m]}",
 }
 
@@ -141,29 +142,30 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
     )
     told = ("heading", "height") if is_told else ()
     recogniser = open_recogniser(config, load_board("this"), known=told, narrowed=is_flown, follows=is_flown)
-    asked = right = 0
-    errors_m = []
+    right, errors_m = 0, []
     for frame in frames:
-        asked += 1
         told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
         event = recogniser.step(replace(told, position=None))
         if event.failed:
             raise base.EdgevprError(event.reason)
+        errors_m.append(np.inf if event.accepted else np.nan)
         if frame.position is None:
-            errors_m += [np.inf] * event.accepted
             continue
         here = frame.position.lat_deg, frame.position.lon_deg
         if event.best and (place := event.best.place.position):
             right += float(distance_m(*here, place.lat_deg, place.lon_deg)) < FOOTPRINT_M / 2
         if event.accepted and event.position:
-            errors_m.append(float(distance_m(*here, event.position.lat_deg, event.position.lon_deg)))
+            errors_m[-1] = float(distance_m(*here, event.position.lat_deg, event.position.lon_deg))
     recogniser.place_map.close()
-    found: Row = {"known": known, "places": len(recogniser.index)}
-    found |= {"queries": asked, "right": right, "accepted": len(errors_m)}
-    found |= {"wrong": sum(error_m > FOOTPRINT_M / 4 for error_m in errors_m)}
-    if errors_m and np.isfinite(errors_m).all():
-        found["error"] = {"median_m": round(float(np.median(errors_m)), 1)}
-        found["error"]["p90_m"] = round(float(np.quantile(errors_m, 0.9)), 1)
+    accepted = ~np.isnan(errors_m)
+    found: Row = {"known": known, "places": len(recogniser.index), "queries": len(errors_m), "right": right}
+    found |= {"accepted": int(accepted.sum()), "wrong": int(np.sum(np.array(errors_m) > FOOTPRINT_M / 4))}
+    if accepted.any() and np.isfinite(np.array(errors_m)[accepted]).all():
+        found["error"] = {"median_m": round(float(np.nanmedian(errors_m)), 1)}
+        found["error"]["p90_m"] = round(float(np.nanquantile(errors_m, 0.9)), 1)
+    if len(errors_m) == _GRID[0] * _GRID[1]:
+        by_row = accepted.reshape(_GRID[::-1]).sum(axis=1)
+        found["by_row"] = {"least": int(by_row.min()), "most": int(by_row.max())}
     return found
 
 
