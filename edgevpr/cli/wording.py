@@ -42,6 +42,8 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"  left out: {result.not_memorable} that are not memorable"
     if result.without_data or result.says_nothing:
         yield f"  left out: {result.without_data} for want of data, {result.says_nothing} for want of texture"
+    if result.white:
+        yield f"  {result.white} of the places are white over a third or more: cloud and snow are not there every day"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:

@@ -28,9 +28,11 @@ MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
 _SHARP_PX, _LEAST_PX = 150, 32
-# What a sharp picture loses at least when it is halved: of two rasters and six sets from the air, half a dozen times
-# enlarged or blurred, the sharp ones lost more than this, the others less.
+# What a sharp picture loses at least when it is halved. Those cut from the rasters of sat_marash lose .10 to .16; where
+# the rasters are halved and enlarged again .05 to .09, four times .02 to .03.
 _BLURRED = 0.07
+_WHITE, _COLOURLESS = 200, 30  # grey values
+_CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
 _TRIED = 0.25, 0.5, 0.75  # places to try for blur, as shares of all
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
@@ -57,8 +59,8 @@ class Lattice:
 
 class OrthophotoSource(RecordingSource):
     """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. Places of which
-    more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `only` are the names of
-    the frames to read (None: all)."""
+    more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `white` counts places
+    a third of which is white, as clouds are. `only` are the names of the frames to read (None: all)."""
 
     def __init__(
         self,
@@ -71,7 +73,7 @@ class OrthophotoSource(RecordingSource):
         super().__init__(only)
         self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
         self.total = sum(map(len, lattices))
-        self.without_data = 0
+        self.without_data = self.white = 0
         self._read = 0
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
@@ -102,6 +104,7 @@ class OrthophotoSource(RecordingSource):
         if valid.mean() < 1 - MOST_WITHOUT_DATA:
             self.without_data += 1
             return None
+        self.white += _white(image) > _CLOUDY
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=pose)
 
@@ -124,13 +127,13 @@ class OrthophotoSource(RecordingSource):
         across_px = lattice.footprint_m / self._orthophoto.resolution_m
         sharp_px = across_px / self._blur(lattice, across_px)
         sharp = f"{across_px:.0f} pixels along a picture"
-        sharp += "" if sharp_px == across_px else f", blurred as if they were {sharp_px:.0f} at most"
+        sharp += "" if sharp_px == across_px else f", blurred: {sharp_px:.0f} would show as much"
         sharp += "" if sharp_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
         return f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {lasts} without calibration"
 
     def _blur(self, lattice: Lattice, across_px: float) -> float:
-        """Return by how much the pixels of the raster, `across_px` along a picture, are smaller than what it shows: a
-        power of two, 1 for a sharp one."""
+        """Return by how much larger the pixels of the raster, `across_px` along a picture, could be, and would show as
+        much: a power of two, 1 for a sharp one."""
         side_px, images = min(SIDE_PX, round(across_px)), []
         for share in _TRIED:
             with suppress(ImageError):
@@ -149,6 +152,11 @@ class OrthophotoSource(RecordingSource):
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
+
+
+def _white(image: Image) -> float:
+    """Return the share of a picture's pixels that are white."""
+    return float(((image.min(axis=2) > _WHITE) & (np.ptp(image, axis=2) < _COLOURLESS)).mean())
 
 
 def _place_of(lattice: Lattice, share: float) -> Position:

@@ -130,7 +130,7 @@ class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
     `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
-    the orthophoto has no data there."""
+    the orthophoto has no data there. `white`: places cut from it that are white over a third or more."""
 
     added: int = 0
     without_position: int = 0
@@ -139,6 +139,7 @@ class MappingResult:
     says_nothing: int = 0
     not_memorable: int = 0
     without_data: int = 0
+    white: int = 0
 
 
 def build_map(

@@ -1,12 +1,15 @@
 """The places cut from an orthophoto: their grid, what is left out, what a frame says, and the memory it takes."""
 
+import re
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
+import rasterio
 from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
 
 from edgevpr.core.errors import UsageError
@@ -170,3 +173,39 @@ def test_a_raster_says_how_sharp_its_pictures_are_and_one_that_shows_nothing_is_
     assert ", 80 pixels along a picture, too few to find all" in coarse.open().forecast(20.0, technique)
     with pytest.raises(UsageError, match="has 30 pixels along a picture of 15 m"):
         Cuttings(orthophoto=str(path), footprint_m=15.0, spacing_m=20.0).open()
+
+
+def test_a_raster_that_was_enlarged_is_as_blurred_as_it_is(tmp_path):
+    def said(shrink):
+        path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
+        with rasterio.open(path, "r+") as raster:
+            ground = raster.read(1)
+            small = cv2.resize(ground, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+            raster.write(cv2.resize(small, ground.shape[::-1], interpolation=cv2.INTER_CUBIC), 1)
+        return Cuttings(orthophoto=str(path), footprint_m=100.0, spacing_m=20.0).open().forecast(20.0, technique)
+
+    assert ", 200 pixels along a picture, about" in said(1)
+    assert re.search(r", 200 pixels along a picture, blurred: (25|50) would show as much, too few to find all", said(4))
+
+
+def test_places_under_cloud_are_counted(tmp_path):
+    path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
+    with rasterio.open(path, "r+") as raster:
+        raster.write(np.full((1, 200, 200), 240, np.uint8), window=rasterio.windows.Window(220, 220, 200, 200))
+    source = source_of(path, 100.0, 60.0)
+    frames = frames_of(source)
+    assert (len(frames), source.white) == (16, 4)
+
+
+def test_one_order_cuts_every_place_at_several_footprints(tmp_path):
+    path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
+    source = Cuttings(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
+    frames = frames_of(source)
+    assert len({frame.name for frame in frames}) == len(frames) == source.total
+    assert {frame.pose.footprint_m for frame in frames if "_150m_" in frame.name} == {150.0}
+    assert {frame.pose.footprint_m for frame in frames if "_100m_" in frame.name} == {100.0}
+    again = Cuttings(orthophoto=str(path), footprint_m=(100.0, 150.0), spacing_m=50.0).open(only=[frames[-1].name])
+    (one,) = frames_of(again)
+    assert np.array_equal(one.image, frames[-1].image)
+    with pytest.raises(UsageError, match="--footprint-m is 5000"):
+        Cuttings(orthophoto=str(path), footprint_m=(100.0, 5000.0), spacing_m=50.0).open()
