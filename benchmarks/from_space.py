@@ -172,8 +172,8 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
 def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) -> list[Row]:
     """Cut the map, and match the pictures of the flight; over the map of the sharp raster, cut as told, foreign too."""
     path = work / f"{cutting.raster.stem} {cutting.told:g} {len(cutting.at)}.gpkg"
-    footprints = [f"{share * cutting.told * FOOTPRINT_M:.1f}" for share in cutting.at]
-    size = ("--footprint-m", *footprints, "--spacing-m", f"{SPACING_M:g}")
+    footprints = ",".join(f"{share * cutting.told * FOOTPRINT_M:.1f}" for share in cutting.at)
+    size = ("--footprint-m", footprints, "--spacing-m", f"{SPACING_M:g}")
     base.edgevpr("map", "build", path, "--orthophoto", cutting.raster, *size)
     rows = [matched(path, frames, known) for known in (_NOTHING, _KNOWN, _FLOWN)]
     if cutting.raster.stem == _SHARP and cutting.told == 1:

@@ -1,7 +1,7 @@
 """`edgevpr map`: make, correct, move, calibrate, look into, check, repair, merge and shrink place maps; and `edgevpr
 salience`: print how memorable, static and full of information a picture is."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -107,10 +107,9 @@ def _add_pictures(parser: ArgumentParser) -> None:
     )
     flags.add_argument(
         "--footprint-m",
-        type=float,
-        nargs="+",
+        type=_lengths,
         metavar="M",
-        help="ground along the longest side of a picture; for flights at several heights, several",
+        help="ground along the longest side of a picture; for flights at several heights two, such as 80,120",
     )
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
     flags.add_argument(
@@ -118,6 +117,14 @@ def _add_pictures(parser: ArgumentParser) -> None:
         metavar="AREA",
         help="only over this: a mission or GeoJSON (a path: a footprint on either side), or LAT,LON,RADIUS_M",
     )
+
+
+def _lengths(text: str) -> tuple[float, ...]:
+    """Read "80,120", as the `type` of a flag. Raises ArgumentTypeError for another text."""
+    try:
+        return tuple(map(float, text.split(",")))
+    except ValueError:
+        raise ArgumentTypeError(f"`{text}` is no length in metres, nor several with commas between them") from None
 
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":

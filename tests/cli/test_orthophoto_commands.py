@@ -177,3 +177,18 @@ def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, g
     assert run("map", "calibrate", path, *cut, "--json") == 0
     found = json.loads(capsys.readouterr().out)["calibration"]
     assert 0 < found["places_asked"] <= found["asked"] <= 6  # where pictures may overlap, nobody knows
+
+
+@pytest.mark.slow
+def test_a_map_cut_at_two_footprints_says_both(tmp_path, ground, capsys):
+    place_map = tmp_path / "m.gpkg"
+    cut = ("--orthophoto", ground, "--footprint-m", "120,80", "--spacing-m", 50, "--no-calibrate", "--json")
+    assert run("map", "build", place_map, *cut) == 0
+    capsys.readouterr()
+    assert run("map", "info", place_map, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["footprints_m"] == [80, 120]
+    assert run("map", "info", place_map) == 0
+    assert "a picture shows 80 or 120 m of ground" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        run("map", "build", tmp_path / "n.gpkg", "--orthophoto", ground, "--footprint-m", "80;120", "--spacing-m", 50)
+    assert "`80;120` is no length in metres, nor several with commas" in capsys.readouterr().err
