@@ -27,7 +27,7 @@ WITHOUT_POSITIONS = (
 # By benchmarks/results/from_space.md, a raster of half a metre a pixel.
 _OTHER_DAY = (
     "of another day fewer are: of pictures months and an earthquake later 48 % were accepted alone, with heading and "
-    "height known (3 to 8 of twelve along a line), and 23 % without (0 to 6); a rehearsal over another orthophoto says it "
+    "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); a rehearsal over another orthophoto says it "
     "of this ground"
 )
 _SHOWN = 20  # differences of a replay at most
