@@ -6,9 +6,9 @@ swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` doe
 autopilot tells them, and without. As a flight they are asked in the order of the grid, its rows to and fro, and nothing
 is told: all that is known of place and scale is by the matches before. Maps are cut at five scales, the footprint told
 being too small or too large, and of rasters of four resolutions; and at three footprints each, .62, .88 and 1.25 times
-the one told. The patchwork is the raster with every other square of 200 m twice as bright. Foreign: pictures of other ground
-(all other sites of the set, both days, and all other sets from the air, each turned by eight angles), told heading and
-height.
+the one told. The patchwork is the raster with every other square of 200 m twice as bright. Foreign: pictures of other
+ground (all other sites of the set, both days, and all other sets from the air, each turned by eight angles), told
+heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
 edgevpr were chosen on pictures of this set, too; on these pictures only the shares of three footprints, and which of
