@@ -108,7 +108,13 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path
 
 @pytest.mark.parametrize(
     ("ratio", "is_surveyed", "said"),
-    [(0.8, True, ["footprint 128 m, map's 160 m"]), (1.1, True, []), (0.8, False, [])],
+    [
+        (0.8, True, ["footprint 128 m, map's 160 m"]),
+        (1.6, True, ["footprint 256 m, map's 160 m"]),
+        (0.9, True, []),
+        (1.3, True, []),
+        (0.8, False, []),
+    ],
 )
 def test_pictures_of_another_scale_than_those_of_an_orthophoto_are_said_once(tmp_path, ratio, is_surveyed, said):
     clock = FakeClock()
