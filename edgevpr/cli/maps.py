@@ -109,7 +109,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
         "--footprint-m",
         type=_lengths,
         metavar="M",
-        help="ground along the longest side of a picture; for flights at several heights two, such as 80,120",
+        help="ground along the longest side of a picture; at several heights, several: 75,105,150",
     )
     flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
     flags.add_argument(
@@ -120,7 +120,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
 
 
 def _lengths(text: str) -> tuple[float, ...]:
-    """Read "80,120", as the `type` of a flag. Raises ArgumentTypeError for another text."""
+    """Read "75,105,150", as the `type` of a flag. Raises ArgumentTypeError for another text."""
     try:
         return tuple(map(float, text.split(",")))
     except ValueError:

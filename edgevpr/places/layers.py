@@ -1,7 +1,7 @@
 """Layers of a map: its places by the footprint at which they were cut from an orthophoto. Most maps have one.
 
 A picture is found best among places that show a little less ground than it does, in finer detail. So a flight at a
-height that its map was not cut for finds more in a map of two footprints.
+height that its map was not cut for finds more in a map of several footprints.
 """
 
 import math
