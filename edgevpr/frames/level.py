@@ -172,7 +172,10 @@ def levelled(
 def footprint_of(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
     """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
     where it has none, of `vehicle`. None: unknown."""
-    return None if frame.pose else _Taking(frame, vehicle, lens).own_m
+    *_, height_m = _attitude(frame, vehicle)
+    if height_m is None or not 0 < height_m <= _HIGHEST_M:
+        return None
+    return 2 * height_m * math.tan(math.radians(lens.fov_deg) / 2)
 
 
 def straightened(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
@@ -235,7 +238,7 @@ class _Taking:
     `size_px` is its size (width, height). Of a lens with distortion, the picture meant is the straightened one."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
-        roll_deg, pitch_deg, self.heading_deg, height_m = _attitude(frame, vehicle)
+        roll_deg, pitch_deg, self.heading_deg, _ = _attitude(frame, vehicle)
         self.is_attitude_known = roll_deg is not None and pitch_deg is not None
         known = (roll_deg or 0.0, pitch_deg or 0.0) if self.is_attitude_known else (0.0, 0.0)
         self._level_from_straight = _level_from_body(*known) @ lens.mount.body_from_straight()
@@ -245,9 +248,8 @@ class _Taking:
         if self._sight:
             width, height = self._sight.straight_px
         self.size_px, self.longest_px = (width, height), max(height, width)
-        half = math.tan(math.radians(lens.fov_deg) / 2)
-        self.focal_px = self.longest_px / 2 / half
-        self.own_m = 2 * height_m * half if height_m is not None and 0 < height_m <= _HIGHEST_M else None
+        self.focal_px = self.longest_px / 2 / math.tan(math.radians(lens.fov_deg) / 2)
+        self.own_m = footprint_of(frame, vehicle, lens)
         focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
         self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
         across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)

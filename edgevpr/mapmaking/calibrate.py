@@ -31,6 +31,7 @@ from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.layers import Layers, layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.rows import readable
@@ -96,7 +97,8 @@ def ask(
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
     looks_down = technique.spec.cells is not None
-    near_m = overlap_m(place_map, index, rule)
+    layers = layers_of(place_map)
+    near_m = overlap_m(layers, index, rule)
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, picture in pictures:
         if (slot := slots.get(place_id)) is None:
@@ -107,7 +109,7 @@ def ask(
             if not len(among):
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
-            event = looked_for(place_id, image, shown, Matcher(technique, among, rule), place_map, meter)
+            event = looked_for(place_id, image, shown, Matcher(technique, among, rule), place_map, meter, layers)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
@@ -120,12 +122,18 @@ def ask(
 
 
 def looked_for(
-    place_id: int, image: Image, shown: Shown | None, matcher: Matcher, place_map: PlaceMap, meter: QueryMeter
+    place_id: int,
+    image: Image,
+    shown: Shown | None,
+    matcher: Matcher,
+    place_map: PlaceMap,
+    meter: QueryMeter,
+    layers: Layers,
 ) -> Recognition:
     """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
-    shows no ground (None: it shows ground everywhere)."""
+    shows no ground (None: it shows ground everywhere). `layers` are those of the map."""
     prepared = Preparation(mask=None if shown is None else Mask(shown, sha256=""))
-    settings = WalkSettings(candidates=matcher.technique.candidates)
+    settings = WalkSettings(candidates=matcher.technique.candidates, layers=layers)
     walk = Recogniser(matcher, place_map, meter, settings, preparation=prepared)
     return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
@@ -276,9 +284,9 @@ def _mirrored(picture: Levelled) -> Levelled:
     return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
 
 
-def overlap_m(place_map: PlaceMap, index: PlaceIndex, rule: AcceptRule) -> float:
+def overlap_m(layers: Layers, index: PlaceIndex, rule: AcceptRule) -> float:
     """Return the distance in metres within which pictures of the map count as neighbours: at least a footprint."""
-    return max(rule.neighbour_m, place_map.footprint_m() or index.spacing_m() or 0.0)
+    return max(rule.neighbour_m, layers.median_m or index.spacing_m() or 0.0)
 
 
 def same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:

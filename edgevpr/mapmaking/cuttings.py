@@ -36,7 +36,6 @@ _CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without cloud
 _TRIED = 0.25, 0.5, 0.75  # places to try for blur, as shares of all
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
-_WHERE = "lat_deg", "lon_deg"
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
@@ -146,7 +145,8 @@ class OrthophotoSource(RecordingSource):
     def to_fetch(self) -> tuple[int, Iterator[None]] | None:
         """See `Orthophoto.to_fetch`."""
         widest_m = max(lattice.footprint_m for lattice in self._lattices)
-        lat_deg, lon_deg = (np.concatenate([getattr(each, name) for each in self._lattices]) for name in _WHERE)
+        lat_deg = np.concatenate([lattice.lat_deg for lattice in self._lattices])
+        lon_deg = np.concatenate([lattice.lon_deg for lattice in self._lattices])
         return self._orthophoto.to_fetch(lat_deg, lon_deg, widest_m, SIDE_PX)
 
     def close(self) -> None:

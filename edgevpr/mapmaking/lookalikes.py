@@ -10,6 +10,7 @@ from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.config import load_config
 from edgevpr.mapmaking.calibrate import looked_for, overlap_m, same_ground
 from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
@@ -39,7 +40,8 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         return
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     rule = accept_rule(technique, config.match, 1, calibration_of(place_map))
-    near_m, meter = overlap_m(place_map, index, rule), meter_of(config, load_board("this"))
+    layers = layers_of(place_map)
+    near_m, meter = overlap_m(layers, index, rule), meter_of(config, load_board("this"))
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     for place_id, image, mask in pictures:
         slot = slots.get(place_id)
@@ -48,7 +50,7 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         away = index.only(~same_ground(index, slot, near_m))
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
             continue
-        event = looked_for(place_id, image, mask, Matcher(technique, away, rule), place_map, meter)
+        event = looked_for(place_id, image, mask, Matcher(technique, away, rule), place_map, meter, layers)
         if event.best is None or event.confidence is None or event.confidence < LEAST:
             yield None
         else:

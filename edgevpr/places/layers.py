@@ -5,11 +5,12 @@ height that its map was not cut for finds more in a map of several footprints.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.core.arrays import Ints
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
@@ -21,10 +22,11 @@ _ALIKE = 1.2  # ratio of two footprints below which they are one layer
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """The `footprints_m` of a map, ascending: those at which its places were cut or, of a map of one layer, the median
-    of all places (empty: unknown). Of a map of several layers, `place_ids` int64 (M,), ascending, are the places that
-    were cut, and `layer` int (M,) the number of the footprint of each."""
+    """The `footprints_m` of a map, ascending: those at which its places were cut or, of a map of one layer, `median_m`,
+    the median of all places (None: unknown, and there are none). Of a map of several layers, `place_ids` int64 (M,),
+    ascending, are the places that were cut, and `layer` int (M,) the number of the footprint of each."""
 
+    median_m: float | None
     footprints_m: tuple[float, ...]
     place_ids: Ints
     layer: Ints
@@ -33,7 +35,7 @@ class Layers:
         """Return the footprint to look among for a picture that shows `seen_m` of ground; None if either is unknown."""
         if not seen_m or not self.footprints_m:
             return None
-        return self.footprints_m[int(self._nearest(_BEST_SHARE * seen_m))]
+        return self.footprints_m[int(_nearest(self.footprints_m, _BEST_SHARE * seen_m))]
 
     def narrowed(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
         """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
@@ -41,14 +43,10 @@ class Layers:
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
         at = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
-        is_other = (self.place_ids[at] == index.place_ids) & (self.layer[at] != self._nearest(footprint_m))
+        is_known, wanted = self.place_ids[at] == index.place_ids, _nearest(self.footprints_m, footprint_m)
+        is_other = is_known & (self.layer[at] != wanted)
         in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
-
-    def _nearest(self, footprint_m: float | Doubles) -> Ints:
-        """Return the number of the footprint that is nearest to each of `footprint_m` by ratio."""
-        off = np.subtract.outer(np.log(footprint_m), np.log(self.footprints_m))
-        return np.asarray(np.abs(off).argmin(axis=-1))
 
 
 def layers_of(place_map: PlaceMap) -> Layers:
@@ -60,9 +58,14 @@ def layers_of(place_map: PlaceMap) -> Layers:
     for each_m in sorted({footprint_m for _, footprint_m in cut}):
         if not footprints_m or each_m > _ALIKE * footprints_m[-1]:
             footprints_m.append(each_m)
-    if len(footprints_m) > 1:
-        ids, own_m = zip(*cut, strict=True)
-        layers = Layers(tuple(footprints_m), np.array(ids), np.zeros(0, int))
-        return replace(layers, layer=layers._nearest(np.array(own_m)))
-    median = (float(np.median([each[1] for each in known])),) if known else ()
-    return Layers(median, np.zeros(0, int), np.zeros(0, int))
+    median_m = float(np.median([each[1] for each in known])) if known else None
+    if len(footprints_m) < 2:
+        return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))
+    ids, own_m = zip(*cut, strict=True)
+    return Layers(median_m, tuple(footprints_m), np.array(ids), _nearest(footprints_m, own_m))
+
+
+def _nearest(footprints_m: Sequence[float], to_m: float | Sequence[float]) -> Ints:
+    """Return the number of the footprint that is nearest by ratio to the length, or to each of the lengths, `to_m`."""
+    off = np.subtract.outer(np.log(to_m), np.log(footprints_m))
+    return np.asarray(np.abs(off).argmin(axis=-1))

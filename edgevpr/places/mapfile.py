@@ -158,12 +158,6 @@ class PlaceMap(MapConnection):
             point = rows.point_of(content)
             return rows.part_of(content, "fine", self.spec.fine), point
 
-    def footprint_m(self) -> float | None:
-        """Return the median footprint in metres of the places with a known pose; None if there are none."""
-        footprints_m = [row[0] for _, row in self.scan("footprint_m") if row]
-        known = [value for value in footprints_m if isinstance(value, float) and 0 < value < math.inf]
-        return float(np.median(known)) if known else None
-
     def landmarks_of(self, place_id: int) -> bytes | None:
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""

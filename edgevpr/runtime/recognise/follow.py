@@ -14,6 +14,7 @@ from edgevpr.core.geodesy import moved as moved_by
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
@@ -63,7 +64,7 @@ class _Survey:
         if known.mean() > _HALF:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
-            spacing_m, footprint_m = index.spacing_m() or 0.0, place_map.footprint_m()
+            spacing_m, footprint_m = index.spacing_m() or 0.0, layers_of(place_map).median_m
             self.spread = max(_LEAST_SPACING_M, spacing_m)
             near_m = _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread
             self.scale = MapScale(

@@ -74,18 +74,15 @@ class Prior:
     `height_ratio` is the height of the camera, relative to that of the map's pictures (see `FineMatch`), by the last
     match; where heights are told, and pictures scaled by them, it is how far they are wrong.
     `footprint_m` is that of the layer of the map in which the last match was, by which the next picture is found best
-    (None: unknown, or its height tells it); the height ratio is relative to it. `layers` are those of the map.
+    (None: unknown, or its height tells it); the height ratio is relative to it.
     `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
     highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
     known heading, degrees (None: headings give no hint; see `TechniqueSpec`). `is_live` is False for recorded frames,
     for which the autopilot's reports do not hold.
     """
 
-    def __init__(
-        self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool, layers: Layers | None = None
-    ) -> None:
+    def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
-        self._layers = layers
         self.footprint_m: float | None = None
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
         self.looks_again = self._are_believed = True
@@ -128,11 +125,18 @@ class Prior:
         return max(ratio, _LEAST_SCALE) if ratio < 1 else ratio / nearest_height(height_ratios, ratio)
 
     def learn(
-        self, found: Candidate, accepted: bool, t_mono_s: float, scale: float = 1.0, footprint_m: float | None = None
+        self,
+        found: Candidate,
+        accepted: bool,
+        t_mono_s: float,
+        scale: float = 1.0,
+        footprint_m: float | None = None,
+        layers: Layers | None = None,
     ) -> None:
         """Keep position and height of an accepted match. The next query uses hints if it agrees with them. Until there
         is one, queries with hints and without alternate. Its picture was enlarged by `scale`, so that by its height it
-        shows `footprint_m` of ground (None: its height is unknown)."""
+        shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it has one).
+        """
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
         if self._known is None:
@@ -143,9 +147,9 @@ class Prior:
             self._are_believed = not self._are_believed
         if accepted and found.match.height_ratio:
             height_ratio, layer_m = scale * found.match.height_ratio, self.footprint_m
-            if self._layers and len(self._layers.footprints_m) > 1 and found.place.pose:
+            if layers and len(layers.footprints_m) > 1 and found.place.pose:
                 seen_m = height_ratio * found.place.pose.footprint_m
-                layer_m = footprint_m or self._layers.fitting(seen_m)
+                layer_m = footprint_m or layers.fitting(seen_m)
                 height_ratio = seen_m / (layer_m or seen_m)
             if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_OFF_SCALE):
                 self.footprint_m, self.height_ratio = layer_m, height_ratio
@@ -197,7 +201,13 @@ class Told:
         return 1.0
 
     def learn(
-        self, found: Candidate, accepted: bool, t_mono_s: float, scale: float = 1.0, footprint_m: float | None = None
+        self,
+        found: Candidate,
+        accepted: bool,
+        t_mono_s: float,
+        scale: float = 1.0,
+        footprint_m: float | None = None,
+        layers: Layers | None = None,
     ) -> None:
         """Learn nothing: the next query is another flight's."""
 

@@ -61,7 +61,7 @@ def open_recogniser(
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
         if narrowed:
-            prior = _in_flight(config, technique, place_map)
+            prior = _in_flight(config, technique)
         recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -84,7 +84,7 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         index_positions(place_map)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior, follows = _in_flight(config, technique, place_map), config.match.follow
+        prior, follows = _in_flight(config, technique), config.match.follow
         recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
@@ -189,10 +189,9 @@ def say_other_lens(place_map: PlaceMap, lens: str | None) -> None:
         _log.info("%s was built without `source.lens`: right if its pictures had no distortion", place_map.path)
 
 
-def _in_flight(config: Config, technique: Technique, place_map: PlaceMap) -> Prior:
+def _in_flight(config: Config, technique: Technique) -> Prior:
     """Make what narrows the queries of a flight."""
-    within_deg, is_live = technique.spec.heading_within_deg, is_now(config.source)
-    return Prior(config.match.reach_m_s, within_deg, is_live, layers_of(place_map))
+    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
 
 
 def _recogniser(
@@ -207,7 +206,7 @@ def _recogniser(
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
-    matcher = Matcher(technique, index, rule, search_of(length))
+    matcher, layers = Matcher(technique, index, rule, search_of(length)), layers_of(place_map)
     mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
     say_other_lens(place_map, config.source.lens)
@@ -216,7 +215,7 @@ def _recogniser(
     if follows and match.sequence is None and kinds_of(technique.spec):
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
-    levelling = levelling_of(config.source, technique, layers=layers_of(place_map))
+    levelling = levelling_of(config.source, technique, layers=layers)
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     preparation = Preparation(
         levelling=levelling,
@@ -228,7 +227,12 @@ def _recogniser(
         matcher,
         place_map,
         meter_of(config, board),
-        WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=config.mavlink.min_accuracy_m),
+        WalkSettings(
+            candidates=candidates,
+            verify=match.verify,
+            min_accuracy_m=config.mavlink.min_accuracy_m,
+            layers=layers,
+        ),
         preparation=preparation,
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
         prior=None if matcher.search else prior,

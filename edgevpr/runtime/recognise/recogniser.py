@@ -16,7 +16,7 @@ from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import Layers, layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
@@ -80,11 +80,13 @@ class Preparation:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
+    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma).
+    `layers` are those of the map (None: the recogniser reads them when it is made)."""
 
     candidates: int | None = None
     verify: bool = True
     min_accuracy_m: float = 1.0
+    layers: Layers | None = None
 
 
 class Recogniser:
@@ -111,7 +113,7 @@ class Recogniser:
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         # Places nearer to each other show the same ground: neither is a rival of the other.
-        self._layers = layers_of(place_map)
+        self._layers = settings.layers or layers_of(place_map)
         self._footprint_m = max(self._layers.footprints_m, default=0.0)
         self.take(matcher)
 
@@ -228,7 +230,7 @@ class Recogniser:
             verdict = Verdict(False, objection)
         if self._prior:
             by_height_m = looked.picture.view.footprint_m
-            self._prior.learn(best, verdict.accepted, frame.t_mono_s, self._scale, by_height_m)
+            self._prior.learn(best, verdict.accepted, frame.t_mono_s, self._scale, by_height_m, self._layers)
             if event.followed:
                 self._prior.follow(event.followed.estimate, event.followed.mass, frame.t_mono_s)
         return verdict, where

@@ -9,6 +9,7 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.follow import Follower
@@ -45,7 +46,7 @@ class Flight:
     def __init__(self, place_map: PlaceMap, index: PlaceIndex, fastest_m_s: float | None = None) -> None:
         self.follower = Follower(place_map, fastest_m_s=fastest_m_s, is_live=True)
         self.place_map, self.index, self.t_s = place_map, index, 1000.0
-        self.has_poses = place_map.footprint_m() is not None
+        self.has_poses = layers_of(place_map).median_m is not None
 
     def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
         """Go on, `moved_m` (east, north) by the camera's own motion."""

@@ -128,7 +128,7 @@ def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_he
         meter,
         WalkSettings(candidates=50),
         preparation=Preparation(levelling=levelling),
-        prior=Prior(None, None, is_live=False, layers=layers),
+        prior=Prior(None, None, is_live=False),
     )
     for place, ratio in ((1, 1.5), (3, 1.5), (2, 1.0), (0, 1.0)):
         del looked[:]

@@ -31,7 +31,7 @@ CAMERA = Camera(noise_sigma=0)
 LENS = Lens(2 * math.degrees(math.atan(320 / CAMERA.focal_px)))
 HEIGHT_M = 100.0
 FOOTPRINT_M = HEIGHT_M * 640 / CAMERA.focal_px
-LAYER = Layers((FOOTPRINT_M,), np.zeros(0, int), np.zeros(0, int))
+LAYER = Layers(FOOTPRINT_M, (FOOTPRINT_M,), np.zeros(0, int), np.zeros(0, int))
 NORTH_M = (120.0, 240.0, 360.0, 480.0)
 M_PER_DEG = 111_195.0
 STRAIGHT = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
