@@ -113,6 +113,7 @@ rig: $(VENV)/installed
 from-space: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/from_space.py
+	$(BIN)/python benchmarks/seams.py
 
 # The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
 # qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.

@@ -30,6 +30,7 @@ _OTHER_DAY = (
     "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); a rehearsal over another orthophoto says it "
     "of this ground"
 )
+_SEAMS = 1 / 8  # share of places with one: straight kerbs look like seams in 2 of 18 pictures of one set
 _SHOWN = 20  # differences of a replay at most
 
 
@@ -45,6 +46,9 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"  left out: {result.without_data} for want of data, {result.says_nothing} for want of texture"
     if result.white:
         yield f"  {result.white} of the places are white over a third or more: cloud and snow are not there every day"
+    if result.seams > _SEAMS * result.tried_for_seams:
+        share = f"{result.seams} of {result.tried_for_seams} places that were looked at"
+        yield f"  straight seams run through {share}, as in a mosaic of several days: fewer are found there"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:

@@ -21,6 +21,7 @@ from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
 from edgevpr.runtime.recognise.landmarks import describe
 
 SIDE_PX = 512
@@ -34,6 +35,7 @@ _BLURRED = 0.07
 _WHITE, _COLOURLESS = 200, 30  # grey values
 _CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
 _TRIED = 0.25, 0.5, 0.75  # places to try for blur, as shares of all
+_TRIED_FOR_SEAMS = 64  # places: it takes a tenth of a second each
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
@@ -59,7 +61,8 @@ class Lattice:
 class OrthophotoSource(RecordingSource):
     """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. Places of which
     more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `white` counts places
-    a third of which is white, as clouds are. `only` are the names of the frames to read (None: all)."""
+    a third of which is white, as clouds are, and `seams` those with a straight seam, of the `tried_for_seams`. `only`
+    are the names of the frames to read (None: all)."""
 
     def __init__(
         self,
@@ -72,7 +75,7 @@ class OrthophotoSource(RecordingSource):
         super().__init__(only)
         self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
         self.total = sum(map(len, lattices))
-        self.without_data = self.white = 0
+        self.without_data = self.white = self.seams = self.tried_for_seams = 0
         self._read = 0
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
@@ -104,6 +107,9 @@ class OrthophotoSource(RecordingSource):
             self.without_data += 1
             return None
         self.white += _white(image) > _CLOUDY
+        if self._read % max(1, self.total // _TRIED_FOR_SEAMS) == 0:
+            self.tried_for_seams += 1
+            self.seams += has_seam(*self._orthophoto.as_it_is(position, WINDOW_PX))
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=pose)
 

@@ -153,7 +153,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
-            result.without_data, result.white = getattr(source, "without_data", 0), getattr(source, "white", 0)
+            for name in ("without_data", "white", "seams", "tried_for_seams"):
+                setattr(result, name, getattr(source, name, 0))
         except EdgevprError:
             if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
                 remove(path)

@@ -130,7 +130,8 @@ class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
     `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
-    the orthophoto has no data there. `white`: places cut from it that are white over a third or more."""
+    the orthophoto has no data there. `white`: places cut from it that are white over a third or more. `seams`: places
+    through which a straight seam runs, of the `tried_for_seams`, some of all."""
 
     added: int = 0
     without_position: int = 0
@@ -140,6 +141,8 @@ class MappingResult:
     not_memorable: int = 0
     without_data: int = 0
     white: int = 0
+    seams: int = 0
+    tried_for_seams: int = 0
 
 
 def build_map(

@@ -145,10 +145,17 @@ class Orthophoto:
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen
 
+    def as_it_is(self, at: Position, side_px: int) -> tuple[Image, Bools]:
+        """Return the pixels of the file around `at`, neither turned nor scaled: up to `side_px` rows and columns, fewer
+        at the edges of the file. Returns and raises as `cut` does."""
+        middle, size = self._pixels(at, np.zeros((1, 2)))[0], np.array([self._raster.width, self._raster.height])
+        low, high = (np.clip(middle + side, 0, size).astype(int).tolist() for side in (-side_px / 2, side_px / 2))
+        return self._raster.read(tuple(low), tuple(high), 1)
+
     def to_fetch(
         self, lat_deg: Doubles, lon_deg: Doubles, footprint_m: float, side_px: int
     ) -> tuple[int, Iterator[None]] | None:
-        """Return how many tiles the pictures that `cut` makes at the places `lat_deg` and `lon_deg` need from an
+        """Return how many tiles the pictures of `cut` and `as_it_is` at the places `lat_deg` and `lon_deg` need from an
         address, and the steps that fetch them. GDAL, which reads WMTS, fetches them later, less those that it has kept.
         None: it is no address."""
         raster = self._raster
@@ -159,7 +166,7 @@ class Orthophoto:
         shrink = _shrink(across_px, side_px)
         tile_px = raster.tile_px if isinstance(raster, TileRaster) else TILE_PX * shrink
         middles = np.column_stack(self._in_file(*transform(WGS84, raster.crs, lon_deg, lat_deg)))
-        reach_px = across_px / 2 + 2 * shrink
+        reach_px = max(across_px / 2 + 2 * shrink, side_px / 2)
         low, high = (((middles + side) // tile_px).astype(int) for side in (-reach_px, reach_px))
         steps = np.indices((high - low).max(axis=0) + 1).reshape(2, -1).T
         tiles = np.unique(np.concatenate([np.minimum(low + step, high) for step in steps]), axis=0)

@@ -1,0 +1,48 @@
+"""Straight seams of an orthophoto, where parts of another day or another brightness meet."""
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Bools, Floats, Image
+
+WINDOW_PX = 512  # a power of two
+# Where parts meet, all of a step is between two pixels; edges of what is on the ground are spread over more.
+_HARD = 0.6
+_MOST_GREY = 40.0  # of a step, so that a few large ones do not make a line
+_BESIDE_PX = 21
+# Grey values. Pictures from space have 6 at most, mosaics of two days 11 to 33, pictures of drones more than this in 5 of
+# 405 (benchmarks/results/seams.md).
+_LEAST_GREY = 12.0
+
+
+def has_seam(image: Image, valid: Bools) -> bool:
+    """Say if a straight seam runs through a picture, uint8 (H, W, 3) with sides of up to WINDOW_PX pixels, as they are
+    in the file; `valid`, bool (H, W), is False where there is no data."""
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    turned = (grey, valid), (grey.T, valid.T)
+    return any(_strongest(each[:, ::way], seen[:, ::way]) > _LEAST_GREY for each, seen in turned for way in (1, -1))
+
+
+def _strongest(grey: Floats, valid: Bools) -> float:
+    """Return by how much the hard steps along one line, from top to bottom and to the right by at most as much, are
+    above those of the lines beside it: their mean, in grey values."""
+    rows, columns = grey.shape
+    one, three = np.abs(grey[:, 2:-1] - grey[:, 1:-2]), np.abs(grey[:, 3:] - grey[:, :-3])
+    seen = valid[:, 3:] & valid[:, 2:-1] & valid[:, 1:-2] & valid[:, :-3]
+    steps = np.zeros((WINDOW_PX, 2 * WINDOW_PX), np.float32)  # lines that leave the picture go on in nothing
+    steps[:rows, : columns - 3] = np.minimum(one, _MOST_GREY) * ((one > _HARD * three) & seen)
+    along = _line_sums(steps) / WINDOW_PX
+    return float((along - cv2.blur(along, (_BESIDE_PX, 1)))[:, : columns - 3].max())
+
+
+def _line_sums(values: Floats) -> Floats:
+    """Return the sums of `values`, float32 (N, W), N a power of two, along lines: float32 (N, W), [k, x] along the line
+    from (row 0, column x) to (row N - 1, column x + k). Columns go round. Each sum is of those of the line's upper and
+    lower half (Goetz and Druckmueller, Pattern Recognition 29(4), 1996)."""
+    sums = values[:, None]  # of N lines with one row each
+    while len(sums) > 1:
+        upper, lower = sums[::2], sums[1::2]
+        longer = [upper[:, k // 2] + np.roll(lower[:, k // 2], -((k + 1) // 2), -1) for k in range(2 * sums.shape[1])]
+        sums = np.stack(longer, axis=1)
+    total: Floats = sums[0]
+    return total
