@@ -145,7 +145,8 @@ class FineMatch:
 class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
     coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Those whose `spec.fine` is None need
-    no `match`, those whose `spec.packed` is None no `pack`, and those whose `spec.in_full` is None no `glance`."""
+    no `match`, those whose `spec.packed` is None no `pack`, those whose `spec.in_full` is None no `glance`, those whose
+    `spec.cells` is None no `turned`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -188,3 +189,6 @@ class Technique(Protocol):
         """Compare only a part of the query's regions with one place; for the arguments see `match`. Returns an estimate
         of the score that `match` would give, and a list with only the best hypothesis, to be given to `match` (None:
         there are no hypotheses)."""
+
+    def turned(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
+        """Compare the query with the place of a `match` again, at its height, but under other rotations only."""

@@ -17,6 +17,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
 from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretched
 from edgevpr.techniques.displacement import aligned, most_similar, share, voted
@@ -65,6 +66,7 @@ _BINS_DOWN = 8  # orientations of the regions whose patterns make a layout
 _LAYOUT_AGREES = 0.45
 # What counts as around a region in the structure of a picture (see `overlay`). Ahead, things are larger.
 _AROUND_CELLS = {"forward": 5.0, "nadir": 3.0}
+_TURNED_DEG = 45.0  # a rotation from which on a picture lies otherwise
 # A match whose structures agree by the second figure keeps its score; below the first one they count as this much.
 # Foreign pictures have at most 4.9 ahead and 2.7 looking down; in corridor, built alike all along, wrong places 9.9.
 _STRUCTURE = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
@@ -242,6 +244,13 @@ class CoHog:
         least, most = _STRUCTURE[self.camera]
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
+
+    def turned(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
+        """See `Technique.turned`."""
+        ratio, at_deg = nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
+        first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
+        off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
+        return self.match(query, fine, (first + np.flatnonzero(off_deg >= _TURNED_DEG)).tolist())
 
     def _likest(
         self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None

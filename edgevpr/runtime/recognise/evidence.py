@@ -147,9 +147,9 @@ def evidence_of(
     agree = {slot: share_of(match) for slot, match in matches.items()}
     rivals = (agree[slot] for slot in away)
     evidence = {
-        "agree": _log_share(agree[best]),
-        "lead": _log_share(agree[best]) - _log_share(max(rivals, default=_BY_CHANCE)),
-        "coverage": _log_share(matches[best].coverage or 0.0),
+        "agree": log_share(agree[best]),
+        "lead": log_share(agree[best]) - log_share(max(rivals, default=_BY_CHANCE)),
+        "coverage": log_share(matches[best].coverage or 0.0),
         "structure": matches[best].structure or 0.0,
         "tried": ranking.tried,
     }
@@ -214,7 +214,8 @@ def read_calibration(text: str) -> MapCalibration:
     return MapCalibration(**found)
 
 
-def _log_share(share: float) -> float:
+def log_share(share: float) -> float:
+    """Return the logarithm of a share, as in the evidence."""
     return math.log(max(share, _LEAST))
 
 

@@ -22,7 +22,7 @@ from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named,
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification
-from edgevpr.runtime.recognise.evidence import evidence_of
+from edgevpr.runtime.recognise.evidence import evidence_of, log_share, share_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
@@ -317,7 +317,19 @@ class Recogniser:
             evidence=evidence,
             by_flight=followed.confidence if followed else None,
         )
-        return judge(findings, index, rule, self.search), best, where
+        verdict = judge(findings, index, rule, self.search)
+        is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
+        if verdict.accepted and evidence and cells is not None and not is_turned_known:
+            findings = replace(findings, ahead_of_turned=evidence["agree"] - self._turned(event, best))
+            verdict = judge(findings, index, rule, self.search)
+        return verdict, best, where
+
+    def _turned(self, event: Recognition, best: Candidate) -> float:
+        """Return how much agrees, as in the evidence, with the best place if the picture is turned otherwise."""
+        assert event.descriptor is not None
+        with self.meter.step("compare"):
+            fine, _ = self.place_map.fine_part(best.place.place_id)
+            return log_share(share_of(self.technique.turned(event.descriptor, fine, best.match)))
 
 
 def _sentence(error: Exception) -> str:
