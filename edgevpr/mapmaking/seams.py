@@ -10,8 +10,8 @@ WINDOW_PX = 512  # a power of two
 _HARD = 0.6
 _MOST_GREY = 40.0  # of a step, so that a few large ones do not make a line
 _BESIDE_PX = 21
-# Grey values. Pictures from space have 6 at most, mosaics of two days 11 to 33; pictures of drones have more than this in
-# 5 of 405 (benchmarks/results/seams.md).
+# Grey values. Pictures from space have 6 at most, mosaics of two days 11 to 33. 5 of 405 pictures of drones have more
+# than this (benchmarks/results/seams.md).
 _LEAST_GREY = 12.0
 
 

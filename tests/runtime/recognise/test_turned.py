@@ -1,0 +1,54 @@
+"""A picture of unknown heading that fits a place in two ways: which of them is right is not known."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.core.config import load_config
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.hints import Told
+from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.techniques import create
+
+LIKE_A_BRIDGE = 2  # the place that looks the same from its other end
+
+
+def frame(place, shift_px=0, heading_deg=None):
+    ground = textured(place, 500, 500)
+    if place == LIKE_A_BRIDGE:
+        ground = np.uint8(np.rint((ground.astype(float) + ground[::-1, ::-1]) / 2))
+    image = ground[50 + shift_px : 434 + shift_px, 50:434]
+    at = Position(50 + place * 0.01, 8.0)
+    return Frame(image=image, name=str(place), t_mono_s=0.0, position=at, heading_deg=heading_deg)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("turned") / "m.gpkg"
+    meter = meter_of(load_config(None), load_board("this"))
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map((frame(place, heading_deg=0.0) for place in range(4)), technique, place_map, meter)
+    with PlaceMap.open(path) as place_map:
+        matcher = Matcher(
+            technique, load_index(place_map, technique, 10**6), accept_rule(technique, load_config(None).match)
+        )
+        told = Told(("heading",), technique.spec.heading_within_deg)
+        yield Recogniser(matcher, place_map, meter, WalkSettings(candidates=50), prior=told)
+
+
+def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):
+    unknown, known = (walk.step(frame(LIKE_A_BRIDGE, 40, heading_deg)) for heading_deg in (None, 0.0))
+    assert not unknown.accepted
+    assert "agrees nearly as well if the picture is turned otherwise" in unknown.reason
+    assert known.accepted, known.reason
+
+
+def test_any_other_place_is_accepted_without(walk):
+    event = walk.step(frame(1, 40))
+    assert event.accepted, event.reason
