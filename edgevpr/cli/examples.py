@@ -32,6 +32,13 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map repair": (("after `map check` has named damage", "valley.gpkg"),),
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
     "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
+    "fleet build": (
+        ("the photographs of many flights", "valley/ --images monday/ tuesday/ --camera nadir"),
+        (
+            "a large orthophoto, by the computers of a network",
+            "state/ --orthophoto state.vrt --footprint-m 120 --spacing-m 30 --scheduler tcp://10.0.0.1:8786",
+        ),
+    ),
     "salience": (("what of a picture is worth remembering", "photos/0042.jpg"),),
     "match": (
         ("where later pictures were taken", "valley.gpkg --images later/"),

@@ -98,6 +98,11 @@ def _add_build(build: ArgumentParser) -> None:
 def _add_pictures(parser: ArgumentParser) -> None:
     """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
     add_recording(parser, required=False)
+    add_orthophoto(parser)
+
+
+def add_orthophoto(parser: ArgumentParser) -> None:
+    """Add the flags for an orthophoto, and for the pictures that are cut from it."""
     flags = parser.add_argument_group("of an orthophoto, in place of --images")
     flags.add_argument(
         "--orthophoto",
@@ -129,7 +134,7 @@ def _lengths(text: str) -> tuple[float, ...]:
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
-    from edgevpr.mapmaking.making import Cuttings, FlownPictures
+    from edgevpr.mapmaking.making import FlownPictures
 
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
@@ -140,6 +145,13 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
+    return cuttings_of(args)
+
+
+def cuttings_of(args: Namespace) -> "Cuttings":
+    """Return the pictures that the flags of an orthophoto name. Raises UsageError."""
+    from edgevpr.mapmaking.making import Cuttings
+
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}

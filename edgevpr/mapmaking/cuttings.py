@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.quadkeys import keys_at
 from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
 from edgevpr.runtime.recognise.landmarks import describe
 
@@ -39,6 +40,10 @@ _TRIED_FOR_SEAMS = 64  # places: it takes a tenth of a second each
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
+
+
+class NoPlaceError(UsageError):
+    """No place of the grid lies where the user wants one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +153,16 @@ class OrthophotoSource(RecordingSource):
             images, halvings = [resized(each, (side_px >> (halvings + 1),) * 2) for each in images], halvings + 1
         return across_px / side_px * 2**halvings if halvings else 1.0
 
+    def ground(self, spacing_m: float) -> Iterator[Image]:
+        """Yield all that the file shows around the places, as it is, in windows that overlap: uint8 (H, W, 3) BGR."""
+        photo = self._orthophoto
+        together = max(1, int(SIDE_PX * photo.resolution_m / spacing_m))  # places a window, along each side
+        for lattice in self._lattices:
+            side_px = math.ceil((2 * together * spacing_m + lattice.footprint_m) / photo.resolution_m)
+            windows = np.column_stack((lattice.rows, lattice.columns)) // together
+            for at in np.unique(windows, axis=0, return_index=True)[1].tolist():
+                yield photo.as_it_is(Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at])), side_px)[0]
+
     def to_fetch(self) -> tuple[int, Iterator[None]] | None:
         """See `Orthophoto.to_fetch`."""
         widest_m = max(lattice.footprint_m for lattice in self._lattices)
@@ -193,8 +208,8 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
     its polygons or within `footprint_m` of its paths.
 
-    Raises UsageError if footprint or spacing do not fit the orthophoto, the area is outside of it, or there are no
-    places or more than a million.
+    Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, and
+    NoPlaceError if there are none.
     """
     plane = local_crs(orthophoto.middle)
     outline_m = np.array(orthophoto.outline(plane))
@@ -220,7 +235,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
         corners += [path + off_m for path in paths_m for off_m in (-footprint_m, footprint_m)]
         area_low, area_high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         if not ((area_low <= high) & (area_high >= low)).all():  # false for what cannot be projected, too
-            raise UsageError(
+            raise NoPlaceError(
                 f"The area does not touch {orthophoto.name}: it is at {extent_words(area.extent_deg)}, the orthophoto "
                 f"at {extent_words(orthophoto.extent_deg)}."
             )
@@ -238,13 +253,23 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     rows, columns = np.nonzero(wanted)
     _require_bounded(len(rows), _MOST_PLACES, spacing_m)
     if not len(rows):
-        raise UsageError(
+        raise NoPlaceError(
             f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.name}: give a smaller spacing."
         )
     lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
     shape = (int(count[1]), int(count[0]))
     rows, columns = rows + count[1] - end[1], columns + begin[0]
     return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
+
+
+def within(lattice: Lattice, key: str) -> Lattice:
+    """Return the places of a grid that lie in the tile with this quad key: each place is in one tile of a zoom. Raises
+    NoPlaceError if there are none."""
+    there = keys_at(lattice.lat_deg, lattice.lon_deg, len(key)) == key
+    if not there.any():
+        raise NoPlaceError(f"No place lies in the tile {key}.")
+    arrays = {name: getattr(lattice, name)[there] for name in ("rows", "columns", "lat_deg", "lon_deg")}
+    return replace(lattice, **arrays)
 
 
 def _require_bounded(count: int, most: int, spacing_m: float) -> None:

@@ -61,28 +61,33 @@ class Cuttings:
     `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
     picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
     places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
-    (None: none are asked for)."""
+    (None: none are asked for). `tile`: the quad key of the tile that the places are in (None: all)."""
 
     orthophoto: str
     footprint_m: float | Sequence[float]
     spacing_m: float
     area: str | None = None
     attribution: str | None = None
+    tile: str | None = None
 
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
-        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp
-        from edgevpr.mapmaking.missions import read_area
+        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp, within
+        from edgevpr.mapmaking.missions import Area, read_area
         from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
+        from edgevpr.mapmaking.quadkeys import ring_around
         from edgevpr.mapmaking.tiles import ground_of
 
-        area = read_area(self.area) if self.area else None
+        area = Area(((ring_around(self.tile),),), ()) if self.tile else None
+        area = read_area(self.area) if self.area else area
         given = self.footprint_m
         footprints_m = sorted(set(given)) if isinstance(given, Sequence) else [given]
         orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, footprints_m[-1]) if area else None)
         lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in footprints_m]
         require_sharp(orthophoto, footprints_m[0])
+        if self.tile:
+            lattices = [within(lattice, self.tile) for lattice in lattices]
         return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only)
 
 

@@ -157,6 +157,15 @@ def repair(path: str | Path, watch: Watch = unwatched) -> Path:
     return original
 
 
+def select(path: str | Path, out: Path, wanted: Callable[[Place], bool]) -> int:
+    """Copy the `wanted` places of a map to the new file `out`, as `shrink` does; return how many there are."""
+    with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
+        whole = (each for each in examine(place_map) if not each.problem)
+        return _copy(
+            place_map, unfinished, (each for each in whole if wanted(rows.place_of(each.place_id, each.content)))
+        )
+
+
 def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:
     """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
     `best_places`). Returns (number of places copied, number of readable places of the map).

@@ -111,6 +111,15 @@ class PlaceMap(MapConnection):
             self._record_beside(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
 
     @property
+    def inputs_sha256(self) -> str | None:
+        """Hash of all that a tile of a fleet's maps was made of; None: it was not recorded."""
+        return self._text_beside(mapspec.INPUTS)
+
+    def record_inputs(self, sha256: str) -> None:
+        """Store the hash of all that the map was made of. Raises MapError."""
+        self._record_beside(mapspec.INPUTS, sha256)
+
+    @property
     def calibration(self) -> str | None:
         """The map's calibration of confidences (see `mapmaking.calibrate`), as the text stored in the file. None if the
         map was not calibrated, or if the stored value is not a text."""

@@ -1,0 +1,92 @@
+"""`edgevpr fleet`: maps larger than an aircraft, a folder of tiles made by many workers."""
+
+from argparse import Namespace
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edgevpr.cli.maps import add_orthophoto, cuttings_of
+from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, group, show
+from edgevpr.core.errors import UsageError
+from edgevpr.core.text import progress
+
+_PLACES_PER_TILE = 10_000
+
+
+def add(commands: Any) -> None:
+    """Add the commands and their flags."""
+    fleet = group(commands, "fleet", "make maps that are larger than an aircraft")
+    build = command(fleet, "build", fleet_build, "map ground tile by tile, by many workers")
+    build.add_argument(
+        "out", metavar="MAPS", help="folder of the maps, one a tile, and of their index; it is gone on with"
+    )
+    build.add_argument(
+        "--images",
+        metavar="SOURCE",
+        nargs="+",
+        help="folders of photographs, and tables (.csv) of files or addresses (s3://...) with their positions",
+    )
+    add_orthophoto(build)
+    build.add_argument("--config", metavar="FILE", help="that of the flights: their camera, mask and salience")
+    add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
+    build.add_argument(
+        "--places-per-tile", type=count, metavar="N", default=_PLACES_PER_TILE, help="at most (default: %(default)s)"
+    )
+    build.add_argument("--scheduler", metavar="ADDRESS", help="of Dask, tcp://HOST:8786 (default: this computer works)")
+    build.add_argument("--workers", type=count, metavar="N", help="on this computer (default: one a core)")
+    build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
+    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure it is")
+    add_json(build)
+
+
+def fleet_build(args: Namespace) -> int:
+    """Run `fleet build`: make or continue a folder of maps, and print what was done."""
+    try:
+        from edgevpr.fleet import building, index
+        from edgevpr.fleet.photos import photos_of
+    except ModuleNotFoundError as error:
+        raise UsageError(f"A fleet's maps need more packages ({error}): `pip install 'edgevpr[fleet]'`.") from error
+
+    config, out = config_of(args, args.config), Path(args.out)
+    if (args.images is None) == (args.orthophoto is None):
+        raise UsageError("Give either --images (photographs of flights) or --orthophoto: maps are made of one of them.")
+    zoom, camera = next((len(key) for key in index.tiles_in(out)), None), config.source.camera
+    without_position = 0
+    if args.orthophoto:
+        tasks, camera = building.tasks_of_orthophoto(cuttings_of(args), args.places_per_tile, zoom), "nadir"
+    elif camera is None:
+        raise UsageError("Where did the camera look? Give --camera nadir (straight down) or --camera forward.")
+    else:
+        tasks, without_position = building.tasks_of_photos(photos_of(args.images), args.places_per_tile, zoom)
+    out = out.absolute()
+    order = building.FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
+    done = list(building.build(order, tasks, args.scheduler, args.workers, progress))
+    problems = {each.key: each.problem for each in done if each.problem}
+    unusable = [text for each in done for text in each.unusable]
+    result = {
+        "maps": str(out),
+        "tiles": sum(each.tile is not None for each in done),
+        "mapped_now": sum(each.is_new for each in done),
+        "places": sum(each.tile.places for each in done if each.tile),
+        "not_calibrated": sum(each.tile.expected is None for each in done if each.tile),
+        "without_position": without_position,
+        "unusable": unusable,
+        "problems": problems,
+    }
+    show({**result, "new": [asdict(each.tile) for each in done if each.is_new and each.tile]}, args.json, _said(result))
+    return 1 if problems or unusable else 0
+
+
+def _said(result: dict[str, Any]) -> list[str]:
+    lines = [
+        f"{result['maps']}: {result['places']} places in {result['tiles']} tiles, {result['mapped_now']} of them mapped "
+        "anew; index.gpkg shows them"
+    ]
+    if result["not_calibrated"]:
+        lines.append(f"  {result['not_calibrated']} tiles are not calibrated: they fly with the shipped confidence")
+    if result["without_position"]:
+        lines.append(f"  left out: {result['without_position']} photographs without a position")
+    if result["unusable"]:
+        lines.append(f"  left out: {len(result['unusable'])} photographs: {result['unusable'][0]}")
+    lines += [f"  not mapped  tile {key}: {problem}" for key, problem in result["problems"].items()]
+    return lines

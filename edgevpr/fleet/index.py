@@ -1,0 +1,114 @@
+"""The index of a folder of maps: one GeoPackage, with an outline of every tile, which QGIS shows, and what it holds.
+
+It is written anew as a whole, and whatever it says is in the tiles' own files too: it can be lost."""
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio
+import shapely
+
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.errors import MapError
+from edgevpr.mapmaking.quadkeys import extent_of_key
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import info_of
+from edgevpr.runtime.recognise.evidence import calibration_of
+
+NAME, _LAYER = "index.gpkg", "tiles"
+_KINDS: Mapping[str, type] = {str(int): np.int64, str(float | None): np.float64}  # of columns; others are texts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tile:
+    """A tile of the grid that is mapped. `key`: its quad key; its map is KEY.gpkg in the folder of the index. `places`:
+    their number. `inputs_sha256`: hash of all that the map was made of. `first_time`, `last_time`: of its pictures, in
+    UTC. `expected`: share (0..1) of changed pictures of its own places that was accepted when it was calibrated, at the
+    `precision` wanted. None: unknown. `technique`: its name and parameters. `file_bytes`: size of the map."""
+
+    key: str
+    places: int
+    inputs_sha256: str
+    first_time: str | None
+    last_time: str | None
+    expected: float | None
+    precision: float | None
+    technique: str
+    file_bytes: int
+
+
+def path_of(folder: Path, key: str) -> Path:
+    """Return the path of a tile's map."""
+    return folder / f"{key}.gpkg"
+
+
+def tile_of(path: Path) -> Tile:
+    """Read what the index says of a tile from its map. Raises MapError."""
+    with PlaceMap.open(path) as place_map:
+        info, calibration, inputs = info_of(place_map), calibration_of(place_map), place_map.inputs_sha256
+    return Tile(
+        key=path.stem,
+        places=info.places,
+        inputs_sha256=inputs or "",
+        first_time=info.first_time,
+        last_time=info.last_time,
+        expected=calibration.accepted if calibration else None,
+        precision=calibration.precision if calibration else None,
+        technique=technique_text(info.spec),
+        file_bytes=info.file_bytes,
+    )
+
+
+def technique_text(spec: TechniqueSpec) -> str:
+    """Return the name and parameters of a technique as text."""
+    return " ".join([spec.name, *(f"{name}={value}" for name, value in sorted(spec.parameters.items()))])
+
+
+def tiles_in(folder: Path) -> dict[str, Tile]:
+    """Return the tiles of a folder by their keys: those of the index, and those whose maps are there and that it lacks.
+    Raises MapError."""
+    found = _read(folder / NAME)
+    paths = {path.stem: path for path in folder.glob("[0-3]*.gpkg") if not path.stem.strip("0123")}
+    return {key: found[key] if key in found else tile_of(path) for key, path in sorted(paths.items())}
+
+
+def write(folder: Path, tiles: Iterable[Tile]) -> None:
+    """Write the index of a folder. It is replaced as a whole."""
+    tiles = list(tiles)
+    extents = [extent_of_key(tile.key) for tile in tiles]
+    outlines = [shapely.to_wkb(shapely.box(west, south, east, north)) for south, west, north, east in extents]
+    columns = list(zip(*map(astuple, tiles), strict=True)) or [() for _ in fields(Tile)]
+    kinds = [_KINDS.get(str(field.type), object) for field in fields(Tile)]
+    unfinished = folder / f".{os.getpid()}.{NAME}"
+    pyogrio.raw.write(
+        unfinished,
+        np.array(outlines, object),
+        [np.array(column, kind) for column, kind in zip(columns, kinds, strict=True)],
+        [field.name for field in fields(Tile)],
+        layer=_LAYER,
+        driver="GPKG",
+        geometry_type="Polygon",
+        crs="EPSG:4326",
+    )
+    unfinished.replace(folder / NAME)
+
+
+def _read(path: Path) -> Mapping[str, Tile]:
+    if not path.exists():
+        return {}
+    try:
+        meta, _, _, columns = pyogrio.raw.read(path, layer=_LAYER, read_geometry=False)
+        rows = [dict(zip(meta["fields"].tolist(), row, strict=True)) for row in zip(*columns, strict=True)]
+        return {row["key"]: Tile(**{name: _plain(value) for name, value in row.items()}) for row in rows}
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, TypeError, KeyError) as error:
+        raise MapError(f"{path} is no index of maps ({error}): remove it, and it is made anew.") from error
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of a column as Python's own; None for NaN."""
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if value != value else value

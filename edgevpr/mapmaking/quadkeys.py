@@ -1,0 +1,97 @@
+"""The grid in which large ground is mapped tile by tile: map tiles of the Web Mercator projection, named by quad keys.
+A key has a digit for each zoom, which says in which quarter of the tile before it lies: 0 and 1 north, 0 and 2 west."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.core.errors import UsageError
+from edgevpr.mapmaking.missions import Ring
+
+MOST_LAT_DEG = 85.05  # farther from the equator there are no map tiles
+# At the equator a tile has a side of 10 km, or of 10 m. What comes into a folder later is divided as the first was: the
+# few photographs of a first flight must not make one tile of a country.
+LEAST_ZOOM, MOST_ZOOM = 12, 22
+_EQUATOR_M = 40_075_016.7
+_MORE = 0.01  # of a tile: its edges are curves in other projections
+
+Extent = tuple[float, float, float, float]
+
+
+def keys_at(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> NDArray[np.str_]:
+    """Return the keys, of `zoom` digits, of the tiles in which positions in degrees (N,) lie: str (N,). Raises
+    UsageError for a position near a pole."""
+    if len(lat_deg) and np.abs(lat_deg).max() > MOST_LAT_DEG:
+        raise UsageError(
+            f"A place is at {lat_deg[np.abs(lat_deg).argmax()]:.2f} degrees north, and tiles end at {MOST_LAT_DEG} "
+            "degrees north and south: make a single map with `edgevpr map build`."
+        )
+    column, row = _numbers(lat_deg, lon_deg, zoom)
+    keys = np.full(len(lat_deg), "", f"<U{zoom}")
+    for level in reversed(range(zoom)):
+        keys = np.char.add(keys, ((column >> level & 1) + 2 * (row >> level & 1)).astype(str))
+    return keys
+
+
+def extent_of_key(key: str) -> Extent:
+    """Return the bounding box of a tile: (south, west, north, east) in degrees."""
+    column = sum((int(digit) & 1) << level for level, digit in enumerate(reversed(key)))
+    row = sum((int(digit) >> 1) << level for level, digit in enumerate(reversed(key)))
+    (north, south), (west, east) = (
+        _lats(row, len(key)),
+        (360 * (column + each) / 2 ** len(key) - 180 for each in (0, 1)),
+    )
+    return south, west, north, east
+
+
+def ring_around(key: str) -> Ring:
+    """Return an outline that is a little larger than a tile: five points (lat, lon) in degrees."""
+    south, west, north, east = extent_of_key(key)
+    lat_deg, lon_deg = _MORE * (north - south), _MORE * (east - west)
+    south, west, north, east = south - lat_deg, west - lon_deg, north + lat_deg, east + lon_deg
+    return [(south, west), (south, east), (north, east), (north, west), (south, west)]
+
+
+def keys_over(extent_deg: Extent, zoom: int) -> Iterator[str]:
+    """Yield the keys of all tiles that a bounding box touches; its longitudes may go beyond the date line."""
+    south, west, north, east = extent_deg
+    (left, right), (bottom, top) = _numbers(np.array([south, north]), np.array([west, east]), zoom, wraps=False)
+    for row in range(top, bottom + 1):
+        for column in range(left, right + 1):
+            middle = np.array([np.mean(_lats(row, zoom))]), np.array([360 * (column + 0.5) / 2**zoom - 180])
+            yield str(keys_at(*middle, zoom)[0])
+
+
+def zoom_of_spacing(lat_deg: float, spacing_m: float, most_places: float) -> int:
+    """Return the lowest zoom, from LEAST_ZOOM on, whose tiles hold at most `most_places` of a grid of `spacing_m` at a
+    latitude."""
+    side_m = spacing_m * math.sqrt(most_places)
+    around_m = _EQUATOR_M * math.cos(math.radians(lat_deg))
+    return min(max(math.ceil(math.log2(around_m / side_m)), LEAST_ZOOM), MOST_ZOOM)
+
+
+def zoom_of_places(lat_deg: Doubles, lon_deg: Doubles, most_places: int) -> int:
+    """Return the lowest zoom, from LEAST_ZOOM on, of which no tile holds more than `most_places` of the positions in
+    degrees, (N,)."""
+    for zoom in range(LEAST_ZOOM, MOST_ZOOM):
+        if np.unique(keys_at(lat_deg, lon_deg, zoom), return_counts=True)[1].max() <= most_places:
+            return zoom
+    return MOST_ZOOM
+
+
+def _numbers(lat_deg: Doubles, lon_deg: Doubles, zoom: int, wraps: bool = True) -> tuple[Ints, Ints]:
+    """Return the columns and rows, int (N,), of the tiles in which positions (N,) lie."""
+    across = 2**zoom
+    column = np.floor((np.asarray(lon_deg) / 360 + 0.5) * across).astype(int)
+    down = 0.5 - np.arcsinh(np.tan(np.radians(lat_deg))) / (2 * np.pi)
+    row = np.clip(np.floor(down * across).astype(int), 0, across - 1)
+    return column % across if wraps else column, row
+
+
+def _lats(row: int, zoom: int) -> tuple[float, float]:
+    """Return the latitudes of the northern and southern edge of a row of tiles, in degrees."""
+    north, south = (math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (row + each) / 2**zoom)))) for each in (0, 1))
+    return north, south

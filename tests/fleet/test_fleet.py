@@ -1,0 +1,285 @@
+"""Maps made tile by tile: by a real scheduler and real workers, each a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from pictures import textured
+from rasters import textured_raster
+
+from edgevpr.cli.main import main
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import MapBusyError, MapError, UsageError
+from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
+from edgevpr.mapmaking.making import Cuttings
+from edgevpr.places.mapfile import PlaceMap
+
+building = pytest.importorskip("edgevpr.fleet.building", reason="needs the extra `fleet`")
+index = pytest.importorskip("edgevpr.fleet.index")
+pyogrio = pytest.importorskip("pyogrio")
+pytestmark = pytest.mark.slow
+PER_TILE = 20
+
+
+def unshown(items, total, label):
+    return items
+
+
+class Cluster:
+    """A scheduler, and workers that can be killed."""
+
+    def __init__(self, folder):
+        self.file, self.workers = folder / "scheduler.json", []
+        self.scheduler = self._start("dask_scheduler", "--port", "0", "--no-dashboard")
+
+    def _start(self, program, *words):
+        words = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", self.file, *words]
+        with open(self.file.with_suffix(".log"), "ab") as log:
+            return subprocess.Popen(list(map(str, words)), stdout=log, stderr=log)
+
+    def add_worker(self):
+        self.workers.append(self._start("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"))
+        return self.workers[-1]
+
+    @property
+    def address(self):
+        for _ in range(300):
+            if self.file.exists() and self.file.read_text().strip():
+                return json.loads(self.file.read_text())["address"]
+            time.sleep(0.1)
+        raise TimeoutError(self.file.with_suffix(".log").read_text())
+
+    def wait_for_workers(self, count):
+        from dask.distributed import Client
+
+        with Client(self.address, timeout=30) as client:
+            client.wait_for_workers(count, timeout=60)
+
+    def stop(self):
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    found = Cluster(tmp_path_factory.mktemp("dask"))
+    found.add_worker()
+    found.add_worker()
+    found.wait_for_workers(2)
+    yield found
+    found.stop()
+
+
+def order(out, **more):
+    return building.FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False, **more)
+
+
+def cuttings(path):
+    return Cuttings(orthophoto=str(path), footprint_m=80.0, spacing_m=40.0)
+
+
+def mapped(cluster, out, tasks, **more):
+    return list(building.build(order(out, **more), tasks, cluster.address, None, unshown))
+
+
+def places_of(folder):
+    """The names of the places of all tiles, by the tile."""
+    found = {}
+    for path in sorted(folder.glob("[0-3]*.gpkg")):
+        with PlaceMap.open(path) as place_map:
+            found[path.stem] = sorted(place.source_image for place in place_map.places())
+    return found
+
+
+@pytest.fixture(scope="module")
+def orthophoto(tmp_path_factory):
+    return textured_raster(tmp_path_factory.mktemp("raster") / "o.tif", side_px=800)
+
+
+@pytest.fixture(scope="module")
+def tiled(cluster, orthophoto, tmp_path_factory):
+    out = tmp_path_factory.mktemp("tiled") / "maps"
+    tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
+    return out, tasks, mapped(cluster, out, tasks)
+
+
+def test_every_place_of_an_orthophoto_is_in_one_tile(tiled, orthophoto):
+    out, _, done = tiled
+    assert not [each.problem for each in done if each.problem]
+    found = places_of(out)
+    source = cuttings(orthophoto).open()
+    names = [frame.name for frame in iter(lambda: source.read(1.0), None)]
+    assert sorted(name for each in found.values() for name in each) == sorted(names)
+    assert max(map(len, found.values())) <= PER_TILE
+    assert len(found) > 4
+
+
+def test_the_index_shows_the_tiles_in_any_program(tiled):
+    out, _, _ = tiled
+    info = pyogrio.read_info(out / index.NAME)
+    assert (info["layer_name"], info["geometry_type"], info["crs"]) == ("tiles", "Polygon", "EPSG:4326")
+    found = index.tiles_in(out)
+    assert {key: tile.places for key, tile in found.items()} == {key: len(each) for key, each in places_of(out).items()}
+    with rasterio.open(out.parents[1] / "raster0" / "o.tif") as raster:
+        west, south, east, north = rasterio.warp.transform_bounds(raster.crs, "EPSG:4326", *raster.bounds)
+    bounds = info["total_bounds"]
+    assert bounds[0] < west + 0.001
+    assert bounds[3] > north - 0.001
+    assert (bounds[2] > east - 0.001, bounds[1] < south + 0.001) == (True, True)
+
+
+def test_the_index_is_made_anew_of_the_tiles_where_it_is_lost(tiled):
+    out, _, _ = tiled
+    before = index.tiles_in(out)
+    (out / index.NAME).unlink()
+    assert index.tiles_in(out) == before
+    index.write(out, before.values())
+    assert index.tiles_in(out) == before
+
+
+def test_a_second_run_maps_nothing_and_one_over_changed_ground_what_has_changed(cluster, orthophoto, tmp_path):
+    path, out = tmp_path / "o.tif", tmp_path / "maps"
+    path.write_bytes(orthophoto.read_bytes())
+    tasks = building.tasks_of_orthophoto(cuttings(path), PER_TILE, None)
+    assert all(each.is_new for each in mapped(cluster, out, tasks) if each.tile)
+    assert not any(each.is_new for each in mapped(cluster, out, tasks))
+    with rasterio.open(path, "r+") as raster:  # a house more, in the north-west
+        raster.write(np.full((1, 20, 20), 255, np.uint8), window=rasterio.windows.Window(30, 30, 20, 20))
+    again = mapped(cluster, out, tasks)
+    assert 1 <= sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
+
+
+def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
+    cluster, out = Cluster(tmp_path), tmp_path / "maps"
+    try:
+        first = cluster.add_worker()
+        cluster.add_worker()
+        cluster.wait_for_workers(2)
+        tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
+        done = []
+        for each in building.build(order(out), tasks, cluster.address, None, unshown):
+            if not done:
+                first.send_signal(signal.SIGKILL)
+            done.append(each)
+    finally:
+        cluster.stop()
+    assert not [each.problem for each in done if each.problem]
+    names = [name for each in places_of(out).values() for name in each]
+    assert len(names) == len(set(names)) == sum(each.tile.places for each in done if each.tile)
+    assert len(names) == cuttings(orthophoto).open().total
+    assert not list(out.glob(".*.gpkg.*"))
+
+
+def photographs(folder, names, first):
+    """Write photographs 30 m apart to the east, and their positions."""
+    folder.mkdir()
+    tags = {}
+    for number, name in enumerate(names, start=first):
+        cv2.imwrite(str(folder / name), textured(number, 384, 384))
+        tags[name] = GeoTag(position=Position(47.0, 8.0 + number * 0.0004))
+    write_positions(folder / "positions.csv", tags)
+
+
+def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_where_they_were_taken(cluster, tmp_path):
+    names = [f"DJI_{number:04d}.png" for number in range(8)]
+    for number, folder in enumerate(("monday", "tuesday", "wednesday")):
+        photographs(tmp_path / folder, names, 8 * number)
+    (tmp_path / "monday" / names[3]).write_bytes(b"broken")
+    (tmp_path / "tuesday" / "none.png").write_bytes((tmp_path / "tuesday" / names[0]).read_bytes())
+    table = tmp_path / "wednesday.csv"
+    lines = (tmp_path / "wednesday" / "positions.csv").read_text().splitlines()
+    lines[1:] = [line.replace("DJI_", f"file://{tmp_path}/wednesday/DJI_", 1) for line in lines[1:]]
+    table.write_text("\n".join([*lines, lines[-1].replace("_0007", "_0099")]))
+    photos = pytest.importorskip("edgevpr.fleet.photos").photos_of
+    sources = [str(tmp_path / "monday"), str(tmp_path / "tuesday"), str(table)]
+    tasks, without_position = building.tasks_of_photos(photos(sources), 10, None)
+    assert without_position == 1
+    done = mapped(cluster, tmp_path / "maps", tasks)
+    unusable = " ".join(text for each in done for text in each.unusable)
+    assert "DJI_0099.png cannot be read" in unusable
+    assert "DJI_0003.png" in unusable
+    found = [name for each in places_of(tmp_path / "maps").values() for name in each]
+    there = [f"{folder}_{name}" for folder in ("monday", "tuesday", "wednesday") for name in names]
+    assert sorted(found) == sorted(set(there) - {"monday_DJI_0003.png"})
+    assert not any(each.is_new for each in mapped(cluster, tmp_path / "maps", tasks))
+
+
+def test_photographs_of_one_name_in_folders_of_one_name_are_told_apart(tmp_path):
+    for parent in ("a", "b"):
+        (tmp_path / parent).mkdir()
+        photographs(tmp_path / parent / "DCIM", ["1.png"], 0)
+    photos = pytest.importorskip("edgevpr.fleet.photos").photos_of
+    folders = [str(tmp_path / parent / "DCIM") for parent in ("a", "b", "a")]
+    names = [photo.name for photo in photos(folders)]
+    assert len(names) == len(set(names)) == 2
+
+
+def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
+    out, tasks, _ = tiled
+    first = building.build(order(out), tasks, cluster.address, None, unshown)
+    next(first)
+    with pytest.raises(MapBusyError, match="another run is mapping into it"):
+        mapped(cluster, out, tasks)
+    first.close()
+
+
+def test_a_tile_of_another_technique_is_refused(tiled, cluster):
+    out, tasks, _ = tiled
+    ahead = replace(order(out), camera="forward")
+    with pytest.raises(MapError, match=r"camera=nadir.*new tiles would be of.*camera=forward.*another folder"):
+        list(building.build(ahead, tasks, cluster.address, None, unshown))
+
+
+def test_a_worker_of_another_version_maps_nothing(tiled, cluster, tmp_path):
+    _, tasks, _ = tiled
+    done = mapped(cluster, tmp_path / "maps", tasks[:2], version="99.0")
+    assert [each.tile for each in done] == [None, None]
+    assert "99.0 asks: install the same on all machines" in done[0].problem
+
+
+def test_where_there_is_no_scheduler_a_sentence_says_how_to_start_one(tmp_path, orthophoto):
+    tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
+    with pytest.raises(UsageError, match=r"There is no Dask scheduler at tcp://127\.0\.0\.1:9"):
+        list(building.build(order(tmp_path / "maps"), tasks, "tcp://127.0.0.1:9", None, unshown))
+
+
+def test_photographs_at_a_pole_are_refused(tmp_path):
+    photo = pytest.importorskip("edgevpr.fleet.photos").Photo
+    with pytest.raises(UsageError, match="tiles end at"):
+        building.tasks_of_photos([photo("/p.jpg", "p.jpg", GeoTag(position=Position(89.0, 0.0)))], 10, None)
+
+
+def test_photographs_on_both_sides_of_the_date_line_have_neighbours_across_it():
+    photo = pytest.importorskip("edgevpr.fleet.photos").Photo
+    at = [Position(0.5, 179.9999), Position(0.5, -179.9999)]
+    photos = [photo(f"/{n}.jpg", f"{n}.jpg", GeoTag(position=each)) for n, each in enumerate(at)]
+    tasks, _ = building.tasks_of_photos(photos, 10, 12)
+    assert [(len(task.photos), len(task.inside)) for task in tasks] == [(2, 1), (2, 1)]
+
+
+def test_the_command_works_on_a_laptop_with_nothing_set_up(tmp_path, capsys):
+    photographs(tmp_path / "photos", [f"{number}.png" for number in range(4)], 0)
+    words = ["fleet", "build", str(tmp_path / "maps"), "--images", str(tmp_path / "photos"), "--workers", "1"]
+    assert main(words) == 2
+    assert "Where did the camera look?" in capsys.readouterr().err
+    done = subprocess.run(
+        [sys.executable, "-m", "edgevpr", *words, "--camera", "nadir", "--json"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "HOME": str(tmp_path)},
+        cwd=Path(__file__).parents[2],
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["places"], result["mapped_now"], result["problems"]) == (4, result["tiles"], {})
