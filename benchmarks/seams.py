@@ -1,10 +1,10 @@
 """Which seams of a raster `edgevpr map build` sees: `make from-space`.
 
-The rasters are those of sat_marash, of both days, looked at in overlapping windows of 512 pixels; the pictures are those
-of all sets from the air, where there are no seams. The mosaics have the raster `before`, and the other day or the same one
-half as bright again instead of it: in every other stripe of 400 m that lies at 12 degrees to north, or in every other
-square of 128 m. The other day has the mean and the spread of each colour that `before` has. The limit was chosen on these
-rasters and pictures.
+The rasters are those of sat_marash, of both days, in windows of 512 pixels that overlap by half; the pictures are
+those of all sets from the air, where there are no seams. The mosaics have the raster `before` and, in every other
+stripe of 400 m that lies at 12 degrees to north, or in every other square of 128 m, the other day, or the same one
+half as bright again. The other day has the mean and the spread of each colour that `before` has. The limit was chosen
+on these rasters and pictures.
 """
 
 from collections.abc import Iterator

@@ -79,8 +79,8 @@ def fleet_build(args: Namespace) -> int:
 
 def _said(result: dict[str, Any]) -> list[str]:
     lines = [
-        f"{result['maps']}: {result['places']} places in {result['tiles']} tiles, {result['mapped_now']} of them mapped "
-        "anew; index.gpkg shows them"
+        f"{result['maps']}: {result['places']} places in {result['tiles']} tiles, {result['mapped_now']} mapped anew; "
+        "index.gpkg shows them"
     ]
     if result["not_calibrated"]:
         lines.append(f"  {result['not_calibrated']} tiles are not calibrated: they fly with the shipped confidence")

@@ -70,9 +70,9 @@ class TileTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoneTile:
-    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: nothing of it can be
-    mapped). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used. `problem`: why
-    it could not be mapped (None: it could)."""
+    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: nothing of it
+    can be mapped). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used.
+    `problem`: why it could not be mapped (None: it could)."""
 
     key: str
     tile: Tile | None = None
