@@ -32,6 +32,10 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map repair": (("after `map check` has named damage", "valley.gpkg"),),
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
     "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
+    "map subset": (
+        ("of a fleet's maps what a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
+        ("in a file of 50 MB at most", "valley/ --mission plan.plan --margin-m 300 --mb 50 --out flight.gpkg"),
+    ),
     "fleet build": (
         ("the photographs of many flights", "valley/ --images monday/ tuesday/ --camera nadir"),
         (

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgevpr.cli import subset
 from edgevpr.cli.shared import (
     add_json,
     add_keys,
@@ -74,6 +75,7 @@ def add(commands: Any) -> None:
     smaller.add_argument("out", metavar="OUT", help="the map file to make")
     smaller.add_argument("--places", type=count, metavar="N", required=True, help="as many places")
     add_json(smaller)
+    subset.add(of_map)
     worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
     worth.add_argument("image", metavar="IMAGE")
     worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")

@@ -9,6 +9,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -145,8 +146,10 @@ def build(
         }
         try:
             for future in shown(as_completed(futures), len(futures), "tiles"):
-                error = future.exception()
-                done = DoneTile(key=futures[future], problem=_sentence(error)) if error else future.result()
+                try:
+                    done = future.result()
+                except Exception as error:  # a task returns what edgevpr can say: this is a worker's or Dask's
+                    done = DoneTile(key=futures[future], problem=_sentence(error))
                 if done.tile:
                     tiles[done.tile.key] = done.tile
                 yield done
@@ -176,12 +179,12 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator["Client"]:
     """Connect to a scheduler, or start workers here. Raises UsageError if there is none, or none that can be used."""
     from dask.distributed import Client, LocalCluster
 
-    for name in ("distributed", "pyogrio"):  # they tell of each connection
-        logging.getLogger(name).setLevel(logging.ERROR)
+    for name in ("distributed", "pyogrio"):  # they tell of each connection, and of lost ones with a traceback
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         if scheduler is None:
             cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, silence_logs=logging.ERROR, dashboard_address=":0"
+                n_workers=workers, threads_per_worker=1, silence_logs=logging.CRITICAL, dashboard_address=":0"
             )
             stack.enter_context(cluster)
         try:
@@ -221,6 +224,8 @@ def _require_alike(tiles: Iterable[Tile], order: FleetOrder) -> None:
 def _sentence(error: BaseException) -> str:
     """Return why a worker could not say what became of a tile."""
     kind = type(error).__name__
+    if isinstance(error, CancelledError):
+        return "the connection to the scheduler is lost: run this again, and it goes on"
     if kind == "KilledWorker":
         return "the workers that mapped it have died: see if their memory is enough"
     return f"{kind}: {error}"

@@ -1,13 +1,14 @@
-"""Reading of areas and paths to be flown over: waypoint files, plans of QGroundControl, and GeoJSON. They limit the
-part of an orthophoto from which a map is made."""
+"""Reading of areas and paths to be flown over: waypoint files, plans of QGroundControl, GeoJSON and KML. They limit the
+part of an orthophoto from which a map is made, and of a map the part that a flight takes."""
 
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
@@ -56,22 +57,34 @@ class Area:
 
 
 def read_area(path: str | Path) -> Area:
-    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or GeoJSON in degrees; or the circle that the text
-    LAT,LON,RADIUS_M tells. Raises UsageError for a file that is none of them, holds no position, or has one outside
+    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, GeoJSON in degrees, or KML; or the circle that the
+    text LAT,LON,RADIUS_M tells. Raises UsageError for a file that is none of them, holds no position, or has one beyond
     -90..90 or -180..180 degrees."""
     try:
         if _CIRCLE.fullmatch(str(path)):
             return _circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
-        area = _of_lines(text.splitlines()) if text.startswith("QGC WPL") else _of_json(json.loads(text))
+        if text.startswith("QGC WPL"):
+            area = _of_lines(text.splitlines())
+        else:
+            area = _of_kml(text) if text.lstrip().startswith("<") else _of_json(json.loads(text))
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read ({error.strerror}): give a mission file, GeoJSON, or LAT,LON,RADIUS_M."
         ) from error
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError):
+    except (
+        ElementTree.ParseError,
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ):
         raise UsageError(
-            f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl and no GeoJSON that can be "
-            "understood: save it again."
+            f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl, and no GeoJSON or KML that can "
+            "be understood: save it again."
         ) from None
     if not area.polygons and not area.paths:
         raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
@@ -111,6 +124,24 @@ def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: f
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
 
 
+def _of_kml(text: str) -> Area:
+    """Read the polygons, lines and points of KML (OGC 12-007r2), whatever they are wrapped in."""
+    polygons: list[tuple[Ring, ...]] = []
+    paths: list[tuple[Waypoint, ...]] = []
+    for element in ElementTree.fromstring(text).iter():
+        within = [[_lat_lon(point.split(",")) for point in (each.text or "").split()] for each in _coordinates(element)]
+        kind = element.tag.rpartition("}")[2]
+        if kind == "Polygon":
+            polygons.append(tuple(within))
+        elif kind in ("LineString", "Point"):
+            paths += [tuple(Waypoint(*point) for point in line) for line in within]
+    return Area(tuple(polygons), tuple(filter(None, paths)))
+
+
+def _coordinates(element: ElementTree.Element) -> list[ElementTree.Element]:
+    return [each for each in element.iter() if each.tag.rpartition("}")[2] == "coordinates"]
+
+
 def _of_json(content: Any) -> Area:
     if content.get("fileType") == "Plan":
         return _of_plan(content["mission"]["items"])
@@ -139,8 +170,8 @@ def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from _geometries(part)
 
 
-def _lat_lon(point: list[float]) -> LatLon:
-    """Return a point of GeoJSON, which has longitude first, as (lat, lon)."""
+def _lat_lon(point: Sequence[float | str]) -> LatLon:
+    """Return a point of GeoJSON or KML, which have longitude first, as (lat, lon)."""
     return _finite(point[1]), _finite(point[0])
 
 

@@ -71,9 +71,11 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
         yield Examined(place_id, problem, content)
 
 
-def merge(paths: Sequence[str], out: Path, watch: Watch = unwatched) -> tuple[list[tuple[int, int]], bool]:
-    """Make the new map `out` of the places of several maps; if that fails, leave no file. Returns for each map (places
-    copied, places that were there already) as numbers, and True if one of them was calibrated: `out` is not.
+def merge(
+    paths: Sequence[str], out: Path, watch: Watch = unwatched, wanted: Callable[[Place], bool] = lambda place: True
+) -> tuple[list[tuple[int, int]], bool]:
+    """Make the new map `out` of the `wanted` places of several maps; if that fails, leave no file. Returns for each map
+    (places copied, places that were there already) as numbers, and True if one was calibrated: `out` is not.
 
     A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). The
     mask hash is copied if all have the same, and so is the lens; attributions are all copied. Raises MapError if the
@@ -92,17 +94,21 @@ def merge(paths: Sequence[str], out: Path, watch: Watch = unwatched) -> tuple[li
                 merged.record_lens(*lenses)
             for each in maps:
                 merged.add_attribution(each.attribution)
-            return [_absorb(merged, each, watch) for each in maps], any(each.calibration is not None for each in maps)
+            return [_absorb(merged, each, watch, wanted) for each in maps], any(
+                each.calibration is not None for each in maps
+            )
 
 
-def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch) -> tuple[int, int]:
-    """Copy what is new of `other` into `place_map`; return (copied, already there) as numbers."""
+def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Callable[[Place], bool]) -> tuple[int, int]:
+    """Copy what is new and `wanted` of `other` into `place_map`; return (copied, already there) as numbers."""
     copied = already_here = 0
     with place_map.transaction():
         here = place_map.ids_by("source_image, time")
         for each in watch(examine(other), len(other), f"copying {other.path.name}"):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
+            if not wanted(rows.place_of(each.place_id, each.content)):
+                continue
             part = rows.part_of(each.content, "coarse", other.spec.coarse)
             alike = here.get((each.content["source_image"], each.content["time"]), ())
             if any(place_map.is_of(place_id, part) for place_id in alike):

@@ -39,6 +39,7 @@ class Cluster:
     """A scheduler, and workers that can be killed."""
 
     def __init__(self, folder):
+        folder.mkdir(exist_ok=True)
         self.file, self.workers = folder / "scheduler.json", []
         self.scheduler = self._start("dask_scheduler", "--port", "0", "--no-dashboard")
 
@@ -179,6 +180,31 @@ def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
     assert len(names) == len(set(names)) == sum(each.tile.places for each in done if each.tile)
     assert len(names) == cuttings(orthophoto).open().total
     assert not list(out.glob(".*.gpkg.*"))
+
+
+def test_a_run_whose_scheduler_dies_says_so_and_the_next_goes_on(orthophoto, tmp_path):
+    out, tasks = tmp_path / "maps", building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
+    cluster, second = Cluster(tmp_path), Cluster(tmp_path / "second")
+    try:
+        cluster.add_worker()
+        cluster.wait_for_workers(1)
+        done = []
+        for each in building.build(order(out), tasks, cluster.address, None, unshown):
+            done.append(each)
+            if each.tile and cluster.scheduler.poll() is None:
+                cluster.scheduler.kill()
+                cluster.scheduler.wait()
+        second.add_worker()
+        second.wait_for_workers(1)
+        again = mapped(second, out, tasks)
+    finally:
+        cluster.stop()
+        second.stop()
+    assert len(done) == len(tasks)
+    assert any("scheduler" in each.problem for each in done if each.problem)
+    assert not [each.problem for each in again if each.problem]
+    assert 0 < sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
+    assert sum(map(len, places_of(out).values())) == cuttings(orthophoto).open().total
 
 
 def photographs(folder, names, first):

@@ -1,0 +1,48 @@
+"""`edgevpr map subset`: the part of a map, or of a fleet's maps, that one flight needs."""
+
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edgevpr.cli.shared import add_json, positive, show
+from edgevpr.core.text import progress
+
+_MARGIN_M = 500.0
+
+
+def add(of_map: Callable[..., Any]) -> None:
+    """Add the command and its flags. `of_map` adds a command that begins with a map."""
+    parser = of_map("subset", map_subset, "take the part that a mission needs", "a map, or a folder of `fleet build`")
+    parser.add_argument(
+        "--mission",
+        metavar="FILE",
+        required=True,
+        help="waypoints of Mission Planner, a .plan of QGroundControl, GeoJSON, KML, or LAT,LON,RADIUS_M",
+    )
+    parser.add_argument("--out", metavar="MAP", required=True, help="the map file to make")
+    parser.add_argument(
+        "--margin-m", type=positive, metavar="M", default=_MARGIN_M, help="around the mission (default: %(default)g)"
+    )
+    parser.add_argument("--mb", type=positive, metavar="MB", help="the file is to be no larger (default: all places)")
+    add_json(parser)
+
+
+def map_subset(args: Namespace) -> int:
+    """Run `map subset`: make the map of a mission, and print what is left out."""
+    from edgevpr.mapmaking.missions import read_area
+    from edgevpr.mapmaking.subset import subset
+    from edgevpr.places.mapfiles import map_path
+
+    area, out = read_area(args.mission), map_path(args.out)
+    found = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
+    text = [f"{out}: {found.places} places of {found.maps} maps, {found.file_bytes / 1e6:.1f} MB"]
+    if left_out := found.near - found.places:
+        text.append(
+            f"  left out: {left_out} of {found.near} places within {args.margin_m:g} m, to keep to {args.mb:g} MB"
+        )
+    if not found.is_calibrated:
+        text.append("  not calibrated: it flies with the shipped confidence")
+    show({"map": str(out), **asdict(found)}, args.json, text)
+    return 0

@@ -1,0 +1,116 @@
+"""The part of a map, or of a folder of a fleet's maps, that one flight needs: what lies near its mission."""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Doubles, LatLon
+from edgevpr.core.errors import MapError, UsageError
+from edgevpr.core.geodesy import offset_m, shorter_deg
+from edgevpr.core.types import Place
+from edgevpr.mapmaking.missions import Area
+from edgevpr.mapmaking.quadkeys import extent_of_key
+from edgevpr.places import mapfiles
+from edgevpr.places.examine import Watch, merge, select, shrink
+from edgevpr.places.mapfile import PlaceMap
+
+_DEGREE_M = 111_000.0  # of latitude, and at most of longitude
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subset:
+    """A map that was made for one flight. `maps`: number of those that it was made of. `near`: places near the mission,
+    of which the best `places` are in it. `file_bytes`: its size. `is_calibrated`: it has the calibration of the one map
+    that it is of."""
+
+    maps: int
+    near: int
+    places: int
+    file_bytes: int
+    is_calibrated: bool
+
+
+def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: float | None, watch: Watch) -> Subset:
+    """Make the map `out` of the places of `source`, a map or a folder of tiles, that are within `margin_m` metres of an
+    area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
+    none or none fits, and MapError for a map that cannot be read."""
+    paths, is_near = _maps_near(source, area, margin_m), _near(area, margin_m)
+    with mapfiles.whole_or_none(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
+        whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
+        if len(paths) == 1:
+            near = select(paths[0], whole, is_near)
+        else:  # as numbers of places copied, and of those that were there already
+            near = sum(copied for copied, _ in merge(list(map(str, paths)), whole, watch, is_near)[0]) if paths else 0
+        if not near:
+            raise UsageError(
+                f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
+            )
+        count, file_bytes = near, whole.stat().st_size
+        if most_bytes is not None and file_bytes > most_bytes:
+            count = int(near * most_bytes / file_bytes)
+            if not count:
+                raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {most_bytes / 1e6:g} hold none.")
+            shrink(whole, made, count, watch)
+        shutil.move(made if count < near else whole, unfinished)
+        with PlaceMap.open(unfinished) as place_map:
+            is_calibrated = place_map.calibration is not None
+        size = unfinished.stat().st_size
+    return Subset(maps=len(paths), near=near, places=count, file_bytes=size, is_calibrated=is_calibrated)
+
+
+def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
+    """Return the maps to look into: one map, or of a folder the tiles that may have places near an area."""
+    if not source.is_dir():
+        return [mapfiles.existing(source)]
+    tiles = sorted(path for path in source.glob("[0-3]*.gpkg") if not path.stem.strip("0123"))
+    if not tiles:
+        raise MapError(f"{source} is no folder of maps: give one that `edgevpr fleet build` has made.")
+    south, west, north, east = area.extent_deg
+    north_deg = margin_m / _DEGREE_M
+    east_deg = north_deg / max(np.cos(np.radians(min(max(abs(south), abs(north)) + north_deg, 89.0))), 1e-3)
+    found = []
+    for path in tiles:
+        of_tile = extent_of_key(path.stem)
+        apart_deg = abs(shorter_deg((of_tile[1] + of_tile[3]) / 2 - (west + east) / 2))
+        is_beside = apart_deg > (of_tile[3] - of_tile[1] + east - west) / 2 + east_deg
+        if not is_beside and of_tile[0] - north_deg <= north and of_tile[2] + north_deg >= south:
+            found.append(path)
+    return found
+
+
+def _near(area: Area, margin_m: float) -> Callable[[Place], bool]:
+    """Return the function that says if a place lies in an area, or within `margin_m` of it."""
+    south, west, north, east = area.extent_deg
+    middle = (south + north) / 2, (west + east) / 2
+
+    def laid(points: list[LatLon]) -> Doubles:
+        lat_deg, lon_deg = np.array(points, float).T
+        return np.column_stack(offset_m(*middle, lat_deg, lon_deg))
+
+    polygons_m = [[laid(ring).astype(np.float32) for ring in rings] for rings in area.polygons]
+    paths_m = [laid([(way.lat_deg, way.lon_deg) for way in path]) for path in area.paths]
+
+    def is_near(place: Place) -> bool:
+        if place.position is None:
+            return False
+        at = laid([(place.position.lat_deg, place.position.lon_deg)])[0]
+        # How far the place is inside a ring, in metres; negative outside.
+        inside_m = [[cv2.pointPolygonTest(ring, at.tolist(), True) for ring in rings] for rings in polygons_m]
+        in_area = any(outline >= -margin_m and max(holes, default=-np.inf) <= margin_m for outline, *holes in inside_m)
+        return in_area or any(_to_path_m(at, path) <= margin_m for path in paths_m)
+
+    return is_near
+
+
+def _to_path_m(at: Doubles, path_m: Doubles) -> float:
+    """Return the distance from a point (2,) to a path (N, 2)."""
+    begin, way = path_m[:-1], np.diff(path_m, axis=0)
+    if not len(way):
+        return float(np.hypot(*(at - path_m[0])))
+    share = np.clip(((at - begin) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1e-9), 0, 1)
+    return float(np.hypot(*(at - begin - share[:, None] * way).T).min())

@@ -1,0 +1,131 @@
+"""The part of a map that a mission needs."""
+
+import numpy as np
+import pytest
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.core.config import load_config
+from edgevpr.core.errors import MapError, UsageError
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Frame, Position
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.mapmaking.missions import Area, Waypoint, read_area
+from edgevpr.mapmaking.quadkeys import keys_at
+from edgevpr.mapmaking.subset import subset
+from edgevpr.places.examine import unwatched
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.techniques import create
+
+HOME = 47.0, 8.0
+SIDE, STEP_M = 5, 100.0
+
+
+def at(east_m, north_m):
+    return moved(*HOME, east_m, north_m)
+
+
+def write_map(path, frames):
+    technique = create("hog")
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(frames, technique, place_map, meter_of(load_config(None), load_board("this")))
+
+
+def frame(column, row):
+    position = Position(*at(column * STEP_M, row * STEP_M))
+    return Frame(image=textured(10 * column + row, 96, 96), name=f"{column}{row}", t_mono_s=0.0, position=position)
+
+
+@pytest.fixture(scope="module")
+def tiles(tmp_path_factory):
+    """A folder of maps, of places 100 m apart, and one map of them all."""
+    folder = tmp_path_factory.mktemp("maps")
+    frames = [frame(column, row) for column in range(SIDE) for row in range(SIDE)]
+    points = np.array([(each.position.lat_deg, each.position.lon_deg) for each in frames])
+    keys = keys_at(*points.T, 17)
+    assert len(set(keys)) >= 4
+    for key in set(keys):
+        write_map(folder / f"{key}.gpkg", [each for each, own in zip(frames, keys, strict=True) if own == key])
+    write_map(folder / "whole.gpkg", frames)
+    return folder
+
+
+def names_in(path):
+    with PlaceMap.open(path) as place_map:
+        return sorted(place.source_image for place in place_map.places())
+
+
+def path_over(*points):
+    return Area((), (tuple(Waypoint(*at(*point)) for point in points),))
+
+
+@pytest.mark.parametrize("of_one", [True, False])
+def test_places_along_a_path_are_taken_from_the_tiles_that_they_are_in(tiles, tmp_path, of_one):
+    source = tiles / "whole.gpkg" if of_one else tiles
+    found = subset(source, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, unwatched)
+    assert names_in(tmp_path / "f.gpkg") == sorted(f"{column}{row}" for column in range(5) for row in (1, 2, 3))
+    assert (found.near, found.places, found.is_calibrated) == (15, 15, False)
+    assert found.file_bytes == (tmp_path / "f.gpkg").stat().st_size
+
+
+def test_places_in_a_polygon_are_taken_and_those_deep_in_its_hole_are_not(tiles, tmp_path):
+    square = [at(-50, -50), at(450, -50), at(450, 450), at(-50, 450), at(-50, -50)]
+    hole = [at(150, 150), at(250, 150), at(250, 250), at(150, 250), at(150, 150)]
+    subset(tiles, Area(((square, hole),), ()), 20.0, tmp_path / "f.gpkg", None, unwatched)
+    assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(5) for r in range(5)} - {"22"}
+    subset(tiles, Area(((square, hole),), ()), 60.0, tmp_path / "g.gpkg", None, unwatched)
+    assert "22" in names_in(tmp_path / "g.gpkg")
+
+
+def test_only_tiles_near_the_mission_are_read(tiles, tmp_path):
+    found = subset(tiles, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
+    assert found.maps < len(list(tiles.glob("[0-3]*.gpkg")))
+    assert names_in(tmp_path / "f.gpkg") == ["00"]
+
+
+def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path):
+    area = path_over((0, 0), (400, 400))
+    whole = subset(tiles, area, 1000.0, tmp_path / "whole.gpkg", None, unwatched)
+    found = subset(tiles, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, unwatched)
+    assert (found.near, found.places) == (25, 12)
+    assert found.file_bytes < whole.file_bytes
+    with pytest.raises(UsageError, match="hold none"):
+        subset(tiles, area, 1000.0, tmp_path / "g.gpkg", 100, unwatched)
+    assert not (tmp_path / "g.gpkg").exists()
+
+
+def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
+    with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
+        subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
+    with pytest.raises(MapError, match="no folder of maps"):
+        subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_says_what_is_left_out(tiles, tmp_path, capsys):
+    (tmp_path / "m.kml").write_text(
+        '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><LineString><coordinates>'
+        f"8.0,47.0,120 {at(0, 400)[1]},{at(0, 400)[0]},120</coordinates></LineString></Placemark></kml>"
+    )
+    words = ["map", "subset", str(tiles), "--mission", str(tmp_path / "m.kml"), "--out", str(tmp_path / "f.gpkg")]
+    assert main([*words, "--margin-m", "150"]) == 0
+    assert "10 places of" in capsys.readouterr().out
+    assert main(words) == 1
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_polygons_and_points_of_kml_are_read(tmp_path):
+    ring = "8,47 8.1,47 8.1,47.1 8,47.1 8,47"
+    (tmp_path / "a.kml").write_text(
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><MultiGeometry><Polygon><outerBoundaryIs>'
+        f"<LinearRing><coordinates>\n{ring}\n</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+        "<Point><coordinates>8.05,47.05,3</coordinates></Point></MultiGeometry></Placemark></Document></kml>"
+    )
+    area = read_area(tmp_path / "a.kml")
+    assert area.polygons == (([(47.0, 8.0), (47.0, 8.1), (47.1, 8.1), (47.1, 8.0), (47.0, 8.0)],),)
+    assert area.paths == ((Waypoint(47.05, 8.05),),)
+    (tmp_path / "b.kml").write_text("<kml><Polygon>")
+    with pytest.raises(UsageError, match="no GeoJSON or KML that can be understood"):
+        read_area(tmp_path / "b.kml")
