@@ -26,7 +26,6 @@ from edgevpr.fleet.index import Tile, path_of, tile_of
 from edgevpr.fleet.photos import Photo, gathered
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
-from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.quadkeys import extent_of_key, keys_at, keys_over, zoom_of_places, zoom_of_spacing
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import select
@@ -109,18 +108,13 @@ def _around(key: str) -> tuple[tuple[float, float], tuple[float, float]]:
 
 def tasks_of_orthophoto(cuttings: Cuttings, places_per_tile: int, zoom: int | None) -> list[TileTask]:
     """Divide the ground of an orthophoto into tiles, of `zoom` (None: so that none has more than `places_per_tile`)."""
-    from edgevpr.mapmaking.missions import read_area
-    from edgevpr.mapmaking.tiles import ground_of
-
-    widest_m = np.max(cuttings.footprint_m)
-    area = read_area(cuttings.area) if cuttings.area else None
-    orthophoto = Orthophoto(cuttings.orthophoto, ground_of(area.points, widest_m) if area else None)
-    extent_deg, lat_deg = orthophoto.extent_deg, orthophoto.middle.lat_deg
-    orthophoto.close()
+    extent_deg = cuttings.extent_deg()
     if zoom is None:
         if not cuttings.spacing_m > 0:  # false for NaN
             raise UsageError(f"--spacing-m is {cuttings.spacing_m:g}: give more than 0.")
-        zoom = zoom_of_spacing(lat_deg, cuttings.spacing_m, places_per_tile / np.size(cuttings.footprint_m))
+        zoom = zoom_of_spacing(
+            (extent_deg[0] + extent_deg[2]) / 2, cuttings.spacing_m, places_per_tile / np.size(cuttings.footprint_m)
+        )
     return [TileTask(key=key, cuttings=replace(cuttings, tile=key)) for key in keys_over(extent_deg, zoom)]
 
 

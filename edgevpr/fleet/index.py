@@ -14,7 +14,7 @@ import shapely
 
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
-from edgevpr.mapmaking.quadkeys import extent_of_key
+from edgevpr.mapmaking.quadkeys import extent_of_key, maps_in
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.runtime.recognise.evidence import calibration_of
@@ -72,8 +72,7 @@ def tiles_in(folder: Path) -> dict[str, Tile]:
     """Return the tiles of a folder by their keys: those of the index, and those whose maps are there and that it lacks.
     Raises MapError."""
     found = _read(folder / NAME)
-    paths = {path.stem: path for path in folder.glob("[0-3]*.gpkg") if not path.stem.strip("0123")}
-    return {key: found[key] if key in found else tile_of(path) for key, path in sorted(paths.items())}
+    return {key: found[key] if key in found else tile_of(path) for key, path in maps_in(folder).items()}
 
 
 def write(folder: Path, tiles: Iterable[Tile]) -> None:

@@ -30,6 +30,8 @@ from edgevpr.runtime.recognise.recogniser import Preparation
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
+    from edgevpr.mapmaking.missions import Area
+    from edgevpr.mapmaking.orthophoto import Orthophoto
     from edgevpr.mapmaking.refine import Refined
 
 _log = logging.getLogger(__name__)
@@ -75,20 +77,37 @@ class Cuttings:
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
         from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp, within
         from edgevpr.mapmaking.missions import Area, read_area
-        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
         from edgevpr.mapmaking.quadkeys import ring_around
-        from edgevpr.mapmaking.tiles import ground_of
 
         area = Area(((ring_around(self.tile),),), ()) if self.tile else None
         area = read_area(self.area) if self.area else area
-        given = self.footprint_m
-        footprints_m = sorted(set(given)) if isinstance(given, Sequence) else [given]
-        orthophoto = Orthophoto(self.orthophoto, ground_of(area.points, footprints_m[-1]) if area else None)
-        lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in footprints_m]
-        require_sharp(orthophoto, footprints_m[0])
+        orthophoto = self._photo(area)
+        lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in self._footprints_m]
+        require_sharp(orthophoto, self._footprints_m[0])
         if self.tile:
             lattices = [within(lattice, self.tile) for lattice in lattices]
         return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only)
+
+    @property
+    def _footprints_m(self) -> list[float]:
+        return sorted(set(self.footprint_m) if isinstance(self.footprint_m, Sequence) else {self.footprint_m})
+
+    def _photo(self, area: "Area | None") -> "Orthophoto":
+        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
+        from edgevpr.mapmaking.tiles import ground_of
+
+        return Orthophoto(self.orthophoto, ground_of(area.points, self._footprints_m[-1]) if area else None)
+
+    def extent_deg(self) -> tuple[float, float, float, float]:
+        """Return the bounding box of the ground that is cut: (south, west, north, east) in degrees, longitudes perhaps
+        beyond the date line. Raises as `open` does."""
+        from edgevpr.mapmaking.missions import read_area
+        from edgevpr.mapmaking.tiles import ground_of
+
+        area = read_area(self.area) if self.area else None
+        orthophoto = self._photo(area)
+        orthophoto.close()
+        return ground_of(area.points, self._footprints_m[-1]).extent_deg if area else orthophoto.extent_deg
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

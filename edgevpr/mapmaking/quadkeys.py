@@ -3,6 +3,7 @@ A key has a digit for each zoom, which says in which quarter of the tile before 
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,12 @@ def keys_over(extent_deg: Extent, zoom: int) -> Iterator[str]:
         for column in range(left, right + 1):
             middle = np.array([np.mean(_lats(row, zoom))]), np.array([360 * (column + 0.5) / 2**zoom - 180])
             yield str(keys_at(*middle, zoom)[0])
+
+
+def maps_in(folder: Path) -> dict[str, Path]:
+    """Return the maps of tiles in a folder, KEY.gpkg, by their keys."""
+    paths = sorted(folder.glob("[0-3]*.gpkg"))
+    return {path.stem: path for path in paths if not path.stem.strip("0123")}
 
 
 def zoom_of_spacing(lat_deg: float, spacing_m: float, most_places: float) -> int:

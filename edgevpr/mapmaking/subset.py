@@ -14,7 +14,7 @@ from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m, shorter_deg
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.missions import Area
-from edgevpr.mapmaking.quadkeys import extent_of_key
+from edgevpr.mapmaking.quadkeys import extent_of_key, maps_in
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, select, shrink
 from edgevpr.places.mapfile import PlaceMap
@@ -67,15 +67,15 @@ def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
     """Return the maps to look into: one map, or of a folder the tiles that may have places near an area."""
     if not source.is_dir():
         return [mapfiles.existing(source)]
-    tiles = sorted(path for path in source.glob("[0-3]*.gpkg") if not path.stem.strip("0123"))
+    tiles = maps_in(source)
     if not tiles:
         raise MapError(f"{source} is no folder of maps: give one that `edgevpr fleet build` has made.")
     south, west, north, east = area.extent_deg
     north_deg = margin_m / _DEGREE_M
     east_deg = north_deg / max(np.cos(np.radians(min(max(abs(south), abs(north)) + north_deg, 89.0))), 1e-3)
     found = []
-    for path in tiles:
-        of_tile = extent_of_key(path.stem)
+    for key, path in tiles.items():
+        of_tile = extent_of_key(key)
         apart_deg = abs(shorter_deg((of_tile[1] + of_tile[3]) / 2 - (west + east) / 2))
         is_beside = apart_deg > (of_tile[3] - of_tile[1] + east - west) / 2 + east_deg
         if not is_beside and of_tile[0] - north_deg <= north and of_tile[2] + north_deg >= south:
