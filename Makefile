@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig from-space service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig from-space bench-fleet service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -114,6 +114,11 @@ from-space: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/from_space.py
 	$(BIN)/python benchmarks/seams.py
+
+# Map making by one worker and by two, into benchmarks/results/: twenty minutes.
+bench-fleet: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fleet]'
+	$(BIN)/python benchmarks/bench_fleet.py
 
 # The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
 # qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
 from edgevpr import __version__
@@ -231,6 +232,7 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
         problem = f"a worker has edgevpr {__version__}, and {order.version} asks: install the same on all machines"
         return DoneTile(key=task.key, problem=problem)
     logging.getLogger("edgevpr").setLevel(logging.ERROR)  # the index says what a tile lacks
+    cv2.setNumThreads(1)  # there is a worker for every core
     try:
         with tempfile.TemporaryDirectory(prefix="edgevpr-tile-") as scratch:
             return _built(task, order, Path(scratch))
