@@ -257,6 +257,8 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     target = path_of(order.out, task.key)
     if sha256 == task.known_sha256:
         return DoneTile(key=task.key, tile=tile_of(target), unusable=tuple(unusable))
+    if lost := _lost(target, task):
+        return DoneTile(key=task.key, problem=lost)
     path = scratch / "map.gpkg"
     ordered = MapOrder(
         path=str(path),
@@ -283,6 +285,25 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     finally:
         unfinished.unlink(missing_ok=True)
     return DoneTile(key=task.key, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
+
+
+def _lost(target: Path, task: TileTask) -> str | None:
+    """Return why a tile's map is not to be replaced: it has pictures that the task does not name (None: none)."""
+    if not target.exists():
+        return None
+    with PlaceMap.open(target) as place_map:
+        there = {place.source_image for place in place_map.places()}
+    if task.cuttings:
+        of_this = f"{task.cuttings.short_name()}_"
+        lost = sorted(name for name in there if not name.startswith(of_this))
+    else:
+        lost = sorted(there.difference(photo.name for photo in task.photos))
+    if not lost:
+        return None
+    return (
+        f"its map has {len(lost)} pictures that this run does not name, such as {lost[0]}: name their folders and "
+        "tables too, or map into another folder"
+    )
 
 
 def _hash_of_ground(cuttings: Cuttings, order: FleetOrder) -> str:

@@ -5,7 +5,6 @@ s3://bucket/0001.jpg."""
 
 import hashlib
 import os
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,9 +34,7 @@ def photos_of(sources: Sequence[str]) -> list[Photo]:
     for source in sources:
         for uri, tag in _of_source(source):
             found.setdefault(uri, tag)  # a folder that is named twice counts once
-    named = Counter(_short(uri) for uri in found)
-    names = ((uri, _short(uri) if named[_short(uri)] == 1 else _long(uri)) for uri in found)
-    return [Photo(uri, name, found[uri]) for uri, name in names]
+    return [Photo(uri, _name(uri), tag) for uri, tag in found.items()]
 
 
 def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
@@ -51,13 +48,11 @@ def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
         raise UsageError(f"--images {source} is no folder and no table of positions (.csv): give one of them.")
 
 
-def _short(uri: str) -> str:
-    """Return the names of a photograph and of its folder: those of cameras begin anew on every card."""
-    return "_".join(uri.rsplit("/", 2)[-2:])
-
-
-def _long(uri: str) -> str:
-    return f"{hashlib.sha256(uri.encode()).hexdigest()[:8]}_{_short(uri)}"
+def _name(uri: str) -> str:
+    """Return a name for a photograph: cameras begin theirs anew on every card, so it has that of its folder, too, and a
+    hash of where both are. What else is mapped must not change it."""
+    *folder, file = uri.rsplit("/", 2)[-2:]
+    return "_".join([*folder, hashlib.sha256(uri.encode()).hexdigest()[:8], file])
 
 
 def gathered(photos: Iterable[Photo], folder: Path) -> Iterator[tuple[Photo, str | None]]:

@@ -80,6 +80,7 @@ class OrthophotoSource(RecordingSource):
         super().__init__(only)
         self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
         self.total = sum(map(len, lattices))
+        self.short_name = decoded_name(orthophoto.short_name)
         self.without_data = self.white = self.seams = self.tried_for_seams = 0
         self._read = 0
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
@@ -99,7 +100,7 @@ class OrthophotoSource(RecordingSource):
         # With leading zeros, so that names sort in the order of the numbers.
         row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
         of_several = f"_{lattice.footprint_m:g}m" if len(self._lattices) > 1 else ""
-        name = f"{decoded_name(self._orthophoto.short_name)}{of_several}_r{row}_c{column}"
+        name = f"{self.short_name}{of_several}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
         position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))

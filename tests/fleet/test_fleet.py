@@ -235,10 +235,24 @@ def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_wher
     unusable = " ".join(text for each in done for text in each.unusable)
     assert "DJI_0099.png cannot be read" in unusable
     assert "DJI_0003.png" in unusable
-    found = [name for each in places_of(tmp_path / "maps").values() for name in each]
-    there = [f"{folder}_{name}" for folder in ("monday", "tuesday", "wednesday") for name in names]
-    assert sorted(found) == sorted(set(there) - {"monday_DJI_0003.png"})
+    found = [name.split("_", 2) for each in places_of(tmp_path / "maps").values() for name in each]
+    there = {(folder, name) for folder in ("monday", "tuesday", "wednesday") for name in names}
+    assert sorted((folder, name) for folder, _, name in found) == sorted(there - {("monday", "DJI_0003.png")})
     assert not any(each.is_new for each in mapped(cluster, tmp_path / "maps", tasks))
+
+
+def test_a_run_that_does_not_name_what_was_mapped_before_replaces_nothing(cluster, tmp_path):
+    photos, out = pytest.importorskip("edgevpr.fleet.photos").photos_of, tmp_path / "maps"
+    folders = [str(tmp_path / name) for name in ("monday", "tuesday")]
+    for number, folder in enumerate(folders):
+        photographs(Path(folder), ["1.png", "2.png"], 2 * number)
+    mapped(cluster, out, building.tasks_of_photos(photos(folders[:1]), 10, None)[0])
+    before = places_of(out)
+    (done,) = mapped(cluster, out, building.tasks_of_photos(photos(folders[1:]), 10, None)[0])
+    assert "has 2 pictures that this run does not name, such as monday_" in done.problem
+    assert places_of(out) == before
+    mapped(cluster, out, building.tasks_of_photos(photos(folders), 10, None)[0])
+    assert sum(map(len, places_of(out).values())) == 4
 
 
 def test_photographs_of_one_name_in_folders_of_one_name_are_told_apart(tmp_path):
