@@ -42,15 +42,16 @@ def add(commands: Any) -> None:
 def fleet_build(args: Namespace) -> int:
     """Run `fleet build`: make or continue a folder of maps, and print what was done."""
     try:
-        from edgevpr.fleet import building, index
+        from edgevpr.fleet import building
         from edgevpr.fleet.photos import photos_of
+        from edgevpr.mapmaking.quadkeys import maps_in
     except ModuleNotFoundError as error:
         raise UsageError(f"A fleet's maps need more packages ({error}): `pip install 'edgevpr[fleet]'`.") from error
 
     config, out = config_of(args, args.config), Path(args.out)
     if (args.images is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (photographs of flights) or --orthophoto: maps are made of one of them.")
-    zoom, camera = next((len(key) for key in index.tiles_in(out)), None), config.source.camera
+    zoom, camera = next(map(len, maps_in(out)), None), config.source.camera
     without_position = 0
     if args.orthophoto:
         tasks, camera = building.tasks_of_orthophoto(cuttings_of(args), args.places_per_tile, zoom), "nadir"

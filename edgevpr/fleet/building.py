@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -242,27 +242,45 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
         return DoneTile(key=task.key, problem=str(error))
 
 
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    """All that a tile is mapped from: the `pictures`, the hash of their content and of the settings, the function that
+    says if a picture's name is one of theirs, and sentences about those that cannot be used."""
+
+    pictures: Cuttings | FlownPictures
+    sha256: str
+    is_named: Callable[[str], bool]
+    unusable: list[str]
+
+
+def _inputs(task: TileTask, order: FleetOrder, scratch: Path) -> _Inputs:
+    """Open the ground of a task, or bring its photographs here. Raises NoPlaceError if it has no ground."""
+    if cuttings := task.cuttings:
+        said = repr(replace(cuttings, orthophoto="", area=None))
+        with closing(cuttings.open()) as source:
+            ground = [hashlib.sha256(each.tobytes()).hexdigest() for each in source.ground(cuttings.spacing_m)]
+        of_this = f"{source.short_name}_"
+        return _Inputs(cuttings, _hash_of(order, [said, *ground]), lambda name: name.startswith(of_this), [])
+    folder = scratch / "pictures"
+    folder.mkdir()
+    hashes = list(gathered(task.photos, folder))
+    unusable = [f"{photo.uri} cannot be read" for photo, found in hashes if found is None]
+    sha256 = _hash_of(order, sorted(f"{photo.name} {found}" for photo, found in hashes if found))
+    names = {photo.name for photo in task.photos}
+    return _Inputs(FlownPictures(source=str(folder)), sha256, lambda name: name in names, unusable)
+
+
 def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
-    unusable: list[str] = []
-    if task.cuttings:
-        pictures: Cuttings | FlownPictures = task.cuttings
-        sha256 = _hash_of_ground(task.cuttings, order)
-    else:
-        folder = scratch / "pictures"
-        folder.mkdir()
-        hashes = list(gathered(task.photos, folder))
-        unusable += [f"{photo.uri} cannot be read" for photo, found in hashes if found is None]
-        sha256 = _hash_of(order, sorted(f"{photo.name} {found}" for photo, found in hashes if found))
-        pictures = FlownPictures(source=str(folder))
-    target = path_of(order.out, task.key)
-    if sha256 == task.known_sha256:
+    inputs, target = _inputs(task, order, scratch), path_of(order.out, task.key)
+    unusable = inputs.unusable
+    if inputs.sha256 == task.known_sha256:
         return DoneTile(key=task.key, tile=tile_of(target), unusable=tuple(unusable))
-    if lost := _lost(target, task):
+    if lost := _lost(target, inputs.is_named):
         return DoneTile(key=task.key, problem=lost)
     path = scratch / "map.gpkg"
     ordered = MapOrder(
         path=str(path),
-        pictures=pictures,
+        pictures=inputs.pictures,
         technique=TECHNIQUE,
         parameters={name: str(value) for name, value in camera_setting(TECHNIQUE, order.camera).items()},
         refine=order.refine,
@@ -277,7 +295,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     if not made_here:
         return DoneTile(key=task.key, unusable=tuple(unusable))
     with PlaceMap.open_for_adding(path) as place_map:
-        place_map.record_inputs(sha256)
+        place_map.record_inputs(inputs.sha256)
     unfinished = target.with_name(f".{target.name}.{scratch.name}")
     try:
         shutil.copyfile(path, unfinished)
@@ -287,36 +305,18 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     return DoneTile(key=task.key, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
 
 
-def _lost(target: Path, task: TileTask) -> str | None:
+def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
     """Return why a tile's map is not to be replaced: it has pictures that the task does not name (None: none)."""
     if not target.exists():
         return None
     with PlaceMap.open(target) as place_map:
-        there = {place.source_image for place in place_map.places()}
-    if task.cuttings:
-        of_this = f"{task.cuttings.short_name()}_"
-        lost = sorted(name for name in there if not name.startswith(of_this))
-    else:
-        lost = sorted(there.difference(photo.name for photo in task.photos))
+        lost = sorted(place.source_image for place in place_map.places() if not is_named(place.source_image))
     if not lost:
         return None
     return (
         f"its map has {len(lost)} pictures that this run does not name, such as {lost[0]}: name their folders and "
         "tables too, or map into another folder"
     )
-
-
-def _hash_of_ground(cuttings: Cuttings, order: FleetOrder) -> str:
-    """Return the hash of what a tile is cut from. Raises NoPlaceError if there is nothing."""
-    source = cuttings.open()
-    try:
-        said = replace(cuttings, orthophoto="", area=None)
-        return _hash_of(
-            order,
-            [repr(said), *(hashlib.sha256(each.tobytes()).hexdigest() for each in source.ground(cuttings.spacing_m))],
-        )
-    finally:
-        source.close()
 
 
 def _hash_of(order: FleetOrder, texts: Iterable[str]) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from edgevpr.core.arrays import Bools, Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.geodesy import to_lines_m
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.images import resized
@@ -310,7 +311,4 @@ def _add_near(inside: Bools, x_m: Doubles, y_m: Doubles, begin: Doubles, end: Do
     low, high = np.minimum(begin, end) - away_m, np.maximum(begin, end) + away_m
     columns = slice(*np.searchsorted(x_m, (low[0], high[0])))
     rows = slice(*np.searchsorted(-y_m, (-high[1], -low[1])))
-    east_m, north_m = x_m[columns][None] - begin[0], y_m[rows][:, None] - begin[1]
-    way = end - begin
-    share = np.clip((east_m * way[0] + north_m * way[1]) / max(way @ way, 1e-9), 0, 1)
-    inside[rows, columns] |= np.hypot(east_m - share * way[0], north_m - share * way[1]) <= away_m
+    inside[rows, columns] |= to_lines_m(x_m[columns][None], y_m[rows][:, None], begin, end - begin) <= away_m

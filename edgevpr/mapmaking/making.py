@@ -98,12 +98,6 @@ class Cuttings:
 
         return Orthophoto(self.orthophoto, ground_of(area.points, self._footprints_m[-1]) if area else None)
 
-    def short_name(self) -> str:
-        """Return what the names of the pictures begin with. Raises as `open` does."""
-        source = self.open()
-        source.close()
-        return source.short_name
-
     def extent_deg(self) -> tuple[float, float, float, float]:
         """Return the bounding box of the ground that is cut: (south, west, north, east) in degrees, longitudes perhaps
         beyond the date line. Raises as `open` does."""

@@ -31,7 +31,12 @@ def keys_at(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> NDArray[np.str_]:
             "degrees north and south: make a single map with `edgevpr map build`."
         )
     column, row = _numbers(lat_deg, lon_deg, zoom)
-    keys = np.full(len(lat_deg), "", f"<U{zoom}")
+    return _spelt(column % 2**zoom, row, zoom)
+
+
+def _spelt(column: Ints, row: Ints, zoom: int) -> NDArray[np.str_]:
+    """Return the keys of tiles by their columns and rows, int (N,) each."""
+    keys = np.full(len(column), "", f"<U{zoom}")
     for level in reversed(range(zoom)):
         keys = np.char.add(keys, ((column >> level & 1) + 2 * (row >> level & 1)).astype(str))
     return keys
@@ -59,11 +64,9 @@ def ring_around(key: str) -> Ring:
 def keys_over(extent_deg: Extent, zoom: int) -> Iterator[str]:
     """Yield the keys of all tiles that a bounding box touches; its longitudes may go beyond the date line."""
     south, west, north, east = extent_deg
-    (left, right), (bottom, top) = _numbers(np.array([south, north]), np.array([west, east]), zoom, wraps=False)
-    for row in range(top, bottom + 1):
-        for column in range(left, right + 1):
-            middle = np.array([np.mean(_lats(row, zoom))]), np.array([360 * (column + 0.5) / 2**zoom - 180])
-            yield str(keys_at(*middle, zoom)[0])
+    (left, right), (bottom, top) = _numbers(np.array([south, north]), np.array([west, east]), zoom)
+    row, column = np.mgrid[top : bottom + 1, left : right + 1].reshape(2, -1)
+    yield from _spelt(column % 2**zoom, row, zoom).tolist()
 
 
 def maps_in(folder: Path) -> dict[str, Path]:
@@ -89,13 +92,14 @@ def zoom_of_places(lat_deg: Doubles, lon_deg: Doubles, most_places: int) -> int:
     return MOST_ZOOM
 
 
-def _numbers(lat_deg: Doubles, lon_deg: Doubles, zoom: int, wraps: bool = True) -> tuple[Ints, Ints]:
-    """Return the columns and rows, int (N,), of the tiles in which positions (N,) lie."""
+def _numbers(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> tuple[Ints, Ints]:
+    """Return the columns and rows, int (N,), of the tiles in which positions (N,) lie. Beyond the date line columns go
+    on counting."""
     across = 2**zoom
     column = np.floor((np.asarray(lon_deg) / 360 + 0.5) * across).astype(int)
     down = 0.5 - np.arcsinh(np.tan(np.radians(lat_deg))) / (2 * np.pi)
     row = np.clip(np.floor(down * across).astype(int), 0, across - 1)
-    return column % across if wraps else column, row
+    return column, row
 
 
 def _lats(row: int, zoom: int) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, LatLon
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.geodesy import offset_m, shorter_deg
+from edgevpr.core.geodesy import offset_m, shorter_deg, to_lines_m
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.quadkeys import extent_of_key, maps_in
@@ -93,7 +93,10 @@ def _near(area: Area, margin_m: float) -> Callable[[Place], bool]:
         return np.column_stack(offset_m(*middle, lat_deg, lon_deg))
 
     polygons_m = [[laid(ring).astype(np.float32) for ring in rings] for rings in area.polygons]
-    paths_m = [laid([(way.lat_deg, way.lon_deg) for way in path]) for path in area.paths]
+    lines_m = []  # where each part of a path begins, and how it goes on; a point is a part without length
+    for path in area.paths:
+        corners_m = laid([(way.lat_deg, way.lon_deg) for way in (path if len(path) > 1 else 2 * path)])
+        lines_m.append((corners_m[:-1].T, np.diff(corners_m, axis=0).T))
 
     def is_near(place: Place) -> bool:
         if place.position is None:
@@ -102,15 +105,6 @@ def _near(area: Area, margin_m: float) -> Callable[[Place], bool]:
         # How far the place is inside a ring, in metres; negative outside.
         inside_m = [[cv2.pointPolygonTest(ring, at.tolist(), True) for ring in rings] for rings in polygons_m]
         in_area = any(outline >= -margin_m and max(holes, default=-np.inf) <= margin_m for outline, *holes in inside_m)
-        return in_area or any(_to_path_m(at, path) <= margin_m for path in paths_m)
+        return in_area or any(to_lines_m(at[0], at[1], *line).min() <= margin_m for line in lines_m)
 
     return is_near
-
-
-def _to_path_m(at: Doubles, path_m: Doubles) -> float:
-    """Return the distance from a point (2,) to a path (N, 2)."""
-    begin, way = path_m[:-1], np.diff(path_m, axis=0)
-    if not len(way):
-        return float(np.hypot(*(at - path_m[0])))
-    share = np.clip(((at - begin) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1e-9), 0, 1)
-    return float(np.hypot(*(at - begin - share[:, None] * way).T).min())

@@ -200,15 +200,7 @@ class Told:
         """Return 1: pictures are taken as they are."""
         return 1.0
 
-    def learn(
-        self,
-        found: Candidate,
-        accepted: bool,
-        t_mono_s: float,
-        scale: float = 1.0,
-        footprint_m: float | None = None,
-        layers: Layers | None = None,
-    ) -> None:
+    def learn(self, *learnt: object) -> None:
         """Learn nothing: the next query is another flight's."""
 
 
