@@ -258,7 +258,7 @@ def _inputs(task: TileTask, order: FleetOrder, scratch: Path) -> _Inputs:
     if cuttings := task.cuttings:
         said = repr(replace(cuttings, orthophoto="", area=None))
         with closing(cuttings.open()) as source:
-            ground = [hashlib.sha256(each.tobytes()).hexdigest() for each in source.ground(cuttings.spacing_m)]
+            ground = [hashlib.sha256(each).hexdigest() for each in source.ground(cuttings.spacing_m)]
         of_this = f"{source.short_name}_"
         return _Inputs(cuttings, _hash_of(order, [said, *ground]), lambda name: name.startswith(of_this), [])
     folder = scratch / "pictures"

@@ -155,15 +155,18 @@ class OrthophotoSource(RecordingSource):
             images, halvings = [resized(each, (side_px >> (halvings + 1),) * 2) for each in images], halvings + 1
         return across_px / side_px * 2**halvings if halvings else 1.0
 
-    def ground(self, spacing_m: float) -> Iterator[Image]:
-        """Yield all that the file shows around the places, as it is, in windows that overlap: uint8 (H, W, 3) BGR."""
+    def ground(self, spacing_m: float) -> Iterator[bytes]:
+        """Yield what the pictures are cut from: the numbers of the places, and all that the file shows around them, in
+        windows that overlap."""
         photo = self._orthophoto
         together = max(1, int(SIDE_PX * photo.resolution_m / spacing_m))  # places a window, along each side
         for lattice in self._lattices:
             side_px = math.ceil((2 * together * spacing_m + lattice.footprint_m) / photo.resolution_m)
-            windows = np.column_stack((lattice.rows, lattice.columns)) // together
-            for at in np.unique(windows, axis=0, return_index=True)[1].tolist():
-                yield photo.as_it_is(Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at])), side_px)[0]
+            numbers = np.column_stack((lattice.rows, lattice.columns))
+            yield numbers.tobytes()
+            for at in np.unique(numbers // together, axis=0, return_index=True)[1].tolist():
+                at_deg = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
+                yield photo.as_it_is(at_deg, side_px)[0].tobytes()
 
     def to_fetch(self) -> tuple[int, Iterator[None]] | None:
         """See `Orthophoto.to_fetch`."""

@@ -22,6 +22,7 @@ from edgevpr.core.errors import MapBusyError, MapError, UsageError
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.mapmaking.making import Cuttings
+from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.mapfile import PlaceMap
 
 building = pytest.importorskip("edgevpr.fleet.building", reason="needs the extra `fleet`")
@@ -159,6 +160,15 @@ def test_a_second_run_maps_nothing_and_one_over_changed_ground_what_has_changed(
         raster.write(np.full((1, 20, 20), 255, np.uint8), window=rasterio.windows.Window(30, 30, 20, 20))
     again = mapped(cluster, out, tasks)
     assert 1 <= sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
+
+
+def test_a_larger_area_maps_the_tiles_again_that_get_more_places(cluster, orthophoto, tmp_path):
+    middle = Orthophoto(orthophoto).middle
+    for radius_m, places in ((60, 9), (100, 21)):
+        area = f"{middle.lat_deg},{middle.lon_deg},{radius_m}"
+        tasks = building.tasks_of_orthophoto(replace(cuttings(orthophoto), area=area), PER_TILE, None)
+        mapped(cluster, tmp_path / "maps", tasks)
+        assert sum(map(len, places_of(tmp_path / "maps").values())) == places
 
 
 def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
