@@ -42,9 +42,9 @@ def add(commands: Any) -> None:
 def fleet_build(args: Namespace) -> int:
     """Run `fleet build`: make or continue a folder of maps, and print what was done."""
     try:
+        from edgevpr.core.quadkeys import maps_in
         from edgevpr.fleet import building
         from edgevpr.fleet.photos import photos_of
-        from edgevpr.mapmaking.quadkeys import maps_in
     except ModuleNotFoundError as error:
         raise UsageError(f"A fleet's maps need more packages ({error}): `pip install 'edgevpr[fleet]'`.") from error
 

@@ -22,12 +22,12 @@ from edgevpr import __version__
 from edgevpr.core.config import Config
 from edgevpr.core.errors import EdgevprError, MapBusyError, MapError, UsageError
 from edgevpr.core.geodesy import moved
+from edgevpr.core.quadkeys import extent_of_key, keys_at, keys_over, zoom_of_places, zoom_of_spacing
 from edgevpr.fleet import index
 from edgevpr.fleet.index import Tile, path_of, tile_of
 from edgevpr.fleet.photos import Photo, gathered
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
-from edgevpr.mapmaking.quadkeys import extent_of_key, keys_at, keys_over, zoom_of_places, zoom_of_spacing
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import select
 from edgevpr.places.mapfile import PlaceMap

@@ -14,7 +14,7 @@ import shapely
 
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
-from edgevpr.mapmaking.quadkeys import extent_of_key, maps_in
+from edgevpr.core.quadkeys import extent_of_key, maps_in
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.runtime.recognise.evidence import calibration_of

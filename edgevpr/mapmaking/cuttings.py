@@ -14,6 +14,7 @@ from edgevpr.core.arrays import Bools, Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import to_lines_m
+from edgevpr.core.quadkeys import keys_at
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.images import resized
@@ -22,7 +23,6 @@ from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
 from edgevpr.mapmaking.missions import Area
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.quadkeys import keys_at
 from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
 from edgevpr.runtime.recognise.landmarks import describe
 

@@ -75,9 +75,9 @@ class Cuttings:
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
+        from edgevpr.core.quadkeys import ring_around
         from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp, within
         from edgevpr.mapmaking.missions import Area, read_area
-        from edgevpr.mapmaking.quadkeys import ring_around
 
         area = Area(((ring_around(self.tile),),), ()) if self.tile else None
         area = read_area(self.area) if self.area else area

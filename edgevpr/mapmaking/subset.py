@@ -12,9 +12,9 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, LatLon
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m, shorter_deg, to_lines_m
+from edgevpr.core.quadkeys import extent_of_key, maps_in
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.missions import Area
-from edgevpr.mapmaking.quadkeys import extent_of_key, maps_in
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, select, shrink
 from edgevpr.places.mapfile import PlaceMap

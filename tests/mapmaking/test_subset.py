@@ -8,10 +8,10 @@ from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
+from edgevpr.core.quadkeys import keys_at
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.missions import Area, Waypoint, read_area
-from edgevpr.mapmaking.quadkeys import keys_at
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import unwatched
 from edgevpr.places.mapfile import PlaceMap

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgevpr.core.errors import UsageError
-from edgevpr.mapmaking.quadkeys import (
+from edgevpr.core.quadkeys import (
     MOST_LAT_DEG,
     extent_of_key,
     keys_at,

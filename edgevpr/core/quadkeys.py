@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.core.arrays import Doubles, Ints, LatLon
 from edgevpr.core.errors import UsageError
-from edgevpr.mapmaking.missions import Ring
 
 MOST_LAT_DEG = 85.05  # farther from the equator there are no map tiles
 # At the equator a tile has a side of 10 km, or of 10 m. What comes into a folder later is divided as the first was: the
@@ -53,7 +52,7 @@ def extent_of_key(key: str) -> Extent:
     return south, west, north, east
 
 
-def ring_around(key: str) -> Ring:
+def ring_around(key: str) -> list[LatLon]:
     """Return an outline that is a little larger than a tile: five points (lat, lon) in degrees."""
     south, west, north, east = extent_of_key(key)
     lat_deg, lon_deg = _MORE * (north - south), _MORE * (east - west)
