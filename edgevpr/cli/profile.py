@@ -1,6 +1,7 @@
 """`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
 from argparse import ArgumentParser, Namespace
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,7 +84,9 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     """Make two things from the flags: the plan of the flight, and the techniques to try in all their forms: that of
     --map, else every one."""
     from edgevpr import techniques
+    from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
+    from edgevpr.places.tilemap import TileMap
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
     from edgevpr.runtime.preflight.pick import camera_setting
@@ -93,8 +96,11 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     config = config_of(args)
     places, camera = args.places, config.source.camera
     if args.map:
-        with PlaceMap.open(args.map) as place_map:
+        is_folder = Path(args.map).is_dir()
+        with closing(TileMap.open(args.map) if is_folder else PlaceMap.open(args.map)) as place_map:
             places, spec = len(place_map), place_map.spec
+        if is_folder:  # of which as much is in RAM as there is room for
+            places = min(places, int(1e6 * budget_mb(config, board)) // bytes_per_place(spec))
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
         wanted = offers((spec.name,), settings={spec.name: spec.parameters})
     else:

@@ -109,7 +109,7 @@ def ask(
             if not len(among):
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
-            event = looked_for(place_id, image, shown, Matcher(technique, among, rule), place_map, meter, layers)
+            event = looked_for(place_id, image, shown, Matcher(technique, among, rule, layers=layers), place_map, meter)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
@@ -128,12 +128,11 @@ def looked_for(
     matcher: Matcher,
     place_map: PlaceMap,
     meter: QueryMeter,
-    layers: Layers,
 ) -> Recognition:
     """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
-    shows no ground (None: it shows ground everywhere). `layers` are those of the map."""
+    shows no ground (None: it shows ground everywhere)."""
     prepared = Preparation(mask=None if shown is None else Mask(shown, sha256=""))
-    settings = WalkSettings(candidates=matcher.technique.candidates, layers=layers)
+    settings = WalkSettings(candidates=matcher.technique.candidates)
     walk = Recogniser(matcher, place_map, meter, settings, preparation=prepared)
     return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 

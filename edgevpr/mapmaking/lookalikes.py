@@ -50,7 +50,7 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         away = index.only(~same_ground(index, slot, near_m))
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
             continue
-        event = looked_for(place_id, image, mask, Matcher(technique, away, rule), place_map, meter, layers)
+        event = looked_for(place_id, image, mask, Matcher(technique, away, rule, layers=layers), place_map, meter)
         if event.best is None or event.confidence is None or event.confidence < LEAST:
             yield None
         else:

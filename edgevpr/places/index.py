@@ -246,7 +246,7 @@ class GrowingIndex:
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
         capacity = _capacity(place_map, each, budget_bytes, self._in_file + room)
-        self._map, self._technique = place_map, technique
+        self.place_map, self._technique = place_map, technique
         self._mean = place_map.mean_coarse() if technique.spec.packed else None
         self._mean_of = self._in_file  # number of places that this mean was computed from
         self._slots = empty_index(technique.spec, capacity, self._mean)
@@ -276,9 +276,9 @@ class GrowingIndex:
     def _repack(self) -> None:
         """Pack all places again with the new mean. A place that can no longer be read is dropped, since its row is
         packed with the old mean."""
-        mean = self._map.mean_coarse()
+        mean = self.place_map.mean_coarse()
         packed = 0
-        held = _only(self._map.coarse_parts(), self.index.place_ids.copy())
+        held = _only(self.place_map.coarse_parts(), self.index.place_ids.copy())
         try:
             for written in fill(replace(self.index, mean=mean), held, self._technique):
                 packed = written

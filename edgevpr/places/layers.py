@@ -4,15 +4,14 @@ A picture is found best among places that show a little less ground than it does
 height that its map was not cut for finds more in a map of several footprints.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgevpr.core.arrays import Ints
+from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Expectation
 
 # Footprint of the places that a picture is found among best, as a share of its own, by benchmarks/results/from_space.md
@@ -49,23 +48,23 @@ class Layers:
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
-def layers_of(place_map: PlaceMap) -> Layers:
+def layers_of(place_map: ReadMap) -> Layers:
     """Read the layers of a map. Raises MapError."""
-    known = [(place_id, *row) for place_id, row in place_map.scan("footprint_m, is_surveyed") if row]
-    known = [each for each in known if isinstance(each[1], float) and 0 < each[1] < math.inf]
-    cut = sorted((place_id, footprint_m) for place_id, footprint_m, is_surveyed in known if is_surveyed)
+    place_ids, length_m, is_cut = place_map.footprints()
     footprints_m: list[float] = []
-    for each_m in sorted({footprint_m for _, footprint_m in cut}):
+    for each_m in np.unique(length_m[is_cut]).tolist():
         if not footprints_m or each_m > _ALIKE * footprints_m[-1]:
             footprints_m.append(each_m)
-    median_m = float(np.median([each[1] for each in known])) if known else None
+    median_m = float(np.median(length_m)) if len(length_m) else None
     if len(footprints_m) < 2:
         return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))
-    ids, own_m = zip(*cut, strict=True)
-    return Layers(median_m, tuple(footprints_m), np.array(ids), _nearest(footprints_m, own_m))
+    order = np.argsort(place_ids[is_cut])
+    return Layers(
+        median_m, tuple(footprints_m), place_ids[is_cut][order], _nearest(footprints_m, length_m[is_cut][order])
+    )
 
 
-def _nearest(footprints_m: Sequence[float], to_m: float | Sequence[float]) -> Ints:
+def _nearest(footprints_m: Sequence[float], to_m: float | Doubles) -> Ints:
     """Return the number of the footprint that is nearest by ratio to the length, or to each of the lengths, `to_m`."""
     off = np.subtract.outer(np.log(to_m), np.log(footprints_m))
     return np.asarray(np.abs(off).argmin(axis=-1))

@@ -21,6 +21,7 @@ from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapfiles import is_of_one_row, sentences
+from edgevpr.places.readmap import Footprints
 from edgevpr.places.rows import Content, Unreadable, Values
 
 _OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
@@ -172,6 +173,15 @@ class PlaceMap(MapConnection):
         is missing or damaged."""
         with self._named(place_id):
             return rows.landmarks_of(self.row(int(place_id), "landmarks, landmarks_crc32"))
+
+    def footprints(self) -> Footprints:
+        """Read the footprints of all places that have one, in the order they were added. Raises MapError."""
+        known = [(place_id, *row) for place_id, row in self.scan("footprint_m, is_surveyed") if row]
+        known = [each for each in known if isinstance(each[1], float) and 0 < each[1] < math.inf]
+        ids, length_m, is_cut = zip(*known, strict=True) if known else ((), (), ())
+        return Footprints(
+            np.array(ids, np.int64), np.array(length_m, float), np.array([bool(cut) for cut in is_cut], bool)
+        )
 
     def ids_by(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""

@@ -26,7 +26,7 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Candidate
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
@@ -64,7 +64,7 @@ class Query:
 
     technique: Technique
     descriptor: Descriptor
-    place_map: PlaceMap
+    place_map: ReadMap
     index: PlaceIndex
     expected: Expectation = NOTHING
 
@@ -264,7 +264,7 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collec
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
-def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
+def named(ranking: Ranking, index: PlaceIndex, place_map: ReadMap, first: int | None = None) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
 
     Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
@@ -328,14 +328,14 @@ def _tried(by_hypothesis: Singles | None, slots: Ints, heights: int) -> float:
     return float(np.minimum(tried, 1.0).mean())
 
 
-def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
+def _require_there(place_map: ReadMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
     """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
         raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")
 
 
-def _left_out_now(place_map: PlaceMap, unreadable: list[PlaceError], tried: int) -> MapError:
+def _left_out_now(place_map: ReadMap, unreadable: list[PlaceError], tried: int) -> MapError:
     """Return the error to raise for `unreadable` ones of the places `tried`. If they are most, the error is about the
     file; else they are entered in `left_out`, and the error is about the first."""
     first = unreadable[0]

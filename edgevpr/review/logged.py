@@ -74,9 +74,9 @@ class LoggedQuery:
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
-    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
-    seconds after its start; it is `span_s` long. `truth` names the positions by which matches are judged, and `notes`
-    are sentences for the head of its page."""
+    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches, `tiles` the
+    quad keys of those that were in RAM. Times are seconds after its start; it is `span_s` long. `truth` names the
+    positions by which matches are judged, and `notes` are sentences for the head of its page."""
 
     path: Path
     truth: str = "GPS"
@@ -88,6 +88,7 @@ class LoggedFlight:
     unusable: list[float] = field(default_factory=list)
     learnt: list[Point] = field(default_factory=list)
     between: list[dict[str, Any]] = field(default_factory=list)
+    tiles: set[str] = field(default_factory=set)
     span_s: float = 0.0
 
 
@@ -130,6 +131,8 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
             flight.learnt += filter(None, [point(line, "position")])
         elif kind == "between":
             flight.between += [line] if point(line) else []
+        elif kind == "tiles":
+            flight.tiles.update(map(str, line["held"]))
         else:
             flight.remarks.append((t_s, str(kind), _words(line)))
     return flight

@@ -3,7 +3,7 @@ over them."""
 
 import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,6 +15,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.tilemap import TileMap
 from edgevpr.review.html import Points, dots, way
 from edgevpr.review.logged import Point
 from edgevpr.review.mosaic import Mosaic
@@ -37,9 +38,11 @@ class Layer:
     form: Literal["dots", "line", "area"] = "dots"
 
 
-def read_ground(path: str | Path) -> list[Place]:
-    """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be read,
-    or is damaged."""
+def read_ground(path: str | Path, tiles: Collection[str] = ()) -> list[Place]:
+    """Read the places of the map file `path` that have a position; of a folder of maps, those of `tiles`, by their quad
+    keys. Raises EdgevprError for a map that cannot be read, or is damaged."""
+    if Path(path).is_dir():
+        return [place for place in TileMap.open(path).places_in(tiles) if place.position]
     with PlaceMap.open(path) as place_map:
         return [place for place in place_map.places() if place.position]
 

@@ -41,6 +41,7 @@ _ALWAYS: dict[str, Any] = {
     "dropped": 0,
     "latency_s": None,
     "condition": "RUNNING",
+    "tile": True,
     "state": "replayed",
 }
 

@@ -1,10 +1,12 @@
 """Flights in this process, by a clock to turn: the real recogniser, loop and log, and who listens."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 from fakes import FakeClock, FakeLink, FakeSource
 
 from edgevpr.core.config import Config, load_config
+from edgevpr.core.types import NO_TAPE
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
@@ -14,6 +16,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.tiles import tiles_of
 from edgevpr.runtime.flight.world import Crew, Stop
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
@@ -66,8 +69,12 @@ class Flight:
         status=None,
     ) -> list[dict]:
         settings, clock = self.config.mavlink, self.clock.clock
-        with self.recogniser.place_map, FlightLog(self.log, clock=self.clock) as flight_log:
+        with ExitStack() as opened:
+            opened.callback(self.recogniser.place_map.close)
+            flight_log = opened.enter_context(FlightLog(self.log, clock=self.clock))
             herald, autopilot = Herald(flight_log, self.link), None
+            if tiles := tiles_of(self.recogniser, self.config.match, herald, NO_TAPE):
+                opened.callback(tiles.close)
             if self.link:
                 navigator = self.navigator
                 if navigator is None:  # of a real link it is the listener from the start
@@ -78,6 +85,7 @@ class Flight:
             crew = Crew(
                 recogniser=self.recogniser,
                 learner=self.learner,
+                tiles=tiles,
                 source=source,
                 link=self.link,
                 autopilot=autopilot,

@@ -18,6 +18,8 @@ from edgevpr.core.errors import MapError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, identity_of
+from edgevpr.places.readmap import ReadMap
+from edgevpr.places.tilemap import TileMap
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import OwnMemory, QueryMeter
 from edgevpr.runtime.flight.world import World
@@ -135,7 +137,7 @@ def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlo
     return {**fields, "recording": world.recording, "decided": decided}
 
 
-def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
+def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: ReadMap) -> dict[str, Any]:
     """Return the fields of the first line of a flight log (kind "start"): all that a flight depends on, except its
     pictures and its autopilot. Only libraries that are loaded have their version listed."""
     loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
@@ -154,8 +156,11 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
     }
 
 
-def _identity(place_map: PlaceMap) -> MapIdentity | None:
+def _identity(place_map: ReadMap) -> MapIdentity | None:
     """Return the identity of a map; None if it has no places yet, or cannot be identified."""
+    if isinstance(place_map, TileMap):
+        return place_map.identity()
+    assert isinstance(place_map, PlaceMap)
     try:
         found = identity_of(place_map)
         return found if found.places else None

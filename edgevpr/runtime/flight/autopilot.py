@@ -12,6 +12,7 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
+from edgevpr.places.tilemap import own_number
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
@@ -146,8 +147,9 @@ class ToAutopilot:
     def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
-            found = {"vpr_place": best.place.place_id, "vpr_score": best.match.score, "vpr_conf": confidence_of(event)}
-            self._link.send(*messages.named_values(now_s, **found))
+            place, score = own_number(best.place.place_id), best.match.score
+            found = messages.named_values(now_s, vpr_place=place, vpr_score=score, vpr_conf=confidence_of(event))
+            self._link.send(*found)
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))

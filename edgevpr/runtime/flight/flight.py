@@ -20,7 +20,7 @@ from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import at_recorded_rate, look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
@@ -30,6 +30,7 @@ from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.tiles import tiles_of
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, ScaleWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
@@ -78,6 +79,7 @@ class Flight:
             self._surveyor.tell,
             self._log_event,
             self._learn,
+            *([crew.tiles.tell] if crew.tiles else []),
         )
 
     @classmethod
@@ -102,6 +104,8 @@ class Flight:
             if link and not source.is_live and (learner or config.mavlink.send_fixes):
                 _log.warning("%s is a recording: its fixes, and what it learns, do not say where you are", source_uri)
             herald = Herald(flight_log, link)
+            if tiles := tiles_of(recogniser, config.match, herald, world.tape):
+                stack.callback(tiles.close)
             autopilot = None
             if link:
                 settings, cores = config.mavlink, world.board.cores
@@ -115,6 +119,7 @@ class Flight:
             crew = Crew(
                 recogniser=recogniser,
                 learner=learner,
+                tiles=tiles,
                 source=source,
                 link=link,
                 ground=ground,
@@ -299,7 +304,7 @@ def _open_log(world: World) -> FlightLog:
 
 
 def open_links(
-    settings: MavlinkConfig, world: World, navigator: Navigator, place_map: PlaceMap, stack: ExitStack
+    settings: MavlinkConfig, world: World, navigator: Navigator, place_map: ReadMap, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
     """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
     address, ground_address = parse_links(settings.link, settings.ground)

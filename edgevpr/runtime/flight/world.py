@@ -32,6 +32,7 @@ from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.status import StatusFile, usual_path
+from edgevpr.runtime.flight.tiles import Tiles
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -128,6 +129,7 @@ class Crew:
 
     recogniser: Recogniser
     learner: Learner | None = None
+    tiles: Tiles | None = None
     source: Source
     link: Link | None = None
     ground: Link | None = None

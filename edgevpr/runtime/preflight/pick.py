@@ -21,7 +21,7 @@ from edgevpr.runtime.preflight.choose import (
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import counted_work, on_board
-from edgevpr.runtime.recognise.opening import budget_mb, made_for
+from edgevpr.runtime.recognise.opening import budget_mb, made_for, searched_places
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import weights_of
 
@@ -82,7 +82,7 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     parts = ["the map was built with it" if config.technique is None else "it was named"]
     if weights := weights_of(technique.spec):
         parts.append(f"weights of {weights}")
-    if left_out := len(recogniser.place_map) - len(recogniser.index):
+    if left_out := len(recogniser.place_map) - searched_places(recogniser):
         parts.append(f"{left_out} places are left to the map file")
     if candidates != usual:
         parts.append(f"{candidates} candidates instead of {usual}")
@@ -100,7 +100,7 @@ def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
         candidates=recogniser.candidates if spec.fine else costs.candidates,
     )
     demand = Demand(
-        places=len(recogniser.index),
+        places=searched_places(recogniser),
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
         camera=_camera(technique),

@@ -24,7 +24,7 @@ from edgevpr.core.errors import PlaceError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, unpacked
 
@@ -172,7 +172,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
 class Verification:
     """Compares the landmarks of one query, which are computed when first needed, with those of places."""
 
-    def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
+    def __init__(self, spec: TechniqueSpec, picture: Levelled, index: PlaceIndex, place_map: ReadMap) -> None:
         self._spec, self.picture, self._index, self._map = spec, picture, index, place_map
 
     @cached_property

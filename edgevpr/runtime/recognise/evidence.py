@@ -27,7 +27,7 @@ import numpy as np
 from edgevpr.core.contract import FineMatch, TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
@@ -170,7 +170,7 @@ def share_of(match: FineMatch) -> float:
     return match.score if match.votes is None else match.votes
 
 
-def calibration_of(place_map: PlaceMap) -> MapCalibration | None:
+def calibration_of(place_map: ReadMap) -> MapCalibration | None:
     """Return the calibration of a map; None if it has none, or, after a warning in the log, if it is unusable."""
     try:
         text = place_map.calibration

@@ -15,7 +15,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
 from edgevpr.runtime.recognise.confidence import Evidence
@@ -57,7 +57,7 @@ class _Survey:
     """Measures of a map of so many `places`: the `origin` of the belief's plane (None: the map has no positions), the
     `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
 
-    def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
+    def __init__(self, place_map: ReadMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
         self.places, self.origin = len(index), None
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
@@ -94,7 +94,7 @@ class Follower:
     times are those of the recording.
     """
 
-    def __init__(self, place_map: PlaceMap, *, fastest_m_s: float | None, is_live: bool) -> None:
+    def __init__(self, place_map: ReadMap, *, fastest_m_s: float | None, is_live: bool) -> None:
         self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or FASTEST_M_S, is_live
         self._survey: _Survey | None = None  # of the map, once it has a place
         self._belief: Belief | None = None

@@ -75,6 +75,7 @@ class Prior:
     match; where heights are told, and pictures scaled by them, it is how far they are wrong.
     `footprint_m` is that of the layer of the map in which the last match was, by which the next picture is found best
     (None: unknown, or its height tells it); the height ratio is relative to it.
+    `area` is where the aircraft was at the last query, as far as it is known: a wider one than narrows the search.
     `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
     highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
     known heading, degrees (None: headings give no hint; see `TechniqueSpec`). `is_live` is False for recorded frames,
@@ -84,6 +85,7 @@ class Prior:
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
         self.footprint_m: float | None = None
+        self.area: Reach | None = None
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
         self.looks_again = self._are_believed = True
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
@@ -112,6 +114,9 @@ class Prior:
             if (since_s := abs(frame.t_mono_s - t_s)) <= _FIX_GOOD_FOR_S:
                 least_m = max(TOLD_REACH_M, _OVER_PLACES * margin_m)
                 reach = Reach(area.position, least_m + area.radius_m + FASTEST_M_S * since_s)
+        self.area = reach
+        if known and reach is None:
+            self.area = Reach(known[0], margin_m + FASTEST_M_S * abs(frame.t_mono_s - known[1]))
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known if self._are_believed else None

@@ -61,7 +61,7 @@ class Learner:
         self.trouble: str | None = None
         self.is_off = False
         self._recogniser, self._growing, self._spacing_m, self._gap_m = recogniser, growing, spacing_m, gap_m
-        self._map, self._utc_clock = recogniser.place_map, utc_clock
+        self._map, self._utc_clock = growing.place_map, utc_clock
 
     @property
     def summary(self) -> str:

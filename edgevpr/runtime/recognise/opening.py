@@ -15,7 +15,9 @@ from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.mapinfo import index_positions
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
+from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
@@ -53,18 +55,42 @@ def open_recogniser(
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
-    place_map = PlaceMap.open(config.map)
+    if is_tiled := Path(config.map).is_dir():
+        _require_flight(config, narrowed)
+    place_map = TileMap.open(config.map) if is_tiled else PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = technique_of(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
-        index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
+        if isinstance(place_map, TileMap):
+            place_map.make_room(technique, budget_bytes)
+            place_map.take(place_map.load(0))
+            index = place_map.index()
+        else:
+            index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
         if narrowed:
             prior = _in_flight(config, technique)
         recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
+
+
+def _require_flight(config: Config, is_flight: bool) -> None:
+    """Raise UsageError if what is opened cannot be recognised in a folder of maps, but in one map only."""
+    if not is_flight:
+        raise UsageError(
+            f"{config.map} is a folder, over whose maps `edgevpr run` flies: elsewhere name one map of them, or make "
+            "one of a part by `edgevpr map subset`."
+        )
+    if config.match.sequence is not None:
+        raise UsageError(f"{config.map} is a folder of maps, in which no sequences are matched: leave them out.")
+
+
+def searched_places(recogniser: Recogniser) -> int:
+    """Return the number of places that a query may be compared with: all in RAM or, of tiles, as many as can be."""
+    place_map = recogniser.place_map
+    return place_map.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
@@ -138,7 +164,7 @@ def made_for(threads: int | None, name: str, settings: Settings | None = None) -
 
 
 def technique_of(
-    place_map: PlaceMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
+    place_map: ReadMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
 
@@ -167,7 +193,7 @@ def technique_of(
     return technique
 
 
-def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
+def say_other_mask(place_map: ReadMap, mask: Mask | None) -> None:
     """Warn if the places of a map, which remain usable, were made with another mask than `mask`."""
     built_with = place_map.mask_sha256
     if len(place_map) and built_with != (mask.sha256 if mask else None):
@@ -175,7 +201,7 @@ def say_other_mask(place_map: PlaceMap, mask: Mask | None) -> None:
         _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
 
 
-def say_other_lens(place_map: PlaceMap, lens: str | None) -> None:
+def say_other_lens(place_map: ReadMap, lens: str | None) -> None:
     """Say if pictures are straightened by the calibration `lens` and the places of a map were not, or the other way
     round, which is right where one of the two cameras has no distortion."""
     built_with = place_map.lens
@@ -198,7 +224,7 @@ def _recogniser(
     config: Config,
     board: Board,
     technique: Technique,
-    place_map: PlaceMap,
+    place_map: ReadMap,
     index: PlaceIndex,
     *,
     prior: Prior | Told | None,
@@ -206,7 +232,8 @@ def _recogniser(
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
-    matcher, layers = Matcher(technique, index, rule, search_of(length)), layers_of(place_map)
+    layers = layers_of(place_map)
+    matcher = Matcher(technique, index, rule, search_of(length), layers=layers)
     mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
     say_other_lens(place_map, config.source.lens)
@@ -231,7 +258,6 @@ def _recogniser(
             candidates=candidates,
             verify=match.verify,
             min_accuracy_m=config.mavlink.min_accuracy_m,
-            layers=layers,
         ),
         preparation=preparation,
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.

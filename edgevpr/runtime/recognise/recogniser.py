@@ -6,8 +6,8 @@ search of the map for the query of a frame. A query may take several looks, at d
 
 import logging
 import math
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 from edgevpr.core.contract import Descriptor, Technique
@@ -17,14 +17,14 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers, layers_of
-from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification
 from edgevpr.runtime.recognise.evidence import evidence_of, log_share, share_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
-from edgevpr.runtime.recognise.hints import Prior, Told, expected_of, other_heights
+from edgevpr.runtime.recognise.hints import Prior, Reach, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
     NEW_FOR_S,
     AcceptRule,
@@ -46,16 +46,21 @@ _Judged = tuple[Verdict, Candidate, Located | None]  # with the best place, and 
 _OF_CANDIDATES = 0.4  # share of the candidates that is compared at each height but the first
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Matcher:
     """All that a frame is recognised with: a technique, the index made with it, the rule for accepting its matches, and
     the search over sequences of queries (None: each query is ranked alone). They belong together: another form of the
-    vectors in RAM gives other scores, and so needs other limits."""
+    vectors in RAM gives other scores, and so needs other limits. `layers` are those of the index (None: those of the
+    map). Of an index of several maps, `rule_of` gives the rule for a place by its number (None: `rule`). `follows`: the
+    flight is followed; not where the index is a part of the map in which the aircraft need not be."""
 
-    technique: Technique
-    index: PlaceIndex
-    rule: AcceptRule
-    search: SequenceSearch | None = None
+    technique: Technique = field(kw_only=False)
+    index: PlaceIndex = field(kw_only=False)
+    rule: AcceptRule = field(kw_only=False)
+    search: SequenceSearch | None = field(default=None, kw_only=False)
+    layers: Layers | None = None
+    rule_of: Callable[[int], AcceptRule] | None = None
+    follows: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,13 +85,11 @@ class Preparation:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma).
-    `layers` are those of the map (None: the recogniser reads them when it is made)."""
+    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
 
     candidates: int | None = None
     verify: bool = True
     min_accuracy_m: float = 1.0
-    layers: Layers | None = None
 
 
 class Recogniser:
@@ -99,7 +102,7 @@ class Recogniser:
     def __init__(
         self,
         matcher: Matcher,
-        place_map: PlaceMap,
+        place_map: ReadMap,
         meter: QueryMeter,
         settings: WalkSettings = WalkSettings(),
         *,
@@ -112,15 +115,17 @@ class Recogniser:
         self._prior, self._follower = prior, follower
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
-        # Places nearer to each other show the same ground: neither is a rival of the other.
-        self._layers = settings.layers or layers_of(place_map)
-        self._footprint_m = max(self._layers.footprints_m, default=0.0)
+        self._layers = matcher.layers or layers_of(place_map)
         self.take(matcher)
 
     def take(self, matcher: Matcher) -> None:
         """Use another matcher from the next frame on."""
         self.technique, self.index = matcher.technique, matcher.index
-        self.rule, self.search = matcher.rule, matcher.search
+        self.rule, self.search, self._rule_of = matcher.rule, matcher.search, matcher.rule_of
+        self._layers = matcher.layers or self._layers
+        self._following = self._follower if matcher.follows else None
+        # Places nearer to each other show the same ground: neither is a rival of the other.
+        self._footprint_m = max(self._layers.footprints_m, default=0.0)
         # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
         self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
 
@@ -171,6 +176,11 @@ class Recogniser:
         return self._prior.scale(self.technique.spec.height_ratios) if self._prior else 1.0
 
     @property
+    def area(self) -> Reach | None:
+        """The area in which the aircraft was at the last query, as far as it is known by other means than its place."""
+        return self._prior.area if isinstance(self._prior, Prior) else None
+
+    @property
     def measures_strides(self) -> bool:
         """True if the motion between two frames is measured."""
         return self._preparation.strides is not None
@@ -211,14 +221,15 @@ class Recogniser:
         self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor
     ) -> tuple[Verdict, Located | None]:
         """Search the map for an encoded frame. Returns the verdict and the aircraft's position (None: unknown)."""
-        follower = self._follower
+        follower = self._following
         nothing = says_nothing(descriptor, self.rule.min_quality)
         event.says_nothing = nothing is not None
         objection = nothing or (event.worth.reason if event.worth else None)
         if follower:
             follower.went_on(frame, event.vehicle, event.stride)
         if not len(self.index):
-            return Verdict(False, "the map has no place yet"), None
+            loading = "its part of the map is being loaded"
+            return Verdict(False, loading if len(self.place_map) else "the map has no place yet"), None
         if objection and self.search is None:  # a sequence needs every query
             if follower:
                 follower.saw_nothing(self.index)
@@ -277,6 +288,7 @@ class Recogniser:
         index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
+        rule = self._rule_of(best.place.place_id) if self._rule_of else rule
         where = proof = evidence = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
@@ -295,9 +307,9 @@ class Recogniser:
                 same = looked.same_ground(ranking)
         if rule.sure:
             evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, cells is not None)
-        if self._follower and followed is None and rule.sure and evidence is not None:
+        if self._following and followed is None and rule.sure and evidence is not None:
             with self.meter.step("locate"):
-                followed = self._follower.heard(ranking, index, evidence, rule.sure, where)
+                followed = self._following.heard(ranking, index, evidence, rule.sure, where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
                 return self._judged(event, ranking.led_by(followed.slot), looked, followed)
         rival = 0

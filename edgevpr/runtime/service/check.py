@@ -80,8 +80,8 @@ def _map(config: Config) -> str:
         with PlaceMap.open(path) as place_map:
             if not len(place_map):
                 return f"{path}, empty so far"
-    recogniser = open_recogniser(config, load_board(config.board))
-    with recogniser.place_map as place_map:
+    recogniser = open_recogniser(config, load_board(config.board), narrowed=True)
+    with closing(recogniser.place_map) as place_map:
         found = outlook(recogniser, config)
         sure = ""
         if recogniser.rule.sure:

@@ -1,0 +1,62 @@
+"""The index of several tiles of a map: one array of a fixed size, in which whole tiles lie one after the other."""
+
+from edgevpr.core.contract import TechniqueSpec
+from edgevpr.places.index import PlaceIndex, empty_index
+
+_MOVED_AT_ONCE = 4096  # places; NumPy copies what it moves within an array
+
+
+class TileIndex:
+    """The arrays of at most `capacity` places. Only `add` and `drop` change which places are in use, so another thread
+    may meanwhile write to those `beyond` them."""
+
+    def __init__(self, spec: TechniqueSpec, capacity: int) -> None:
+        self._slots = empty_index(spec, capacity, None)
+        self._held: dict[int, int] = {}  # places of each tile, in the order of the slots
+
+    @property
+    def tiles(self) -> tuple[int, ...]:
+        """The numbers of the tiles that it holds."""
+        return tuple(self._held)
+
+    @property
+    def capacity(self) -> int:
+        """The number of places for which there is room."""
+        return len(self._slots)
+
+    @property
+    def free(self) -> int:
+        """The number of free slots."""
+        return self.capacity - sum(self._held.values())
+
+    def of(self, tile: int | None) -> PlaceIndex:
+        """Return the index of one tile's places (None: of all that it holds), as views until the next `drop`."""
+        if tile is None:
+            return self._slots.first(self.capacity - self.free)
+        return self._slots.only(self._slice_of(tile))
+
+    def beyond(self) -> PlaceIndex:
+        """Return the free slots, to write places to."""
+        return self._slots.only(slice(self.capacity - self.free, None))
+
+    def add(self, tile: int, places: int) -> None:
+        """Use the first `places` slots of those `beyond`, which have been written, as those of a tile."""
+        self._held[tile] = places
+
+    def drop(self, tile: int) -> None:
+        """Free the slots of a tile: the places after it move to where it was."""
+        gone, end = self._slice_of(tile), self.capacity - self.free
+        for start in range(gone.stop, end, _MOVED_AT_ONCE):
+            stop = min(start + _MOVED_AT_ONCE, end)
+            to = start - (gone.stop - gone.start)
+            for array in self._slots.arrays.values():
+                array[to : to + stop - start] = array[start:stop]
+        del self._held[tile]
+
+    def _slice_of(self, tile: int) -> slice:
+        start = 0
+        for number, places in self._held.items():
+            if number == tile:
+                break
+            start += places
+        return slice(start, start + self._held[tile])
