@@ -2,10 +2,11 @@
 benchmarks/tiled_flight.py` writes benchmarks/results/tiled_flight.md, .json and .jpg.
 
 A real `edgevpr run` flies from corner to corner, at 40 m/s and one query in two seconds, beside a simulated autopilot
-that has GPS for the first minute. A second flight has no autopilot, and so knows nothing of its position. The camera sends Motion JPEG. The map has a
-budget of 96 MB, that of a Raspberry Pi Zero 2 W: 84,000 of a million places. The places along the track are pictures of
-generated ground, which are flown over with noise; the others have random content. Pictures have 256 pixels, so that the
-folder takes 9 GB; what a place takes in RAM does not depend on this. RAM is that of the process, every second.
+that has GPS for the first minute. A second flight has no autopilot, and so knows nothing of its position. The camera
+sends Motion JPEG. The map has a budget of 96 MB, that of a Raspberry Pi Zero 2 W: 84,000 of a million places. The
+places along the track are pictures of generated ground, which are flown over with noise; the others have random
+content. Pictures have 256 pixels, so that the folder takes 9 GB; what a place takes in RAM does not depend on this.
+RAM is that of the process, every second.
 """
 
 import argparse

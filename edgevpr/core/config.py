@@ -178,7 +178,7 @@ class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 
     board: str = key("--board NAME", "hardware profile (default: this machine)")
-    map: str | None = key("--map MAP", "the place map")
+    map: str | None = key("--map MAP", "the place map, or a folder of tiles")
     technique: str | None = key("--technique NAME", "insist on this technique")
     source: SourceConfig
     match: MatchConfig

@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import ClassVar
 
+import cv2
 import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
@@ -23,7 +24,10 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.tileindex import TileIndex
 from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import load_board
+from edgevpr.review.compare import compare
+from edgevpr.review.replay import replay
 from edgevpr.runtime.flight import tiles as tiles_of_flight
+from edgevpr.runtime.flight.flight import fly
 from edgevpr.runtime.recognise import opening
 from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
 from edgevpr.techniques import create
@@ -189,6 +193,23 @@ def test_a_flight_ends_while_a_tile_is_being_loaded(folder, tmp_path):
     flight = TiledFlight(folder, tmp_path / "log")
     flight.fly([8] * 2, work=lambda: None)
     assert not [each for each in threading.enumerate() if each.name.startswith("tiles")]
+
+
+@pytest.mark.slow
+def test_a_recorded_flight_over_tiles_is_flown_again_to_the_byte(folder, tmp_path):
+    (tmp_path / "seen").mkdir()
+    for number in range(8):
+        cv2.imwrite(str(tmp_path / "seen" / f"{number}.png"), frame(number // 2 + 8).image)
+    files = {
+        "source.uri": str(tmp_path / "seen"),
+        "log.path": str(tmp_path / "log"),
+        "log.record": str(tmp_path / "tape"),
+    }
+    assert fly(load_config(None, {"map": str(folder), "source.rate_hz": 2.0, **files})) == 0
+    again = replay(tmp_path / "log")
+    lines = compare(again.flown, again.lines)
+    assert not lines.others
+    assert len(of_kind(again.lines, "tiles")) > 2
 
 
 def test_a_folder_is_flown_over_and_nothing_else(folder, tmp_path):
