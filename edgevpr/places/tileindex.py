@@ -1,5 +1,9 @@
-"""The index of several tiles of a map: one array of a fixed size, in which whole tiles lie one after the other."""
+"""The index of several tiles of a map: one array of a fixed size, in which whole tiles lie one after the other, those
+that are searched together side by side."""
 
+from collections.abc import Collection
+
+from edgevpr.core.arrays import Array
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex, empty_index
 
@@ -29,11 +33,15 @@ class TileIndex:
         """The number of free slots."""
         return self.capacity - sum(self._held.values())
 
-    def of(self, tile: int | None) -> PlaceIndex:
-        """Return the index of one tile's places (None: of all that it holds), as views until the next `drop`."""
-        if tile is None:
-            return self._slots.first(self.capacity - self.free)
-        return self._slots.only(self._slice_of(tile))
+    def of(self, tiles: Collection[int]) -> PlaceIndex:
+        """Return the index of some of the tiles that it holds, as views until the next `drop` or `of`. What lies
+        between them is moved away."""
+        last = [tile for tile in self._held if tile in tiles]
+        if tuple(last) not in {self.tiles[at : at + len(last)] for at in range(len(self._held))}:
+            for tile in last:
+                self._to_end(tile)
+        start = self._slice_of(last[0]).start if last else 0
+        return self._slots.only(slice(start, start + sum(self._held[tile] for tile in last)))
 
     def beyond(self) -> PlaceIndex:
         """Return the free slots, to write places to."""
@@ -45,13 +53,19 @@ class TileIndex:
 
     def drop(self, tile: int) -> None:
         """Free the slots of a tile: the places after it move to where it was."""
-        gone, end = self._slice_of(tile), self.capacity - self.free
-        for start in range(gone.stop, end, _MOVED_AT_ONCE):
-            stop = min(start + _MOVED_AT_ONCE, end)
-            to = start - (gone.stop - gone.start)
-            for array in self._slots.arrays.values():
-                array[to : to + stop - start] = array[start:stop]
+        gone = self._slice_of(tile)
+        for array in self._slots.arrays.values():
+            _close(array, gone, self.capacity - self.free)
         del self._held[tile]
+
+    def _to_end(self, tile: int) -> None:
+        """Move a tile's places behind those of all other tiles."""
+        own, end = self._slice_of(tile), self.capacity - self.free
+        for array in self._slots.arrays.values():
+            kept = array[own].copy()
+            _close(array, own, end)
+            array[end - len(kept) : end] = kept
+        self._held[tile] = self._held.pop(tile)
 
     def _slice_of(self, tile: int) -> slice:
         start = 0
@@ -60,3 +74,11 @@ class TileIndex:
                 break
             start += places
         return slice(start, start + self._held[tile])
+
+
+def _close(array: Array, gone: slice, end: int) -> None:
+    """Move the entries from the end of a slice to `end` down to where the slice begins."""
+    for start in range(gone.stop, end, _MOVED_AT_ONCE):
+        stop = min(start + _MOVED_AT_ONCE, end)
+        to = start - (gone.stop - gone.start)
+        array[to : to + stop - start] = array[start:stop]

@@ -95,9 +95,9 @@ class TileMap:
         """The number of places for which there is room beside the tiles in RAM."""
         return self._index.free
 
-    def index(self, tile: int | None = None) -> PlaceIndex:
-        """Return the index of one tile in RAM (None: of all of them). It holds until the next `drop`."""
-        return self._index.of(tile)
+    def index(self, tiles: Collection[int]) -> PlaceIndex:
+        """Return the index of some of the tiles in RAM. It holds until the next call, or the next `drop`."""
+        return self._index.of(tiles)
 
     def load(self, tile: int) -> Loaded:
         """Read a tile into free slots: of more places than there are, the best. Raises MapError if it cannot be read,
@@ -188,7 +188,7 @@ class TileMap:
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield places as `PlaceMap.places` does; without numbers, those of the tiles in RAM."""
-        ids = self.index().place_ids.tolist() if place_ids is None else place_ids
+        ids = self.index(self.held).place_ids.tolist() if place_ids is None else place_ids
         for place_id in ids:
             with self._of(place_id) as (place_map, own_id):
                 (place,) = place_map.places([own_id])

@@ -1,7 +1,7 @@
 """Flies over a folder of tiles: keeps in RAM those around the aircraft, which a thread loads beside the queries.
 
-As long as it is known about where the aircraft is, by GPS or by what was recognised, the tiles there and next to them
-are searched, and the nearest that are not in RAM are loaded, those ahead first. Otherwise the aircraft is *lost*: tiles
+As long as it is known about where the aircraft is, by GPS or by what was recognised, the tiles there are searched, and
+those next to them, or ahead, are loaded before they are needed. Otherwise the aircraft is *lost*: tiles
 are loaded in turn, all of the folder, and each query searches one of them and is judged by itself. Where nothing has
 been recognised for a minute, GPS may be wrong: from then on every second minute counts as lost.
 """
@@ -20,13 +20,14 @@ from edgevpr.places.layers import layers_of
 from edgevpr.places.tilemap import Loaded, TileMap, tile_of_place
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.recognise.evidence import calibration_of
-from edgevpr.runtime.recognise.hints import Reach
+from edgevpr.runtime.recognise.hints import TOLD_REACH_M, Reach
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
 from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _LOST_S = 60.0
 _AHEAD_S = 60.0  # the tiles at which the aircraft then is are loaded as soon as those where it is
+_BESIDE_M = TOLD_REACH_M  # the area is never known better: a tile so near to it is searched too
 _HELD_NEARER = 0.25  # by this share of its side a tile in RAM counts as nearer: two must not take turns at an edge
 
 
@@ -43,7 +44,7 @@ class Tiles:
         self._rules = dict.fromkeys(tile_map.held, recogniser.rule)
         self._unusable: set[int] = set()
         self._searched_s = np.full(len(tile_map.keys), -np.inf)  # when each was searched last, while lost
-        self._alone: int | None = None  # the tile that is searched (None: all in RAM)
+        self._searched: tuple[int, ...] = tile_map.held
         self._area: Reach | None = None  # the last that was known
         self._found_s: float | None = None
         self._layers = layers_of(tile_map)
@@ -53,20 +54,19 @@ class Tiles:
         """Load, drop and search tiles by what an event says of the aircraft's position."""
         if event.frame is None:
             return
-        now_s, before = event.frame.t_mono_s, (self._alone, self._map.held)
-        if self._alone is not None and event.ranking is not None:
-            self._searched_s[self._alone] = now_s
+        now_s, before = event.frame.t_mono_s, (self._searched, self._map.held)
+        if event.ranking is not None:
+            self._searched_s[list(self._searched)] = now_s
         area = self._known(event, now_s)
         self._take_loaded()
         if area:
             self._go_to(self._wanted(area, event))
-            self._alone = None
+            self._searched = self._near(area)
         else:
             self._look_elsewhere()
-            held = self._map.held
-            self._alone = min(held, key=lambda tile: self._searched_s[tile]) if held else None
-        if (self._alone, self._map.held) != before:
-            self._search(held_before=before[1])
+            self._searched = tuple(sorted(self._map.held, key=lambda tile: self._searched_s[tile])[:1])
+        if (self._searched, self._map.held) != before:
+            self._search(held_before=before[1], is_lost=area is None)
 
     def close(self) -> None:
         """End the thread; what it is loading is given up."""
@@ -102,17 +102,22 @@ class Tiles:
                 wanted.append(tile)
         return wanted
 
+    def _near(self, area: Reach) -> tuple[int, ...]:
+        """Return the tiles in RAM in which the aircraft can be; those searched before stay a little longer."""
+        away_m = self._map.away_m(area.position) - area.radius_m
+        most_m = {tile: 2 * _BESIDE_M if tile in self._searched else _BESIDE_M for tile in self._map.held}
+        return tuple(tile for tile in self._map.held if away_m[tile] <= most_m[tile])
+
     def _places(self, tile: int) -> int:
         return min(int(self._map.places_of[tile]), self._map.capacity)
 
     def _go_to(self, wanted: list[int]) -> None:
-        """Have the tiles `wanted` in RAM, and no others. One stays until there is another to search."""
+        """Have the tiles `wanted` in RAM, and no others."""
         if self._loading or not wanted:
             return
         to_load = next((tile for tile in wanted if tile not in self._map.held), None)
         for tile in set(self._map.held) - set(wanted):
-            if len(self._map.held) > 1 or (to_load is not None and self._map.free < self._places(to_load)):
-                self._map.drop(tile)
+            self._map.drop(tile)
         if to_load is not None:
             self._load(to_load)
 
@@ -154,8 +159,8 @@ class Tiles:
         else:
             self._map.take(loaded)
 
-    def _search(self, held_before: tuple[int, ...]) -> None:
-        """Have the recogniser search the tiles in RAM, or the one that is searched alone."""
+    def _search(self, held_before: tuple[int, ...], is_lost: bool) -> None:
+        """Have the recogniser search the tiles that are to be searched."""
         held = self._map.held
         if held != held_before:
             if held:
@@ -165,11 +170,11 @@ class Tiles:
         self._recogniser.take(
             Matcher(
                 self._recogniser.technique,
-                self._map.index(self._alone),
-                rules[self._alone] if self._alone is not None else self._recogniser.rule,
+                self._map.index(self._searched),
+                rules[self._searched[0]] if self._searched else self._recogniser.rule,
                 layers=self._layers,
                 rule_of=lambda place_id: rules[tile_of_place(place_id)],
-                follows=self._alone is None,
+                follows=not is_lost,
             )
         )
 

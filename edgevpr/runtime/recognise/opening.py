@@ -65,7 +65,7 @@ def open_recogniser(
         if isinstance(place_map, TileMap):
             place_map.make_room(technique, budget_bytes)
             place_map.take(place_map.load(0))
-            index = place_map.index()
+            index = place_map.index(place_map.held)
         else:
             index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
@@ -88,9 +88,11 @@ def _require_flight(config: Config, is_flight: bool) -> None:
 
 
 def searched_places(recogniser: Recogniser) -> int:
-    """Return the number of places that a query may be compared with: all in RAM or, of tiles, as many as can be."""
+    """Return the number of places that a query is compared with: all in RAM or, of tiles, the places of one."""
     place_map = recogniser.place_map
-    return place_map.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
+    if isinstance(place_map, TileMap):
+        return min(int(place_map.places_of.max()), place_map.capacity)
+    return len(recogniser.index)
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
