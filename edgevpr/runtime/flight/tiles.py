@@ -1,9 +1,9 @@
 """Flies over a folder of tiles: keeps in RAM those around the aircraft, which a thread loads beside the queries.
 
 As long as it is known about where the aircraft is, by GPS or by what was recognised, the tiles there are searched, and
-those next to them, or ahead, are loaded before they are needed. Otherwise the aircraft is *lost*: tiles
-are loaded in turn, all of the folder, and each query searches one of them and is judged by itself. Where nothing has
-been recognised for a minute, GPS may be wrong: from then on every second minute counts as lost.
+those next to them, or ahead, are loaded before they are needed. Otherwise the aircraft is *lost*: tiles are loaded in
+turn, all of the folder, and each query searches one of them and is judged by itself. Where nothing has been recognised
+for a minute, GPS may be wrong: from then on every second minute counts as lost.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,7 +27,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _LOST_S = 60.0
 _AHEAD_S = 60.0  # the tiles at which the aircraft then is are loaded as soon as those where it is
-_BESIDE_M = TOLD_REACH_M  # the area is never known better: a tile so near to it is searched too
+_BESIDE_M = TOLD_REACH_M  # beyond the area, in which the aircraft may be nevertheless: what lies there is searched too
 _HELD_NEARER = 0.25  # by this share of its side a tile in RAM counts as nearer: two must not take turns at an edge
 
 
@@ -103,10 +103,12 @@ class Tiles:
         return wanted
 
     def _near(self, area: Reach) -> tuple[int, ...]:
-        """Return the tiles in RAM in which the aircraft can be; those searched before stay a little longer."""
-        away_m = self._map.away_m(area.position) - area.radius_m
-        most_m = {tile: 2 * _BESIDE_M if tile in self._searched else _BESIDE_M for tile in self._map.held}
-        return tuple(tile for tile in self._map.held if away_m[tile] <= most_m[tile])
+        """Return the tiles in RAM in which the aircraft can be, or the nearest of them; those searched before stay a
+        little longer."""
+        away_m, held = self._map.away_m(area.position), self._map.held
+        most_m = {tile: area.radius_m + _BESIDE_M * (2 if tile in self._searched else 1) for tile in held}
+        near = tuple(tile for tile in held if away_m[tile] <= most_m[tile])
+        return near or tuple(sorted(held, key=lambda tile: away_m[tile])[:1])
 
     def _places(self, tile: int) -> int:
         return min(int(self._map.places_of[tile]), self._map.capacity)

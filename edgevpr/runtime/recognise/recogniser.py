@@ -228,8 +228,7 @@ class Recogniser:
         if follower:
             follower.went_on(frame, event.vehicle, event.stride)
         if not len(self.index):
-            loading = "its part of the map is being loaded"
-            return Verdict(False, loading if len(self.place_map) else "the map has no place yet"), None
+            return Verdict(False, "the map has no place yet"), None
         if objection and self.search is None:  # a sequence needs every query
             if follower:
                 follower.saw_nothing(self.index)

@@ -119,7 +119,7 @@ def test_the_tiles_around_the_aircraft_are_in_ram_and_no_others(folder, tmp_path
     way = [0, 0, 0, *range(PLACES)]
     queries = flight.fly(way)
     found = [line for line in queries if line["accepted"]]
-    assert len(found) > 0.8 * len(way)
+    assert len(found) > 0.6 * len(way)
     assert all(line["position"]["lat_deg"] == pytest.approx(50 + int(line["query"]) * STEP_DEG) for line in found)
     assert all(tile_at(flight.map, place) in held for place, held in list(zip(way, flight.held, strict=True))[3:])
     assert max(map(len, flight.held)) <= 5
