@@ -20,6 +20,7 @@ from base import Row
 
 from edgevpr.core.config import load_config
 from edgevpr.fleet import building
+from edgevpr.fleet.worker import FleetOrder
 from edgevpr.mapmaking.making import Cuttings
 
 SET, FOOTPRINT_M, PER_TILE = "sat_marash", 156.0, 100
@@ -47,7 +48,7 @@ def measure(path: Path, spacing_m: float, workers: int, out: Path) -> Row:
     from dask.distributed import Client, LocalCluster
 
     cuttings = Cuttings(orthophoto=str(path), footprint_m=FOOTPRINT_M, spacing_m=spacing_m)
-    order = building.FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False)
+    order = FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False)
     with (
         LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
