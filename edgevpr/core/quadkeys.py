@@ -101,7 +101,8 @@ def zoom_of_places(lat_deg: Doubles, lon_deg: Doubles, most_places: int) -> int:
     """Return the lowest zoom, from LEAST_ZOOM on, of which no tile holds more than `most_places` of the positions in
     degrees, (N,)."""
     for zoom in range(LEAST_ZOOM, MOST_ZOOM):
-        if np.unique(keys_at(lat_deg, lon_deg, zoom), return_counts=True)[1].max() <= most_places:
+        column, row = _numbers(lat_deg, lon_deg, zoom)
+        if np.unique((row << zoom) + column % 2**zoom, return_counts=True)[1].max() <= most_places:
             return zoom
     return MOST_ZOOM
 

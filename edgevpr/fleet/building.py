@@ -47,12 +47,13 @@ def tasks_of_photos(photos: Sequence[Photo], places_per_tile: int, zoom: int | N
     points = [photo.tag.position for photo in placed if photo.tag.position]
     lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points]).T
     zoom = zoom_of_places(lat_deg, lon_deg, places_per_tile) if zoom is None else zoom
-    keys, tasks = keys_at(lat_deg, lon_deg, zoom), []
+    keys, northwards, tasks = keys_at(lat_deg, lon_deg, zoom), np.argsort(lat_deg), []
     for key in np.unique(keys).tolist():
-        inside = keys == key
-        near = inside | in_extent(extent_around(key, MARGIN_M), lat_deg, lon_deg)
-        uris = frozenset(placed[at].uri for at in np.flatnonzero(inside))
-        tasks.append(TileTask(key=key, photos=tuple(placed[at] for at in np.flatnonzero(near)), inside=uris))
+        extent_deg = extent_around(key, MARGIN_M)
+        near = northwards[slice(*np.searchsorted(lat_deg, extent_deg[::2], sorter=northwards))]
+        near = np.sort(near[in_extent(extent_deg, lat_deg[near], lon_deg[near])])
+        inside = frozenset(placed[at].uri for at in near[keys[near] == key])
+        tasks.append(TileTask(key=key, photos=tuple(placed[at] for at in near), inside=inside))
     return tasks, len(photos) - len(placed)
 
 
@@ -83,17 +84,15 @@ def build(
     with _alone(order.out), _client(scheduler, workers) as client:
         tiles = index.tiles_in(order.out)
         _require_alike(tiles.values(), order)
-        hashes = {key: tile.inputs_sha256 for key, tile in tiles.items()}
-        futures = {
-            client.submit(build_tile, replace(task, known_sha256=hashes.get(task.key)), order, pure=False): task.key
-            for task in tasks
-        }
+        futures = {client.submit(build_tile, task, order, pure=False): task.key for task in tasks}
         try:
             for future in shown(as_completed(futures), len(futures), "tiles"):
+                key = futures.pop(future)  # what nobody holds is not done again where the worker that has it dies
                 try:
                     done = future.result()
                 except Exception as error:  # a task returns what edgevpr can say: this is a worker's or Dask's
-                    done = DoneTile(key=futures[future], problem=_sentence(error))
+                    done = DoneTile(key=key, problem=_sentence(error))
+                del future
                 if done.tile:
                     tiles[done.tile.key] = done.tile
                 yield done

@@ -47,13 +47,12 @@ class FleetOrder:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileTask:
     """A tile to be mapped: its quad key, and what of: `cuttings` of an orthophoto, or `photos`, in the tile and around
-    it, those `inside` by their addresses. `known_sha256`: hash of what its map was made of (None: there is no map)."""
+    it, those `inside` by their addresses."""
 
     key: str
     cuttings: Cuttings | None = None
     photos: tuple[Photo, ...] = ()
     inside: frozenset[str] = frozenset()
-    known_sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +122,8 @@ def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
 def _of_photos(order: FleetOrder, task: TileTask, folder: Path) -> _Inputs:
     """Bring the photographs of a tile into a folder. Raises NoPlaceError if none of the tile can be used."""
     folder.mkdir()
-    found = gather(task.photos, folder)
+    needs_near = order.refine or order.calibrate
+    found = gather((photo for photo in task.photos if needs_near or photo.uri in task.inside), folder)
     contents, uris = set(map(content_in, found.named)), {name: photo.uri for name, photo in found.named.items()}
     return _Inputs(
         pictures=FlownPictures(source=str(folder)),
@@ -141,8 +141,8 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     target, folder = path_of(order.out, task.key), scratch / "pictures"
     inputs = _of_orthophoto(order, task.key, task.cuttings) if task.cuttings else _of_photos(order, task, folder)
     unusable = inputs.unusable
-    if inputs.sha256 == task.known_sha256:
-        return DoneTile(key=task.key, tile=tile_of(target), unusable=tuple(unusable))
+    if target.exists() and (there := tile_of(target)).inputs_sha256 == inputs.sha256:
+        return DoneTile(key=task.key, tile=there, unusable=tuple(unusable))
     if lost := _lost(target, inputs.is_named):
         return DoneTile(key=task.key, problem=lost, unusable=tuple(unusable))
     if task.photos and not task.inside.intersection(inputs.uris.values()):
