@@ -1,10 +1,11 @@
 """Confidence in a map that is put together of several tiles: `python benchmarks/bench_subset.py`.
 
-The raster `before` of sat_marash is mapped as four tiles, each calibrated as `edgevpr fleet build` calibrates it, and
-`edgevpr map subset` takes them all: with the most cautious of their calibrations, as it does, and without any, as the
-shipped confidence flies. Beside it stands one map of the same ground, calibrated as a whole. Over each the flight of
-`make from-space` is matched, picture by picture, and pictures of the set's other sites (foreign), which all must be
-refused. The set is one of those that the shipped confidence was tuned on; the way to join calibrations was not.
+The raster `before` of sat_marash is mapped as five tiles of 2 to 412 places, each calibrated as `edgevpr fleet build`
+calibrates it, and `edgevpr map subset` takes them all: with the most cautious of their calibrations, as it does, and
+without any, as the shipped confidence flies. Beside it stands one map of the same ground, calibrated as a whole. Over
+each the flight of `make from-space` is matched, picture by picture, and pictures of the set's other sites (foreign),
+which all must be refused. The set is one of those that the shipped confidence was tuned on; the way to join
+calibrations was not. All tiles are of one town: where they differ more, the most cautious costs more.
 """
 
 import shutil
