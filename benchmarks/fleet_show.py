@@ -7,7 +7,7 @@ build` maps them without refining and calibrating by two workers of a Dask sched
 one worker gets SIGKILL, a browser takes a picture of Dask's dashboard, and another worker is started.
 
 In the end the places in all tiles are counted by the content of their pictures: each photograph that was not refused
-must be one place, and only one.
+must be one place, and only one. How long it took says little: other programs ran beside it.
 """
 
 import argparse
@@ -288,7 +288,7 @@ def main() -> None:
 def page(found: Row) -> str:
     names = ("photographs", "tiles", "places", "refused", "lost", "doubled", "unknown", "unfinished_files")
     columns = {name.replace("_", " "): f"{{{name}}}" for name in names} | {"minutes": "{minutes:.1f}"}
-    killed, progress, layer = found["killed"], "\n".join(found["progress"]), " ".join(found["index"]["layers"][0])
+    killed, progress, layer = found["killed"], "\n".join(found["progress"]), found["index"]["layers"][0]
     said = json.dumps({name: value for name, value in found["said"].items() if name != "maps"})
     return f"""# A fleet's map of {found["counted"]["photographs"]:,} photographs
 
@@ -308,8 +308,9 @@ What the command said on the way, and in the end:
 {said}
 ```
 
-`index.gpkg`, as GDAL reads it, has the layer "{layer}" with {found["index"]["features"]} features in
-{found["index"]["crs"]}, and the columns {", ".join(found["index"]["fields"])}. Its outlines, by the places:
+`index.gpkg`, as GDAL reads it, has the layer `{layer[0]}` ({layer[1]}) with
+{found["index"]["features"]} features in {found["index"]["crs"]}, and the columns
+{", ".join(found["index"]["fields"])}. Its outlines, by the places:
 
 ![The outlines of the tiles](../../docs/pictures/fleet-index.png)
 
