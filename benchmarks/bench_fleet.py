@@ -1,14 +1,16 @@
-"""How map making grows with the workers: `make bench-fleet`.
+"""How map making grows with the workers: `make bench-fleet`, or `python benchmarks/bench_fleet.py --large`.
 
 `edgevpr fleet build` maps tiles of the raster `before` of sat_marash by the workers of Dask on this computer, each a
-process of one thread. The places lie 62 or 31 m apart, and are not calibrated. The serial part and the shared one are
-those for which T(w) = serial + shared / w gives the times measured with one and two workers: in so small a job the
-serial part is mostly the wait for the last tile. The projection holds for a job of this size, and assumes that nothing
-else grows with the workers: that the store gives each of them its pictures as fast as a local disk gives them to one.
+process of one thread. The places lie 62 or 31 m apart (--large: 9.6 m, too), and are not calibrated. The serial part
+and the shared one are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in
+so small a job the serial part is mostly the wait for the last tile. The projection holds for a job of this size, and
+assumes that nothing else grows with the workers: that the store gives each of them its pictures as fast as a local disk
+gives them to one.
 Read and written is what the workers asked Linux for, page cache and logs included. RAM is the peak of the largest
 worker.
 """
 
+import argparse
 import resource
 import tempfile
 import time
@@ -20,10 +22,12 @@ from base import Row
 
 from edgevpr.core.config import load_config
 from edgevpr.fleet import building
+from edgevpr.fleet.worker import FleetOrder
 from edgevpr.mapmaking.making import Cuttings
 
 SET, FOOTPRINT_M, PER_TILE = "sat_marash", 156.0, 100
 SPACINGS_M, WORKERS, PROJECTED, LARGE = (62.0, 31.0), (1, 2), (10, 100), 10_000_000
+LARGE_SPACING_M = 9.6  # 10,000 places: half an hour of two cores. 100,000 would take them half a day
 _COLUMNS = {
     "places": "{places}",
     "tiles": "{tiles}",
@@ -47,7 +51,7 @@ def measure(path: Path, spacing_m: float, workers: int, out: Path) -> Row:
     from dask.distributed import Client, LocalCluster
 
     cuttings = Cuttings(orthophoto=str(path), footprint_m=FOOTPRINT_M, spacing_m=spacing_m)
-    order = building.FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False)
+    order = FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False)
     with (
         LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
@@ -89,10 +93,13 @@ def projected(one: Row, two: Row) -> list[Row]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--large", action="store_true")
+    spacings_m = (*SPACINGS_M, *((LARGE_SPACING_M,) if parser.parse_args().large else ()))
     (folder,) = base.find_sets(names=[SET])
     path, rows = folder / "raster" / "before.vrt", []
     with tempfile.TemporaryDirectory(prefix="edgevpr-fleet-") as work:
-        for spacing_m in SPACINGS_M:
+        for spacing_m in spacings_m:
             both = [measure(path, spacing_m, count, Path(work) / f"{spacing_m:g} {count}") for count in WORKERS]
             print(*both, sep="\n", flush=True)
             rows += projected(*both)

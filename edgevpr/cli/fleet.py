@@ -1,7 +1,6 @@
 """`edgevpr fleet`: maps larger than an aircraft, a folder of tiles made by many workers."""
 
 from argparse import Namespace
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress
 
 _PLACES_PER_TILE = 10_000
+_MOST_TOLD = 10  # tiles that are not mapped: a store that is away says the same of each
 
 
 def add(commands: Any) -> None:
@@ -45,6 +45,7 @@ def fleet_build(args: Namespace) -> int:
         from edgevpr.core.quadkeys import maps_in
         from edgevpr.fleet import building
         from edgevpr.fleet.photos import photos_of
+        from edgevpr.fleet.worker import FleetOrder
     except ModuleNotFoundError as error:
         raise UsageError(f"A fleet's maps need more packages ({error}): `pip install 'edgevpr[fleet]'`.") from error
 
@@ -60,7 +61,7 @@ def fleet_build(args: Namespace) -> int:
     else:
         tasks, without_position = building.tasks_of_photos(photos_of(args.images), args.places_per_tile, zoom)
     out = out.absolute()
-    order = building.FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
+    order = FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
     done = list(building.build(order, tasks, args.scheduler, args.workers, progress))
     problems = {each.key: each.problem for each in done if each.problem}
     unusable = [text for each in done for text in each.unusable]
@@ -74,7 +75,8 @@ def fleet_build(args: Namespace) -> int:
         "unusable": unusable,
         "problems": problems,
     }
-    show({**result, "new": [asdict(each.tile) for each in done if each.is_new and each.tile]}, args.json, _said(result))
+    # Only their keys: the index has what there is to say of each, and there may be thousands.
+    show({**result, "new": [each.key for each in done if each.is_new]}, args.json, _said(result))
     return 1 if problems or unusable else 0
 
 
@@ -89,5 +91,8 @@ def _said(result: dict[str, Any]) -> list[str]:
         lines.append(f"  left out: {result['without_position']} photographs without a position")
     if result["unusable"]:
         lines.append(f"  left out: {len(result['unusable'])} photographs: {result['unusable'][0]}")
-    lines += [f"  not mapped  tile {key}: {problem}" for key, problem in result["problems"].items()]
+    told = list(result["problems"].items())[:_MOST_TOLD]
+    lines += [f"  not mapped  tile {key}: {problem}" for key, problem in told]
+    if more := len(result["problems"]) - len(told):
+        lines.append(f"  not mapped  {more} tiles more: --json names them")
     return lines

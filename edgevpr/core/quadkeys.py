@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgevpr.core.arrays import Doubles, Ints, LatLon
+from edgevpr.core.arrays import Bools, Doubles, Ints, LatLon
 from edgevpr.core.errors import UsageError
+from edgevpr.core.geodesy import moved
 
 MOST_LAT_DEG = 85.05  # farther from the equator there are no map tiles
 # At the equator a tile has a side of 10 km, or of 10 m. What comes into a folder later is divided as the first was: the
 # few photographs of a first flight must not make one tile of a country.
 LEAST_ZOOM, MOST_ZOOM = 12, 22
 _EQUATOR_M = 40_075_016.7
-_MORE = 0.01  # of a tile: its edges are curves in other projections
+_MORE = 0.01  # of an extent: its edges are curves in other projections
 
 Extent = tuple[float, float, float, float]
 
@@ -52,9 +53,23 @@ def extent_of_key(key: str) -> Extent:
     return south, west, north, east
 
 
-def ring_around(key: str) -> list[LatLon]:
-    """Return an outline that is a little larger than a tile: five points (lat, lon) in degrees."""
+def extent_around(key: str, margin_m: float) -> Extent:
+    """Return the bounding box of a tile and of the ground within `margin_m` metres of it, as `extent_of_key` does; its
+    east may be above 180."""
     south, west, north, east = extent_of_key(key)
+    (south, west), (north, east) = moved(south, west, -margin_m, -margin_m), moved(north, east, margin_m, margin_m)
+    return south, west, north, west + (east - west) % 360
+
+
+def in_extent(extent_deg: Extent, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
+    """Return bool (N,), True for the positions in degrees, (N,) each, that lie in a bounding box."""
+    south, west, north, east = extent_deg
+    return (lat_deg > south) & (lat_deg < north) & ((lon_deg - west) % 360 < (east - west) % 360)
+
+
+def ring_around(extent_deg: Extent) -> list[LatLon]:
+    """Return an outline that is a little larger than a bounding box: five points (lat, lon) in degrees."""
+    south, west, north, east = extent_deg
     lat_deg, lon_deg = _MORE * (north - south), _MORE * (east - west)
     south, west, north, east = south - lat_deg, west - lon_deg, north + lat_deg, east + lon_deg
     return [(south, west), (south, east), (north, east), (north, west), (south, west)]
@@ -86,7 +101,8 @@ def zoom_of_places(lat_deg: Doubles, lon_deg: Doubles, most_places: int) -> int:
     """Return the lowest zoom, from LEAST_ZOOM on, of which no tile holds more than `most_places` of the positions in
     degrees, (N,)."""
     for zoom in range(LEAST_ZOOM, MOST_ZOOM):
-        if np.unique(keys_at(lat_deg, lon_deg, zoom), return_counts=True)[1].max() <= most_places:
+        column, row = _numbers(lat_deg, lon_deg, zoom)
+        if np.unique((row << zoom) + column % 2**zoom, return_counts=True)[1].max() <= most_places:
             return zoom
     return MOST_ZOOM
 

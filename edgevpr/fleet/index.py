@@ -27,8 +27,9 @@ _KINDS: Mapping[str, type] = {str(int): np.int64, str(float | None): np.float64}
 class Tile:
     """A tile of the grid that is mapped. `key`: its quad key; its map is KEY.gpkg in the folder of the index. `places`:
     their number. `inputs_sha256`: hash of all that the map was made of. `first_time`, `last_time`: of its pictures, in
-    UTC. `expected`: share (0..1) of changed pictures of its own places that was accepted when it was calibrated, at the
-    `precision` wanted. None: unknown. `technique`: its name and parameters. `file_bytes`: size of the map."""
+    UTC. `expected`: share (0..1) of changed pictures of places in it and around it that was accepted when it was
+    calibrated, at the `precision` wanted. None: unknown. `technique`: its name and parameters.
+    `file_bytes`: size of the map."""
 
     key: str
     places: int

@@ -1,40 +1,66 @@
 """The photographs of a fleet, from many folders and tables, and those of one tile, brought to where it is mapped.
 
 A table is a positions.csv whose column `file` has paths, relative to the table, or addresses that fsspec opens, such as
-s3://bucket/0001.jpg."""
+s3://bucket/0001.jpg. A photograph is known by its content: where it lies may change, and cameras begin their names anew
+on every card."""
 
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import fsspec
 
-from edgevpr.core.errors import UsageError
+from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.geodesy import distance_m
+from edgevpr.core.text import decoded_name
+from edgevpr.frames.images import EXTENSIONS, is_image
 from edgevpr.frames.positions import GeoTag, read_positions, write_positions
 from edgevpr.frames.source import tags_of
 
 _CHUNK_BYTES = 1 << 20
+_HASH_DIGITS, _MOST_LETTERS = 12, 40  # of a name: that of a file has 255 bytes
+_SAME_M = 1.0  # between two positions of one photograph: written with fewer digits
 
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """A photograph at a path or an address, the `name` that a map has for it, which no other one has, and what is known
-    of it (see `GeoTag`)."""
+    """A photograph at a path or an address, and what is known of it (see `GeoTag`)."""
 
     uri: str
-    name: str
     tag: GeoTag
 
 
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """Photographs in a folder: `named`, by the names that they have there and in a map, each with another content.
+    `contents` has a text for each, of its content and its tag. `unusable` has a sentence about each that cannot be
+    used, by its address."""
+
+    named: dict[str, Photo]
+    contents: list[str]
+    unusable: dict[str, str]
+
+
 def photos_of(sources: Sequence[str]) -> list[Photo]:
-    """Return the photographs of folders and tables. Raises UsageError for a source that cannot be read."""
-    found: dict[str, GeoTag] = {}
+    """Return the photographs of folders and tables. One that is named twice counts once. Raises UsageError for a source
+    that cannot be read, and for a photograph that has two positions."""
+    found: dict[str, tuple[GeoTag, str]] = {}
     for source in sources:
         for uri, tag in _of_source(source):
-            found.setdefault(uri, tag)  # a folder that is named twice counts once
-    return [Photo(uri, _name(uri), tag) for uri, tag in found.items()]
+            before, of_source = found.setdefault(uri, (tag, source))
+            if not _agree(before, tag):
+                raise UsageError(f"{uri} has one position in {of_source} and another in {source}: give one of them.")
+    return [Photo(uri, tag) for uri, (tag, _) in found.items()]
+
+
+def _agree(tag: GeoTag, other: GeoTag) -> bool:
+    here, there = tag.position, other.position
+    if here is None or there is None:
+        return here is there
+    return distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg) <= _SAME_M
 
 
 def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
@@ -48,30 +74,65 @@ def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
         raise UsageError(f"--images {source} is no folder and no table of positions (.csv): give one of them.")
 
 
-def _name(uri: str) -> str:
-    """Return a name for a photograph: cameras begin theirs anew on every card, so it has that of its folder, too, and a
-    hash of where both are. What else is mapped must not change it."""
-    *folder, file = uri.rsplit("/", 2)[-2:]
-    return "_".join([*folder, hashlib.sha256(uri.encode()).hexdigest()[:8], file])
+def content_in(name: str) -> str:
+    """Return the part of a photograph's name that is a hash of its content."""
+    return Path(name).stem.rpartition("_")[2]
 
 
-def gathered(photos: Iterable[Photo], folder: Path) -> Iterator[tuple[Photo, str | None]]:
-    """Bring photographs into a folder, with a positions.csv of them, and yield each with the hash of its content; None
-    if it cannot be read."""
-    tags = {}
+def _name(uri: str, sha256: str) -> str:
+    """Return the name of a photograph in a map: its folder's, its own, so that names sort as the pictures were taken,
+    and the hash of its content."""
+    path = urlsplit(uri).path if uri.startswith(("http://", "https://")) else uri
+    *folder, file = decoded_name(path).rsplit("/", 2)[-2:]
+    words = [*folder, Path(file).stem]
+    return "_".join([*(word[-_MOST_LETTERS:] for word in words), sha256[:_HASH_DIGITS]]) + Path(file).suffix
+
+
+def gather(photos: Iterable[Photo], folder: Path) -> Gathered:
+    """Bring photographs into a folder, with a positions.csv of them. Of those of one content the first counts. Raises
+    SourceError where a store cannot be reached, or does not give what it has."""
+    found = Gathered({}, [], {})
+    first: dict[str, Photo] = {}  # by the hash of the content
     for photo in photos:
-        sha256 = hashlib.sha256(repr(photo.tag).encode())
-        target, is_here = folder / photo.name, "://" not in photo.uri
+        unfinished, is_here = folder / ".unfinished", "://" not in photo.uri
         try:
-            with fsspec.open(photo.uri, "rb") as source, open(os.devnull if is_here else target, "wb") as copy:
-                while chunk := source.read(_CHUNK_BYTES):
-                    sha256.update(chunk)
-                    copy.write(chunk)
-        except (OSError, ValueError, ImportError):
-            yield photo, None
+            sha256 = _copied(photo.uri, Path(os.devnull) if is_here else unfinished)
+        except FileNotFoundError:
+            found.unusable[photo.uri] = f"{photo.uri} is not there: correct the table, or bring it back"
             continue
-        if is_here:
-            target.symlink_to(photo.uri)
-        tags[photo.name] = photo.tag
-        yield photo, sha256.hexdigest()
-    write_positions(folder / "positions.csv", tags)
+        except Exception as error:  # each store has errors of its own
+            if not is_here:  # the next photographs would fail, too: this is not to make a map with holes
+                raise SourceError(
+                    f"{photo.uri} cannot be read ({_one_line(error)}): run this again when it can."
+                ) from None
+            found.unusable[photo.uri] = f"{photo.uri} cannot be read ({_one_line(error)})"
+            continue
+        same, name = first.setdefault(sha256, photo), _name(photo.uri, sha256)
+        if same is not photo:
+            if not _agree(same.tag, photo.tag):
+                found.unusable[photo.uri] = f"{photo.uri} is the picture {same.uri}, and has another position"
+        elif not is_image(name):
+            found.unusable[photo.uri] = f"{photo.uri} is no picture ({' '.join(EXTENSIONS)})"
+        else:
+            if is_here:
+                (folder / name).symlink_to(photo.uri)
+            else:
+                unfinished.rename(folder / name)
+            found.named[name] = photo
+            found.contents.append(f"{sha256} {photo.tag!r}")
+    write_positions(folder / "positions.csv", {name: photo.tag for name, photo in found.named.items()})
+    return found
+
+
+def _copied(uri: str, target: Path) -> str:
+    """Copy what is at a path or an address, and return the hash of it."""
+    sha256 = hashlib.sha256()
+    with fsspec.open(uri, "rb") if "://" in uri else open(uri, "rb") as source, target.open("wb") as copy:
+        while chunk := source.read(_CHUNK_BYTES):
+            sha256.update(chunk)
+            copy.write(chunk)
+    return sha256.hexdigest()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

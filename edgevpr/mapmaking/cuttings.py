@@ -14,7 +14,7 @@ from edgevpr.core.arrays import Bools, Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import to_lines_m
-from edgevpr.core.quadkeys import keys_at
+from edgevpr.core.quadkeys import extent_around, in_extent, keys_at
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.images import resized
@@ -67,8 +67,8 @@ class Lattice:
 class OrthophotoSource(RecordingSource):
     """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. Places of which
     more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `white` counts places
-    a third of which is white, as clouds are, and `seams` those with a straight seam, of the `tried_for_seams`. `only`
-    are the names of the frames to read (None: all)."""
+    a third of which is white, as clouds are, and, if it `tries_seams`, `seams` those with a straight seam, of the
+    `tried_for_seams`. `only` are the names of the frames to read (None: all)."""
 
     def __init__(
         self,
@@ -77,13 +77,14 @@ class OrthophotoSource(RecordingSource):
         clock: Callable[[], float],
         *,
         only: Collection[str] | None = None,
+        tries_seams: bool = True,
     ) -> None:
         super().__init__(only)
         self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
         self.total = sum(map(len, lattices))
         self.short_name = decoded_name(orthophoto.short_name)
         self.without_data = self.white = self.seams = self.tried_for_seams = 0
-        self._read = 0
+        self._read, self._tries_seams = 0, tries_seams
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
@@ -114,7 +115,7 @@ class OrthophotoSource(RecordingSource):
             self.without_data += 1
             return None
         self.white += _white(image) > _CLOUDY
-        if self._read % max(1, self.total // _TRIED_FOR_SEAMS) == 0:
+        if self._tries_seams and self._read % max(1, self.total // _TRIED_FOR_SEAMS) == 0:
             self.tried_for_seams += 1
             self.seams += has_seam(*self._orthophoto.as_it_is(position, WINDOW_PX))
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
@@ -182,7 +183,9 @@ class OrthophotoSource(RecordingSource):
 
 def _white(image: Image) -> float:
     """Return the share of a picture's pixels that are white."""
-    return float(((image.min(axis=2) > _WHITE) & (np.ptp(image, axis=2) < _COLOURLESS)).mean())
+    blue, green, red = cv2.split(image)
+    low, high = cv2.min(cv2.min(blue, green), red), cv2.max(cv2.max(blue, green), red)
+    return float(((low > _WHITE) & (high - low < _COLOURLESS)).mean())
 
 
 def _place_of(lattice: Lattice, share: float) -> Position:
@@ -267,12 +270,13 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
 
 
-def within(lattice: Lattice, key: str) -> Lattice:
-    """Return the places of a grid that lie in the tile with this quad key: each place is in one tile of a zoom. Raises
-    NoPlaceError if there are none."""
+def within(lattice: Lattice, key: str, margin_m: float) -> Lattice:
+    """Return the places of a grid that lie in the tile with this quad key, or within `margin_m` of it. Raises
+    NoPlaceError if none is in the tile: each place is in one tile of a zoom."""
     there = keys_at(lattice.lat_deg, lattice.lon_deg, len(key)) == key
     if not there.any():
         raise NoPlaceError(f"No place lies in the tile {key}.")
+    there |= in_extent(extent_around(key, margin_m), lattice.lat_deg, lattice.lon_deg)
     arrays = {name: getattr(lattice, name)[there] for name in ("rows", "columns", "lat_deg", "lon_deg")}
     return replace(lattice, **arrays)
 

@@ -63,7 +63,8 @@ class Cuttings:
     `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
     picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
     places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
-    (None: none are asked for). `tile`: the quad key of the tile that the places are in (None: all)."""
+    (None: none are asked for). `tile`: the quad key of the tile that the places are in, or not more than `margin_m`
+    metres beside (None: all)."""
 
     orthophoto: str
     footprint_m: float | Sequence[float]
@@ -71,22 +72,24 @@ class Cuttings:
     area: str | None = None
     attribution: str | None = None
     tile: str | None = None
+    margin_m: float = 0.0
 
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
-        from edgevpr.core.quadkeys import ring_around
+        from edgevpr.core.quadkeys import extent_around, ring_around
         from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp, within
         from edgevpr.mapmaking.missions import Area, read_area
 
-        area = Area(((ring_around(self.tile),),), ()) if self.tile else None
+        area = Area(((ring_around(extent_around(self.tile, self.margin_m)),),), ()) if self.tile else None
         area = read_area(self.area) if self.area else area
         orthophoto = self._photo(area)
         lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in self._footprints_m]
         require_sharp(orthophoto, self._footprints_m[0])
         if self.tile:
-            lattices = [within(lattice, self.tile) for lattice in lattices]
-        return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only)
+            lattices = [within(lattice, self.tile, self.margin_m) for lattice in lattices]
+        # Seams are those of the whole raster, and to try a place takes longer than to map it.
+        return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only, tries_seams=self.tile is None)
 
     @property
     def _footprints_m(self) -> list[float]:
@@ -209,7 +212,8 @@ def _say_and_fetch(source: Source, spacing_m: float, technique: Technique, shown
     from edgevpr.mapmaking.cuttings import OrthophotoSource
 
     assert isinstance(source, OrthophotoSource)  # opened by `Cuttings`
-    _log.info("%s", source.forecast(spacing_m, technique))
+    if _log.isEnabledFor(logging.INFO):  # it takes half a second
+        _log.info("%s", source.forecast(spacing_m, technique))
     if to_fetch := source.to_fetch():
         count, steps = to_fetch
         for _ in shown(steps, count, "fetching tiles"):

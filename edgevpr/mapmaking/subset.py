@@ -2,22 +2,22 @@
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, LatLon
+from edgevpr.core.arrays import Bools, Doubles, LatLon
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m, shorter_deg, to_lines_m
 from edgevpr.core.quadkeys import extent_of_key, maps_in
-from edgevpr.core.types import Place
 from edgevpr.mapmaking.missions import Area
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, select, shrink
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text, of_several
 
 _DEGREE_M = 111_000.0  # of latitude, and at most of longitude
 
@@ -25,8 +25,8 @@ _DEGREE_M = 111_000.0  # of latitude, and at most of longitude
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subset:
     """A map that was made for one flight. `maps`: number of those that it was made of. `near`: places near the mission,
-    of which the best `places` are in it. `file_bytes`: its size. `is_calibrated`: it has the calibration of the one map
-    that it is of."""
+    of which the best `places` are in it. `file_bytes`: its size. `is_calibrated`: it has the calibration of the map
+    that it is of, or that of several (see `of_several`)."""
 
     maps: int
     near: int
@@ -39,17 +39,28 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     """Make the map `out` of the places of `source`, a map or a folder of tiles, that are within `margin_m` metres of an
     area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
     none or none fits, and MapError for a map that cannot be read."""
-    paths, is_near = _maps_near(source, area, margin_m), _near(area, margin_m)
+    paths, calibrations = _maps_near(source, area, margin_m), list[MapCalibration | None]()
+
+    def wanted(place_map: PlaceMap) -> list[int]:
+        place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
+        there: list[int] = place_ids[near_of(area, margin_m, lat_deg, lon_deg)].astype(int).tolist()
+        if there:
+            calibrations.append(calibration_of(place_map))
+        return there
+
     with mapfiles.whole_or_none(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
-            near = select(paths[0], whole, is_near)
+            near = select(paths[0], whole, wanted)
         else:  # as numbers of places copied, and of those that were there already
-            near = sum(copied for copied, _ in merge(list(map(str, paths)), whole, watch, is_near)[0]) if paths else 0
+            near = sum(copied for copied, _ in merge(list(map(str, paths)), whole, watch, wanted)[0]) if paths else 0
         if not near:
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
             )
+        if len(paths) > 1 and (calibration := of_several(calibrations)):
+            with PlaceMap.open_for_adding(whole) as place_map:
+                place_map.record_calibration(calibration_text(calibration))
         count, file_bytes = near, whole.stat().st_size
         if most_bytes is not None and file_bytes > most_bytes:
             count = int(near * most_bytes / file_bytes)
@@ -83,28 +94,50 @@ def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
     return found
 
 
-def _near(area: Area, margin_m: float) -> Callable[[Place], bool]:
-    """Return the function that says if a place lies in an area, or within `margin_m` of it."""
+def near_of(area: Area, margin_m: float, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
+    """Return bool (N,), True for the positions in degrees, (N,) each, in an area or within `margin_m` metres of it: in
+    a hole of it, too. False for NaN."""
     south, west, north, east = area.extent_deg
     middle = (south + north) / 2, (west + east) / 2
 
-    def laid(points: list[LatLon]) -> Doubles:
-        lat_deg, lon_deg = np.array(points, float).T
-        return np.column_stack(offset_m(*middle, lat_deg, lon_deg))
+    def laid(points: Sequence[LatLon]) -> Doubles:
+        return np.array(offset_m(*middle, *np.array(points, float).T))
 
-    polygons_m = [[laid(ring).astype(np.float32) for ring in rings] for rings in area.polygons]
-    lines_m = []  # where each part of a path begins, and how it goes on; a point is a part without length
-    for path in area.paths:
-        corners_m = laid([(way.lat_deg, way.lon_deg) for way in (path if len(path) > 1 else 2 * path)])
-        lines_m.append((corners_m[:-1].T, np.diff(corners_m, axis=0).T))
-
-    def is_near(place: Place) -> bool:
-        if place.position is None:
-            return False
-        at = laid([(place.position.lat_deg, place.position.lon_deg)])[0]
-        # How far the place is inside a ring, in metres; negative outside.
-        inside_m = [[cv2.pointPolygonTest(ring, at.tolist(), True) for ring in rings] for rings in polygons_m]
-        in_area = any(outline >= -margin_m and max(holes, default=-np.inf) <= margin_m for outline, *holes in inside_m)
-        return in_area or any(to_lines_m(at[0], at[1], *line).min() <= margin_m for line in lines_m)
-
+    corners_m = laid(area.points)
+    low_m, high_m = corners_m.min(axis=1) - margin_m, corners_m.max(axis=1) + margin_m
+    at_m = np.array(offset_m(*middle, lat_deg, lon_deg))
+    candidates = np.flatnonzero(((at_m >= low_m[:, None]) & (at_m <= high_m[:, None])).all(axis=0))
+    at_m, is_near = at_m[:, candidates], np.zeros(len(lat_deg), bool)
+    found = np.zeros(len(candidates), bool)
+    for path in area.paths:  # a point is a path without length
+        found |= (
+            _away_m(laid([(way.lat_deg, way.lon_deg) for way in (path if len(path) > 1 else 2 * path)]), at_m)
+            <= margin_m
+        )
+    for rings in area.polygons:
+        outline, *holes = [laid([*ring, ring[0]]) for ring in rings]
+        of_this = _inside(outline, at_m) | (_away_m(outline, at_m) <= margin_m)
+        for hole in holes:
+            of_this &= ~_inside(hole, at_m) | (_away_m(hole, at_m) <= margin_m)
+        found |= of_this
+    is_near[candidates] = found
     return is_near
+
+
+def _away_m(corners_m: Doubles, at_m: Doubles) -> Doubles:
+    """Return the distance in metres of points (2, N) from a line with these corners (2, n), float64 (N,)."""
+    away_m = np.full(at_m.shape[1], np.inf)
+    for begin, end in pairwise(corners_m.T):
+        np.minimum(away_m, to_lines_m(at_m[0], at_m[1], begin, end - begin), out=away_m)
+    return away_m
+
+
+def _inside(ring_m: Doubles, at_m: Doubles) -> Bools:
+    """Return bool (N,), True for points (2, N) in a closed ring (2, n): a ray to the east crosses it an odd number of
+    times."""
+    (east_m, north_m), inside = at_m, np.zeros(at_m.shape[1], bool)
+    for (x, y), (next_x, next_y) in pairwise(ring_m.T):
+        if y != next_y:
+            crosses = (y > north_m) != (next_y > north_m)
+            inside ^= crosses & (east_m < x + (north_m - y) * (next_x - x) / (next_y - y))
+    return inside

@@ -2,7 +2,7 @@
 
 import os
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
 from edgevpr.places.index import best_places
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.rows import Content, Unreadable
+from edgevpr.places.rows import Content, Unreadable, Values
 
 _MOST_FAULTS = 20  # most faults of a file that SQLite lists
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
@@ -29,6 +29,8 @@ class Examined(NamedTuple):
     problem: str | None
     content: Content
 
+
+Wanted = Callable[[PlaceMap], Collection[int] | None]  # the ids of the places of a map that are wanted; None: all
 
 # Called with the places that are read, their number and a label; yields the places unchanged and shows the progress.
 Watch = Callable[[Iterable[Examined], int, str], Iterable[Examined]]
@@ -53,10 +55,11 @@ class MapCheck:
         return not (self.damaged or self.faults)
 
 
-def examine(place_map: PlaceMap) -> Iterator[Examined]:
-    """Read and check all values of every place, and yield the results in the order the places were added."""
+def examine(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterator[Examined]:
+    """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order the
+    places were added."""
     spec = place_map.spec
-    for place_id, row in place_map.scan(rows.ALL):
+    for place_id, row in place_map.scan(rows.ALL) if only is None else _rows_of(place_map, only):
         content: Content = {} if row is None else rows.content_of(rows.ALL, row)
         problem = "SQLite cannot read its row" if row is None else None
         try:
@@ -71,8 +74,16 @@ def examine(place_map: PlaceMap) -> Iterator[Examined]:
         yield Examined(place_id, problem, content)
 
 
+def _rows_of(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[int, Values | None]]:
+    for place_id in sorted(place_ids):
+        try:
+            yield place_id, tuple(place_map.row(place_id, rows.ALL).values())
+        except PlaceError:
+            yield place_id, None
+
+
 def merge(
-    paths: Sequence[str], out: Path, watch: Watch = unwatched, wanted: Callable[[Place], bool] = lambda place: True
+    paths: Sequence[str], out: Path, watch: Watch = unwatched, wanted: Wanted = lambda place_map: None
 ) -> tuple[list[tuple[int, int]], bool]:
     """Make the new map `out` of the `wanted` places of several maps; if that fails, leave no file. Returns for each map
     (places copied, places that were there already) as numbers, and True if one was calibrated: `out` is not.
@@ -99,16 +110,16 @@ def merge(
             )
 
 
-def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Callable[[Place], bool]) -> tuple[int, int]:
+def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Wanted) -> tuple[int, int]:
     """Copy what is new and `wanted` of `other` into `place_map`; return (copied, already there) as numbers."""
     copied = already_here = 0
+    only = wanted(other)
     with place_map.transaction():
         here = place_map.ids_by("source_image, time")
-        for each in watch(examine(other), len(other), f"copying {other.path.name}"):
+        total = len(other) if only is None else len(only)
+        for each in watch(examine(other, only), total, f"copying {other.path.name}"):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
-            if not wanted(rows.place_of(each.place_id, each.content)):
-                continue
             part = rows.part_of(each.content, "coarse", other.spec.coarse)
             alike = here.get((each.content["source_image"], each.content["time"]), ())
             if any(place_map.is_of(place_id, part) for place_id in alike):
@@ -163,13 +174,10 @@ def repair(path: str | Path, watch: Watch = unwatched) -> Path:
     return original
 
 
-def select(path: str | Path, out: Path, wanted: Callable[[Place], bool]) -> int:
+def select(path: str | Path, out: Path, wanted: Wanted) -> int:
     """Copy the `wanted` places of a map to the new file `out`, as `shrink` does; return how many there are."""
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        whole = (each for each in examine(place_map) if not each.problem)
-        return _copy(
-            place_map, unfinished, (each for each in whole if wanted(rows.place_of(each.place_id, each.content)))
-        )
+        return _copy(place_map, unfinished, examine(place_map, wanted(place_map)))
 
 
 def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:

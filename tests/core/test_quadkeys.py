@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from edgevpr.core.errors import UsageError
 from edgevpr.core.quadkeys import (
     MOST_LAT_DEG,
+    extent_around,
     extent_of_key,
+    in_extent,
     keys_at,
     keys_over,
     ring_around,
@@ -39,11 +41,24 @@ def test_a_box_over_the_date_line_has_tiles_on_both_sides():
 
 
 def test_an_outline_goes_around_its_tile():
-    ring = ring_around("021230")
+    ring = ring_around(extent_of_key("021230"))
     assert ring[0] == ring[-1]
     south, west, north, east = extent_of_key("021230")
     assert min(ring) < (south, west)
     assert max(ring) > (north, east)
+
+
+@pytest.mark.parametrize("beside_deg", [-179.9999, 179.9999])
+def test_the_ground_around_a_tile_goes_on_over_the_date_line(beside_deg):
+    (key,) = keys_at(np.array([0.5]), np.array([beside_deg]), 12)
+    lat_deg, lon_deg = np.full(4, 0.5), np.array([-179.9999, 179.9999, 179.0, -179.0])
+    assert in_extent(extent_around(key, 100.0), lat_deg, lon_deg).tolist() == [True, True, False, False]
+    assert in_extent(extent_around(key, 1.0), lat_deg, lon_deg).tolist() == [
+        beside_deg < 0,
+        beside_deg > 0,
+        False,
+        False,
+    ]
 
 
 def test_near_a_pole_there_are_no_tiles():

@@ -2,10 +2,10 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +21,16 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapBusyError, MapError, UsageError
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
+from edgevpr.mapmaking import calibrate
+from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.mapfile import PlaceMap
 
 building = pytest.importorskip("edgevpr.fleet.building", reason="needs the extra `fleet`")
 index = pytest.importorskip("edgevpr.fleet.index")
+photos = pytest.importorskip("edgevpr.fleet.photos")
+worker = pytest.importorskip("edgevpr.fleet.worker")
 pyogrio = pytest.importorskip("pyogrio")
 pytestmark = pytest.mark.slow
 PER_TILE = 20
@@ -84,7 +88,8 @@ def cluster(tmp_path_factory):
 
 
 def order(out, **more):
-    return building.FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False, **more)
+    settings = {"refine": False, "calibrate": False, **more}
+    return worker.FleetOrder(out=out, config=load_config(None), camera="nadir", **settings)
 
 
 def cuttings(path):
@@ -171,6 +176,28 @@ def test_a_larger_area_maps_the_tiles_again_that_get_more_places(cluster, orthop
         assert sum(map(len, places_of(tmp_path / "maps").values())) == places
 
 
+def test_a_tile_is_calibrated_with_the_ground_around_it_which_it_does_not_keep(orthophoto, tmp_path, monkeypatch):
+    for name in ("ASKED_DOWN", "FEWEST_PLACES"):  # each takes a while
+        monkeypatch.setattr(calibrate, name, 6)
+    (tmp_path / "maps").mkdir()
+    tasks = building.tasks_of_orthophoto(replace(cuttings(orthophoto), spacing_m=70.0), 9, None)
+    task = next(task for task in tasks if 0 < len(cut_of(task)) < 6)
+    done = worker.build_tile(task, order(tmp_path / "maps", calibrate=True))
+    assert done.problem is None
+    assert places_of(tmp_path / "maps")[task.key] == cut_of(task)
+    assert done.tile.expected is not None
+
+
+def cut_of(task):
+    """The names of the pictures that are cut in a tile."""
+    try:
+        source = task.cuttings.open()
+    except NoPlaceError:
+        return []
+    with closing(source):
+        return sorted(frame.name for frame in iter(lambda: source.read(1.0), None))
+
+
 def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
     cluster, out = Cluster(tmp_path), tmp_path / "maps"
     try:
@@ -180,15 +207,22 @@ def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
         tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
         done = []
         for each in building.build(order(out), tasks, cluster.address, None, unshown):
-            if not done:
-                first.send_signal(signal.SIGKILL)
             done.append(each)
+            if sum(each.tile is not None for each in done) == 3 and first.poll() is None:
+                made = {
+                    index.path_of(out, each.key): index.path_of(out, each.key).stat().st_ino
+                    for each in done
+                    if each.tile
+                }
+                first.kill()
+                first.wait()
     finally:
         cluster.stop()
     assert not [each.problem for each in done if each.problem]
     names = [name for each in places_of(out).values() for name in each]
     assert len(names) == len(set(names)) == sum(each.tile.places for each in done if each.tile)
     assert len(names) == cuttings(orthophoto).open().total
+    assert {path: path.stat().st_ino for path in made} == made, "what was done is not done again"
     assert not list(out.glob(".*.gpkg.*"))
 
 
@@ -237,42 +271,67 @@ def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_wher
     lines = (tmp_path / "wednesday" / "positions.csv").read_text().splitlines()
     lines[1:] = [line.replace("DJI_", f"file://{tmp_path}/wednesday/DJI_", 1) for line in lines[1:]]
     table.write_text("\n".join([*lines, lines[-1].replace("_0007", "_0099")]))
-    photos = pytest.importorskip("edgevpr.fleet.photos").photos_of
     sources = [str(tmp_path / "monday"), str(tmp_path / "tuesday"), str(table)]
-    tasks, without_position = building.tasks_of_photos(photos(sources), 10, None)
+    tasks, without_position = building.tasks_of_photos(photos.photos_of(sources), 10, None)
     assert without_position == 1
     done = mapped(cluster, tmp_path / "maps", tasks)
     unusable = " ".join(text for each in done for text in each.unusable)
-    assert "DJI_0099.png cannot be read" in unusable
+    assert "DJI_0099.png is not there" in unusable
     assert "DJI_0003.png" in unusable
-    found = [name.split("_", 2) for each in places_of(tmp_path / "maps").values() for name in each]
-    there = {(folder, name) for folder in ("monday", "tuesday", "wednesday") for name in names}
-    assert sorted((folder, name) for folder, _, name in found) == sorted(there - {("monday", "DJI_0003.png")})
+    found = [name.rpartition("_")[0] for each in places_of(tmp_path / "maps").values() for name in each]
+    there = {f"{folder}_{name[:8]}" for folder in ("monday", "tuesday", "wednesday") for name in names}
+    assert sorted(found) == sorted(there - {"monday_DJI_0003"})
     assert not any(each.is_new for each in mapped(cluster, tmp_path / "maps", tasks))
 
 
 def test_a_run_that_does_not_name_what_was_mapped_before_replaces_nothing(cluster, tmp_path):
-    photos, out = pytest.importorskip("edgevpr.fleet.photos").photos_of, tmp_path / "maps"
+    out = tmp_path / "maps"
     folders = [str(tmp_path / name) for name in ("monday", "tuesday")]
     for number, folder in enumerate(folders):
         photographs(Path(folder), ["1.png", "2.png"], 2 * number)
-    mapped(cluster, out, building.tasks_of_photos(photos(folders[:1]), 10, None)[0])
+    mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders[:1]), 10, None)[0])
     before = places_of(out)
-    (done,) = mapped(cluster, out, building.tasks_of_photos(photos(folders[1:]), 10, None)[0])
+    (done,) = mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders[1:]), 10, None)[0])
     assert "has 2 pictures that this run does not name, such as monday_" in done.problem
     assert places_of(out) == before
-    mapped(cluster, out, building.tasks_of_photos(photos(folders), 10, None)[0])
+    mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders), 10, None)[0])
     assert sum(map(len, places_of(out).values())) == 4
 
 
-def test_photographs_of_one_name_in_folders_of_one_name_are_told_apart(tmp_path):
-    for parent in ("a", "b"):
-        (tmp_path / parent).mkdir()
-        photographs(tmp_path / parent / "DCIM", ["1.png"], 0)
-    photos = pytest.importorskip("edgevpr.fleet.photos").photos_of
-    folders = [str(tmp_path / parent / "DCIM") for parent in ("a", "b", "a")]
-    names = [photo.name for photo in photos(folders)]
-    assert len(names) == len(set(names)) == 2
+def test_photographs_that_are_moved_or_named_twice_are_neither_mapped_again_nor_twice(cluster, tmp_path):
+    out, cards = tmp_path / "maps", [tmp_path / card / "DCIM" for card in "ab"]
+    for number, card in enumerate(cards):
+        card.parent.mkdir()
+        photographs(card, ["1.png", "2.png"], 2 * number)
+
+    def placed(*sources):
+        done = mapped(cluster, out, building.tasks_of_photos(photos.photos_of(list(map(str, sources))), 10, None)[0])
+        assert not [each for each in done if each.problem or each.unusable]
+        return sum(map(len, places_of(out).values())), any(each.is_new for each in done)
+
+    assert placed(*cards, cards[0]) == (4, True)
+    (tmp_path / "a").rename(tmp_path / "archive")
+    moved = tmp_path / "archive" / "DCIM"
+    assert placed(moved, cards[1]) == (4, False)
+    lines = (moved / "positions.csv").read_text().splitlines()
+    table = tmp_path / "table.csv"
+    table.write_text("\n".join([lines[0], *(f"file://{moved}/{line}" for line in lines[1:])]))
+    assert placed(table, moved, cards[1]) == (4, False)
+    photographs(tmp_path / "c", ["1.png"], 5)
+    assert placed(table, cards[1], tmp_path / "c") == (5, True)
+
+
+def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
+    photographs(tmp_path / "a", ["1.png"], 0)
+    table, elsewhere = tmp_path / "a.csv", GeoTag(position=Position(47.0, 8.001))
+    write_positions(table, {"a/1.png": elsewhere})
+    with pytest.raises(UsageError, match=r"1\.png has one position in .*a and another in .*a\.csv"):
+        photos.photos_of([str(tmp_path / "a"), str(table)])
+    write_positions(table, {f"file://{tmp_path}/a/1.png": elsewhere})
+    (tmp_path / "here").mkdir()
+    found = photos.gather(photos.photos_of([str(tmp_path / "a"), str(table)]), tmp_path / "here")
+    assert len(found.named) == 1
+    assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
 
 
 def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
@@ -305,16 +364,15 @@ def test_where_there_is_no_scheduler_a_sentence_says_how_to_start_one(tmp_path, 
 
 
 def test_photographs_at_a_pole_are_refused(tmp_path):
-    photo = pytest.importorskip("edgevpr.fleet.photos").Photo
     with pytest.raises(UsageError, match="tiles end at"):
-        building.tasks_of_photos([photo("/p.jpg", "p.jpg", GeoTag(position=Position(89.0, 0.0)))], 10, None)
+        building.tasks_of_photos([photos.Photo("/p.jpg", GeoTag(position=Position(89.0, 0.0)))], 10, None)
 
 
 def test_photographs_on_both_sides_of_the_date_line_have_neighbours_across_it():
-    photo = pytest.importorskip("edgevpr.fleet.photos").Photo
     at = [Position(0.5, 179.9999), Position(0.5, -179.9999)]
-    photos = [photo(f"/{n}.jpg", f"{n}.jpg", GeoTag(position=each)) for n, each in enumerate(at)]
-    tasks, _ = building.tasks_of_photos(photos, 10, 12)
+    tasks, _ = building.tasks_of_photos(
+        [photos.Photo(f"/{n}.jpg", GeoTag(position=each)) for n, each in enumerate(at)], 10, 12
+    )
     assert [(len(task.photos), len(task.inside)) for task in tasks] == [(2, 1), (2, 1)]
 
 

@@ -1,5 +1,8 @@
 """The part of a map that a mission needs."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pictures import textured
@@ -16,6 +19,8 @@ from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import unwatched
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.confidence import prior
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.techniques import create
 
@@ -94,6 +99,24 @@ def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path)
     with pytest.raises(UsageError, match="hold none"):
         subset(tiles, area, 1000.0, tmp_path / "g.gpkg", 100, unwatched)
     assert not (tmp_path / "g.gpkg").exists()
+
+
+def test_the_most_cautious_calibration_of_the_tiles_counts(tiles, tmp_path):
+    shutil.copytree(tiles, tmp_path / "tiles")
+    paths, model = sorted((tmp_path / "tiles").glob("[0-3]*.gpkg")), prior("ahead")
+    model = replace(model, scale=model.adapted_scale, adapted_scale=None)
+    for number, path in enumerate(paths):
+        biased = replace(model, of_place=replace(model.of_place, bias=float(-number)))
+        calibration = MapCalibration(
+            models={"ahead": biased}, made="2026-05-01", asked=40, precision=0.999, accepted=0.5, accepted_wrong=0
+        )
+        with PlaceMap.open_for_adding(path) as place_map:
+            place_map.record_calibration(calibration_text(calibration))
+    area = path_over((0, 0), (400, 400))
+    assert subset(tmp_path / "tiles", area, 1000.0, tmp_path / "f.gpkg", None, unwatched).is_calibrated
+    with PlaceMap.open(tmp_path / "f.gpkg") as place_map:
+        (joined,) = calibration_of(place_map).models.values()
+    assert {each.bias for each in (joined.of_place, *joined.of_other_places)} == {-float(n) for n in range(len(paths))}
 
 
 def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):

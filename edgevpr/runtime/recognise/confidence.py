@@ -87,11 +87,13 @@ class Scale:
 class Model:
     """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression that
     tells whether the query shows ground of the map, `of_place` whether the best place is the right one, and `scale`
-    converts their logits. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
+    converts their logits. Of a map joined of several, `of_other_places` are those of the others: the least logit
+    counts. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
     adapted). `made` is its date, and `made_of` describes in words the data it was fitted to."""
 
     of_map: Logistic
     of_place: Logistic
+    of_other_places: tuple[Logistic, ...] = ()
     scale: Scale
     adapted_scale: Scale | None = None
     made: str
@@ -100,10 +102,10 @@ class Model:
     def chance(self, evidence: Evidence) -> float:
         """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
         the heading is known, `tried` says that fewer rotations than a map was measured with had the chance to match."""
-        logits = self.of_map.logit(evidence), self.of_place.logit(evidence)
-        if not all(map(math.isfinite, logits)):
+        of_map, *of_places = (each.logit(evidence) for each in (self.of_map, self.of_place, *self.of_other_places))
+        if not all(map(math.isfinite, (of_map, *of_places))):
             return 1.0
-        chance = self.scale.off_map.beyond(logits[0]) + self.scale.off_place.beyond(logits[1])
+        chance = self.scale.off_map.beyond(of_map) + self.scale.off_place.beyond(min(of_places))
         return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _OF_ROTATIONS))
 
     def confidence(self, evidence: Evidence) -> float:
@@ -126,7 +128,8 @@ def model_of(stored: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
     scales = {name: stored[name] and _scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
-    return Model(**{**stored, **regressions, **scales})
+    others = tuple(_logistic(**each) for each in stored.get("of_other_places", ()))
+    return Model(**{**stored, **regressions, **scales, "of_other_places": others})
 
 
 @lru_cache

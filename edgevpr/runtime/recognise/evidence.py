@@ -18,7 +18,7 @@ import json
 import logging
 import math
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -30,7 +30,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of
+from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of, prior
 
 AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
 _BARE = ("lead", "coverage", "structure")
@@ -86,6 +86,11 @@ class MapCalibration:
 
     def described(self) -> str:
         """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
+        if not self.recognisable:  # see `of_several`
+            return (
+                f"the most cautious of its parts counts; of {self.asked} changed pictures of places in their own part "
+                f"at least {100 * self.accepted:.0f} % were accepted, at a precision of {100 * self.precision:.6g} %"
+            )
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'}"
         alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
@@ -113,7 +118,8 @@ def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
     known = OF_MAP.get(kind, ()) + OF_PLACE.get(kind, ())
-    if unknown := {*model.of_map.names, *model.of_place.names}.difference(known):
+    names = {name for each in (model.of_map, model.of_place, *model.of_other_places) for name in each.names}
+    if unknown := names.difference(known):
         raise ValueError(f"there is no evidence {min(unknown)!r:.40} of kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
         model.confidence(dict.fromkeys(known, value))
@@ -187,6 +193,41 @@ def calibration_of(place_map: ReadMap) -> MapCalibration | None:
         )
         return None
     return found
+
+
+def of_several(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
+    """Join the calibrations of maps whose places are put together (None: a map has none): a match is only accepted if
+    each of them accepts it, and the shipped confidence, if one has none. Places of different maps that look alike were
+    never seen together. Returns None if no map has one, or if different versions have made them."""
+    known = [each for each in maps if each]
+    if not known:
+        return None
+    models = {}
+    for kind in known[0].models:
+        shipped, own = prior(kind), [each.models[kind] for each in known if kind in each.models]
+        scale = shipped.adapted_scale or shipped.scale
+        if len(own) < len(known) or any((each.of_map, each.scale) != (shipped.of_map, scale) for each in own):
+            return None
+        of_places = [place for each in own for place in (each.of_place, *each.of_other_places)]
+        if len(known) < len(maps):  # its scale is the stricter one, see `Model.threshold`
+            of_places, scale = [*of_places, shipped.of_place], shipped.scale
+        models[kind] = Model(
+            of_map=shipped.of_map,
+            of_place=of_places[0],
+            of_other_places=tuple(dict.fromkeys(of_places[1:])),
+            scale=scale,
+            adapted_scale=shipped.adapted_scale if len(known) < len(maps) else None,
+            made=min(each.made for each in known),
+            made_of=f"the calibrations of {len(known)} of {len(maps)} maps",
+        )
+    return MapCalibration(
+        models=models,
+        made=min(each.made for each in known),
+        asked=sum(each.asked for each in known),
+        precision=max(each.precision for each in known),
+        accepted=min(each.accepted for each in known),
+        accepted_wrong=sum(each.accepted_wrong for each in known),
+    )
 
 
 def not_calibrated(places: int) -> str:

@@ -10,6 +10,7 @@ import sqlite3
 import zlib
 from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 from fakes import FakeClock
 from pictures import textured
@@ -29,8 +30,11 @@ from edgevpr.runtime.recognise.evidence import (
     calibration_of,
     calibration_text,
     not_calibrated,
+    of_several,
+    read_calibration,
     require_usable,
 )
+from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
@@ -152,3 +156,42 @@ def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     needed = [model.threshold(precision) for precision in (0.5, 0.9, 0.99, 0.999, 0.999999)]
     assert needed == sorted(needed)
     assert needed[0] < needed[-1]
+
+
+def adapted_to(rng, kind):
+    """The calibration of a map whose places look alike in a way of its own."""
+    shipped = prior(kind)
+    weights = tuple((np.array(shipped.of_place.weights) * rng.uniform(0.3, 1.7, len(shipped.of_place.names))).tolist())
+    of_place = replace(shipped.of_place, weights=weights, bias=shipped.of_place.bias + rng.uniform(-2, 2))
+    model = replace(shipped, of_place=of_place, scale=shipped.adapted_scale, adapted_scale=None, made="2026-05-01")
+    return replace(FOUND, models={kind: model}, asked=int(rng.integers(30, 60)), accepted=float(rng.uniform(0.2, 0.9)))
+
+
+@pytest.mark.parametrize("kind", ["ahead", "down", "down_bare"])
+@pytest.mark.parametrize("bare", [0, 1])  # maps without a calibration
+def test_joined_maps_accept_nothing_that_one_of_them_refuses(kind, bare):
+    rng = np.random.default_rng(3)
+    maps = [*(adapted_to(rng, kind) for _ in range(3)), *[None] * bare]
+    joined = read_calibration(calibration_text(of_several(maps)))
+    require_usable(kind, joined.models[kind])
+    every = [Sureness(each.models if each else {kind: prior(kind)}, 0.999) for each in maps]
+    of_joined, accepted, refused = Sureness(joined.models, 0.999), 0, 0
+    for _ in range(3000):
+        seen = {name: float(rng.normal(1.5, 3)) for name in sorted({*OF_MAP[kind], *OF_PLACE[kind]})} | {"tried": 1.0}
+        each_accepts = [one.confidence(seen) >= one.threshold(seen) for one in every]
+        if of_joined.confidence(seen) >= of_joined.threshold(seen):
+            assert all(each_accepts)
+            accepted += 1
+        refused += any(each_accepts) and not all(each_accepts)
+    assert min(accepted, refused) > 20
+    assert (joined.asked, joined.accepted) == (
+        sum(each.asked for each in maps if each),
+        min(each.accepted for each in maps if each),
+    )
+    assert "the most cautious of its parts counts" in joined.described()
+
+
+def test_maps_that_cannot_be_joined_are_not_calibrated():
+    other = replace(prior("ahead"), of_map=replace(prior("ahead").of_map, bias=1.0))  # of another version
+    assert of_several([None, None]) is None
+    assert of_several([adapted_to(np.random.default_rng(1), "ahead"), replace(FOUND, models={"ahead": other})]) is None

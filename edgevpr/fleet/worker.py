@@ -1,0 +1,197 @@
+"""The work of one worker of a fleet: a tile is mapped as `map build` maps it.
+
+It depends on its task alone, and a map appears in the folder as a whole: a task can be done again, by another worker
+or by the next run. A tile whose map was made of the same is left as it is."""
+
+import hashlib
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edgevpr import __version__
+from edgevpr.core.config import Config
+from edgevpr.core.errors import EdgevprError, ImageError
+from edgevpr.core.quadkeys import keys_at
+from edgevpr.fleet.index import Tile, path_of, tile_of
+from edgevpr.fleet.photos import Photo, content_in, gather
+from edgevpr.mapmaking.cuttings import NoPlaceError
+from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
+from edgevpr.places.examine import Wanted, select
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.preflight.pick import camera_setting
+
+TECHNIQUE = "cohog"
+MARGIN_M = 150.0  # around a tile: pictures from which its own are refined, and told from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetOrder:
+    """The maps to be made in the folder `out`. `config`: of the flights. `camera`: the way it looks, nadir or forward.
+    `refine`, `calibrate`: see `MapOrder`. `version`: of the edgevpr that asks for them."""
+
+    out: Path
+    config: Config
+    camera: str
+    refine: bool = True
+    calibrate: bool = True
+    version: str = __version__
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TileTask:
+    """A tile to be mapped: its quad key, and what of: `cuttings` of an orthophoto, or `photos`, in the tile and around
+    it, those `inside` by their addresses."""
+
+    key: str
+    cuttings: Cuttings | None = None
+    photos: tuple[Photo, ...] = ()
+    inside: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoneTile:
+    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: nothing of it
+    can be mapped). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used.
+    `problem`: why it could not be mapped (None: it could)."""
+
+    key: str
+    tile: Tile | None = None
+    is_new: bool = False
+    unusable: tuple[str, ...] = ()
+    problem: str | None = None
+
+
+def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
+    """Map one tile; a worker runs this."""
+    if order.version != __version__:  # a worker that has come later
+        problem = f"a worker has edgevpr {__version__}, and {order.version} asks: install the same on all machines"
+        return DoneTile(key=task.key, problem=problem)
+    logging.getLogger("edgevpr").setLevel(logging.ERROR)  # the index says what a tile lacks
+    cv2.setNumThreads(1)  # there is a worker for every core
+    try:
+        with tempfile.TemporaryDirectory(prefix="edgevpr-tile-") as scratch:
+            return _built(task, order, Path(scratch))
+    except NoPlaceError:
+        return DoneTile(key=task.key)
+    except EdgevprError as error:  # as text: not every error can travel
+        return DoneTile(key=task.key, problem=str(error))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Inputs:
+    """All that a tile is mapped from: the `pictures`, the hash of their content and of the settings, and sentences
+    about those of the tile that cannot be used. `is_named` says if a picture of an older map is one of them, by its
+    name, and `inside` which places lie in the tile, and not only near it. `uris`: addresses of photographs, by name."""
+
+    pictures: Cuttings | FlownPictures
+    sha256: str
+    is_named: Callable[[str], bool]
+    inside: Wanted
+    uris: Mapping[str, str] = field(default_factory=dict)
+    unusable: list[str] = field(default_factory=list)
+
+
+def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
+    """Open the ground of a tile. Raises NoPlaceError if it has none."""
+    cuttings = replace(cuttings, margin_m=MARGIN_M if order.calibrate else 0.0)
+    said = repr(replace(cuttings, orthophoto="", area=None))
+    with closing(cuttings.open()) as source:
+        ground = [hashlib.sha256(each).hexdigest() for each in source.ground(cuttings.spacing_m)]
+    of_this = f"{source.short_name}_"
+
+    def inside(place_map: PlaceMap) -> list[int]:
+        place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
+        there: list[int] = place_ids[keys_at(lat_deg, lon_deg, len(key)) == key].astype(int).tolist()
+        return there
+
+    return _Inputs(
+        pictures=cuttings,
+        sha256=_hash_of(order, [said, *ground]),
+        is_named=lambda name: name.startswith(of_this),
+        inside=inside,
+    )
+
+
+def _of_photos(order: FleetOrder, task: TileTask, folder: Path) -> _Inputs:
+    """Bring the photographs of a tile into a folder. Raises NoPlaceError if none of the tile can be used."""
+    folder.mkdir()
+    needs_near = order.refine or order.calibrate
+    found = gather((photo for photo in task.photos if needs_near or photo.uri in task.inside), folder)
+    contents, uris = set(map(content_in, found.named)), {name: photo.uri for name, photo in found.named.items()}
+    return _Inputs(
+        pictures=FlownPictures(source=str(folder)),
+        sha256=_hash_of(order, sorted(found.contents)),
+        is_named=lambda name: content_in(name) in contents,
+        inside=lambda place_map: [
+            place.place_id for place in place_map.places() if uris[place.source_image] in task.inside
+        ],
+        uris=uris,
+        unusable=[text for uri, text in found.unusable.items() if uri in task.inside],
+    )
+
+
+def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
+    target, folder = path_of(order.out, task.key), scratch / "pictures"
+    inputs = _of_orthophoto(order, task.key, task.cuttings) if task.cuttings else _of_photos(order, task, folder)
+    unusable = inputs.unusable
+    if target.exists() and (there := tile_of(target)).inputs_sha256 == inputs.sha256:
+        return DoneTile(key=task.key, tile=there, unusable=tuple(unusable))
+    if lost := _lost(target, inputs.is_named):
+        return DoneTile(key=task.key, problem=lost, unusable=tuple(unusable))
+    if task.photos and not task.inside.intersection(inputs.uris.values()):
+        return DoneTile(key=task.key, unusable=tuple(unusable))
+
+    def say(error: ImageError) -> None:
+        name = next((name for name in inputs.uris if f"{folder / name}" in str(error)), None)
+        if name is None or inputs.uris[name] in task.inside:  # a neighbour tells of its own
+            unusable.append(str(error).replace(f"{folder / name}", inputs.uris[name]) if name else str(error))
+
+    path, whole = scratch / "inside.gpkg", scratch / "map.gpkg"
+    ordered = MapOrder(
+        path=str(whole),
+        pictures=inputs.pictures,
+        technique=TECHNIQUE,
+        parameters={name: str(value) for name, value in camera_setting(TECHNIQUE, order.camera).items()},
+        refine=order.refine,
+        calibrate=order.calibrate,
+    )
+    make_map(ordered, order.config, say, lambda items, *_: items)
+    if not select(whole, path, inputs.inside):
+        return DoneTile(key=task.key, unusable=tuple(unusable))
+    with PlaceMap.open_for_adding(path) as place_map:
+        place_map.record_inputs(inputs.sha256)
+    unfinished = target.with_name(f".{target.name}.{scratch.name}")
+    try:
+        shutil.copyfile(path, unfinished)
+        unfinished.replace(target)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return DoneTile(key=task.key, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
+
+
+def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
+    """Return why a tile's map is not to be replaced: it has pictures that the task does not name (None: none)."""
+    if not target.exists():
+        return None
+    with PlaceMap.open(target) as place_map:
+        lost = sorted(place.source_image for place in place_map.places() if not is_named(place.source_image))
+    if not lost:
+        return None
+    return (
+        f"its map has {len(lost)} pictures that this run does not name, such as {lost[0]}: name their folders and "
+        f"tables too, map into another folder, or remove {target.name}"
+    )
+
+
+def _hash_of(order: FleetOrder, texts: Iterable[str]) -> str:
+    """Return the hash of an order's settings and of texts about pictures."""
+    source, salience = order.config.source, order.config.salience
+    settings = source, salience, order.config.match, order.refine, order.calibrate
+    return hashlib.sha256("\n".join([repr(settings), *texts]).encode()).hexdigest()
