@@ -234,7 +234,7 @@ def draw_index(maps: Path, path: Path) -> Row:
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
 
-    file = maps / index.NAME
+    file = maps / index.INDEX
     info, tiles = pyogrio.read_info(file), index.tiles_in(maps)
     regions: dict[tuple[int, int], list[str]] = {}
     for key in tiles:

@@ -17,9 +17,10 @@ from edgevpr.core.errors import MapError
 from edgevpr.core.quadkeys import extent_of_key, maps_in
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
+from edgevpr.places.tilemap import INDEX
 from edgevpr.runtime.recognise.evidence import calibration_of
 
-NAME, _LAYER = "index.gpkg", "tiles"
+_LAYER = "tiles"
 _KINDS: Mapping[str, type] = {str(int): np.int64, str(float | None): np.float64}  # of columns; others are texts
 
 
@@ -72,7 +73,7 @@ def technique_text(spec: TechniqueSpec) -> str:
 def tiles_in(folder: Path) -> dict[str, Tile]:
     """Return the tiles of a folder by their keys: those of the index, and those whose maps are there and that it lacks.
     Raises MapError."""
-    found = _read(folder / NAME)
+    found = _read(folder / INDEX)
     return {key: found[key] if key in found else tile_of(path) for key, path in maps_in(folder).items()}
 
 
@@ -83,7 +84,7 @@ def write(folder: Path, tiles: Iterable[Tile]) -> None:
     outlines = [shapely.to_wkb(shapely.box(west, south, east, north)) for south, west, north, east in extents]
     columns = list(zip(*map(astuple, tiles), strict=True)) or [() for _ in fields(Tile)]
     kinds = [_KINDS.get(str(field.type), object) for field in fields(Tile)]
-    unfinished = folder / f".{os.getpid()}.{NAME}"
+    unfinished = folder / f".{os.getpid()}.{INDEX}"
     pyogrio.raw.write(
         unfinished,
         np.array(outlines, object),
@@ -94,7 +95,7 @@ def write(folder: Path, tiles: Iterable[Tile]) -> None:
         geometry_type="Polygon",
         crs="EPSG:4326",
     )
-    unfinished.replace(folder / NAME)
+    unfinished.replace(folder / INDEX)
 
 
 def _read(path: Path) -> Mapping[str, Tile]:

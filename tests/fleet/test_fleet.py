@@ -134,7 +134,7 @@ def test_every_place_of_an_orthophoto_is_in_one_tile(tiled, orthophoto):
 
 def test_the_index_shows_the_tiles_in_any_program(tiled):
     out, _, _ = tiled
-    info = pyogrio.read_info(out / index.NAME)
+    info = pyogrio.read_info(out / index.INDEX)
     assert (info["layer_name"], info["geometry_type"], info["crs"]) == ("tiles", "Polygon", "EPSG:4326")
     found = index.tiles_in(out)
     assert {key: tile.places for key, tile in found.items()} == {key: len(each) for key, each in places_of(out).items()}
@@ -149,7 +149,7 @@ def test_the_index_shows_the_tiles_in_any_program(tiled):
 def test_the_index_is_made_anew_of_the_tiles_where_it_is_lost(tiled):
     out, _, _ = tiled
     before = index.tiles_in(out)
-    (out / index.NAME).unlink()
+    (out / index.INDEX).unlink()
     assert index.tiles_in(out) == before
     index.write(out, before.values())
     assert index.tiles_in(out) == before

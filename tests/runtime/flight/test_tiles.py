@@ -50,7 +50,8 @@ def tiles(tmp_path_factory):
         build_map(map(frame, range(PLACES)), TECHNIQUE, place_map, meter_of(load_config(None), load_board("this")))
     keys = keys_at(50 + np.arange(PLACES) * STEP_DEG, np.full(PLACES, 8.0), ZOOM)
     for key in set(keys.tolist()):
-        select(folder / "whole.gpkg", folder / f"{key}.gpkg", lambda place, key=key: keys[place.place_id - 1] == key)
+        there = (np.flatnonzero(keys == key) + 1).tolist()
+        select(folder / "whole.gpkg", folder / f"{key}.gpkg", lambda place_map, there=there: there)
     (folder / "whole.gpkg").unlink()
     return folder
 
