@@ -115,10 +115,12 @@ from-space: $(VENV)/installed
 	$(BIN)/python benchmarks/from_space.py
 	$(BIN)/python benchmarks/seams.py
 
-# Map making by one worker and by two, into benchmarks/results/: ten minutes.
+# Map making by one worker and by two, and what several flights leave of their maps, into benchmarks/results/: twenty
+# minutes.
 bench-fleet: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fleet]'
 	$(BIN)/python benchmarks/bench_fleet.py
+	$(BIN)/python benchmarks/passes.py
 
 # The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
 # qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.

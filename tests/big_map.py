@@ -39,7 +39,7 @@ def make_big_map(
         db.execute("PRAGMA journal_mode = OFF")  # a file that nobody has seen yet is in no danger
         points = _grid(places, corner_deg, step_deg)
         db.executemany(_INSERT, _rows(spec, points, np.random.default_rng(seed)))
-        db.execute(geopackage.GROW_EXTENT, {"lat": corner_deg[0], "lon": corner_deg[1]})
+        db.execute(geopackage.GROW_EXTENT, {"table": "places", "lat": corner_deg[0], "lon": corner_deg[1]})
     db.close()
 
 

@@ -11,6 +11,7 @@ from edgevpr.core.text import progress
 
 _PLACES_PER_TILE = 10_000
 _MOST_TOLD = 10  # tiles that are not mapped: a store that is away says the same of each
+_OF_PASSES = ("merged", "faded", "changed")  # of several flights over the same ground
 
 
 def add(commands: Any) -> None:
@@ -71,6 +72,7 @@ def fleet_build(args: Namespace) -> int:
         "mapped_now": sum(each.is_new for each in done),
         "places": sum(each.tile.places for each in done if each.tile),
         "not_calibrated": sum(each.tile.expected is None for each in done if each.tile),
+        **{name: sum(getattr(each.tile, name) for each in done if each.tile) for name in _OF_PASSES},
         "without_position": without_position,
         "unusable": unusable,
         "problems": problems,
@@ -87,6 +89,11 @@ def _said(result: dict[str, Any]) -> list[str]:
     ]
     if result["not_calibrated"]:
         lines.append(f"  {result['not_calibrated']} tiles are not calibrated: they fly with the shipped confidence")
+    if any(result[name] for name in _OF_PASSES):
+        lines.append(
+            f"  of several flights over the same ground: {result['merged']} places became part of others, "
+            f"{result['faded']} faded; changed spots: {result['changed']} (layer `changes` of the tiles)"
+        )
     if result["without_position"]:
         lines.append(f"  left out: {result['without_position']} photographs without a position")
     if result["unusable"]:

@@ -4,7 +4,7 @@ It is written anew as a whole, and whatever it says is in the tiles' own files t
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import shapely
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.quadkeys import extent_of_key, maps_in
+from edgevpr.places.history import counts_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.tilemap import INDEX
@@ -29,8 +30,9 @@ class Tile:
     """A tile of the grid that is mapped. `key`: its quad key; its map is KEY.gpkg in the folder of the index. `places`:
     their number. `inputs_sha256`: hash of all that the map was made of. `first_time`, `last_time`: of its pictures, in
     UTC. `expected`: share (0..1) of changed pictures of places in it and around it that was accepted when it was
-    calibrated, at the `precision` wanted. None: unknown. `technique`: its name and parameters.
-    `file_bytes`: size of the map."""
+    calibrated, at the `precision` wanted. None: unknown. `technique`: its name and parameters. `file_bytes`: size of
+    the map. `passes`: flights over the same ground that were compared; `merged`, `faded`: places that became part of
+    another, or that no later flight found; `changed`: spots where one did not find earlier ground."""
 
     key: str
     places: int
@@ -41,6 +43,10 @@ class Tile:
     precision: float | None
     technique: str
     file_bytes: int
+    passes: int = 0
+    merged: int = 0
+    faded: int = 0
+    changed: int = 0
 
 
 def path_of(folder: Path, key: str) -> Path:
@@ -52,6 +58,7 @@ def tile_of(path: Path) -> Tile:
     """Read what the index says of a tile from its map. Raises MapError."""
     with PlaceMap.open(path) as place_map:
         info, calibration, inputs = info_of(place_map), calibration_of(place_map), place_map.inputs_sha256
+        counts = counts_of(place_map)
     return Tile(
         key=path.stem,
         places=info.places,
@@ -62,6 +69,7 @@ def tile_of(path: Path) -> Tile:
         precision=calibration.precision if calibration else None,
         technique=technique_text(info.spec),
         file_bytes=info.file_bytes,
+        **asdict(counts),
     )
 
 

@@ -23,7 +23,9 @@ from edgevpr.fleet.index import Tile, path_of, tile_of
 from edgevpr.fleet.photos import Photo, content_in, gather
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
+from edgevpr.mapmaking.passes import history_of
 from edgevpr.places.examine import Wanted, select
+from edgevpr.places.history import History, removed_from, write_history
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
 
@@ -163,10 +165,18 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         calibrate=order.calibrate,
     )
     make_map(ordered, order.config, say, lambda items, *_: items)
-    if not select(whole, path, inputs.inside):
+    folders = {name: uri.rpartition("/")[0] for name, uri in inputs.uris.items()}
+    history = history_of(whole, inputs.pictures, order.config, folders, inputs.inside) if folders else History()
+
+    def kept(place_map: PlaceMap) -> list[int]:
+        inside = place_map.places(inputs.inside(place_map))
+        return [place.place_id for place in inside if place.source_image not in history.removed]
+
+    if not select(whole, path, kept):
         return DoneTile(key=task.key, unusable=tuple(unusable))
     with PlaceMap.open_for_adding(path) as place_map:
         place_map.record_inputs(inputs.sha256)
+        write_history(place_map, history)
     unfinished = target.with_name(f".{target.name}.{scratch.name}")
     try:
         shutil.copyfile(path, unfinished)
@@ -181,7 +191,8 @@ def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
     if not target.exists():
         return None
     with PlaceMap.open(target) as place_map:
-        lost = sorted(place.source_image for place in place_map.places() if not is_named(place.source_image))
+        names = [*(place.source_image for place in place_map.places()), *removed_from(place_map)]
+    lost = sorted(name for name in names if not is_named(name))
     if not lost:
         return None
     return (

@@ -176,7 +176,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 technique,
                 place_map,
                 meter_of(config, here),
-                replace(_preparation(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
+                replace(preparation_of(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
@@ -269,7 +269,7 @@ def calibrate_map(
         meter_of(config, load_board("this")),
         frames,
         lambda asked, total: shown(asked, total, "calibrating"),
-        _preparation(config, pictures, technique),
+        preparation_of(config, pictures, technique),
     )
 
 
@@ -296,7 +296,7 @@ def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None, mask: M
     return source, made_for(here.threads, name, settings)
 
 
-def _preparation(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
+def preparation_of(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
     """Return the steps before encoding: overlay mask and levelling. Pictures cut from an orthophoto need neither."""
     if isinstance(pictures, Cuttings):
         return Preparation()

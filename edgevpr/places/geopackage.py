@@ -57,12 +57,27 @@ INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_i
 INSERT INTO gpkg_geometry_columns VALUES ('places', 'geom', 'POINT', {WGS84}, 0, 0);
 """
 
-# The layer's extent grows with every place, in the same transaction.
+# What several flights have said of the same ground (see `history`): tables that a map may lack.
+CHANGES = "geom, from_time, to_time, confidence, from_image, to_image"
+_FID = "fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"
+HISTORY = (
+    f"CREATE TABLE passes ({_FID}, name TEXT NOT NULL, first_time DATETIME, last_time DATETIME)",
+    f"CREATE TABLE removed ({_FID}, source_image TEXT NOT NULL, place_id INTEGER)",
+    f"""CREATE TABLE changes ({_FID}, geom POINT NOT NULL, from_time DATETIME, to_time DATETIME,
+    confidence DOUBLE NOT NULL, from_image TEXT NOT NULL, to_image TEXT NOT NULL)""",
+    f"""INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES
+    ('passes', 'attributes', 'passes', 'flights that were compared', NULL),
+    ('removed', 'attributes', 'removed', 'pictures that are part of another place, or have faded', NULL),
+    ('changes', 'features', 'changes', 'spots where a later flight did not find earlier ground', {WGS84})""",
+    f"INSERT INTO gpkg_geometry_columns VALUES ('changes', 'geom', 'POINT', {WGS84}, 0, 0)",
+)
+
+# A layer's extent grows with every point, in the same transaction.
 GROW_EXTENT = """
 UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
     min_x = min(coalesce(min_x, :lon), :lon), max_x = max(coalesce(max_x, :lon), :lon),
     min_y = min(coalesce(min_y, :lat), :lat), max_y = max(coalesce(max_y, :lat), :lat)
-WHERE table_name = 'places'
+WHERE table_name = :table
 """
 
 # The spatial index of the standard (OGC 12-128r18, annex F.3): an R-tree, and triggers that follow every change of the

@@ -213,7 +213,7 @@ class PlaceMap(MapConnection):
                 yield place_id, lat_deg, lon_deg, rows.quality_of(content)
 
     def _grow_extent(self, lat_deg: float, lon_deg: float) -> None:
-        self.db.execute(geopackage.GROW_EXTENT, {"lat": lat_deg, "lon": lon_deg})
+        self.db.execute(geopackage.GROW_EXTENT, {"table": "places", "lat": lat_deg, "lon": lon_deg})
 
     def _text_beside(self, key: str) -> str | None:
         """Return the text stored under `key` in the table edgevpr_map; None if there is none or it cannot be read."""

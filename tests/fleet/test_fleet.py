@@ -2,6 +2,7 @@
 
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import overflown
 import pytest
 import rasterio
 from pictures import textured
@@ -332,6 +334,33 @@ def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
     found = photos.gather(photos.photos_of([str(tmp_path / "a"), str(table)]), tmp_path / "here")
     assert len(found.named) == 1
     assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
+
+
+def test_flights_over_the_same_ground_become_one_map_which_the_index_tells_of(cluster, tmp_path, capsys):
+    days = [str(tmp_path / day) for day in ("monday", "tuesday", "wednesday")]
+    same, other = overflown.ground(1), overflown.ground(2)
+    for number, (day, last) in enumerate(zip(days, (same, same, other), strict=True)):
+        overflown.fly(Path(day), [same, same, same, last], number, 1.7e9 + number * overflown.DAY_S)
+    words = ["--camera", "nadir", "--fov-deg", str(overflown.FOV_DEG), "--no-refine", "--no-calibrate"]
+    build = ["fleet", "build", str(tmp_path / "maps"), *words, "--scheduler", cluster.address, "--images"]
+    assert main([*build, *days]) == 0
+    assert "7 places became part of others, 0 faded; changed spots: 1" in capsys.readouterr().out
+    tiles = index.tiles_in(tmp_path / "maps").values()
+    assert [sum(getattr(tile, name) for tile in tiles) for name in ("places", "merged", "changed")] == [5, 7, 1]
+    assert {tile.passes for tile in tiles} == {3}
+    (tmp_path / "maps" / "index.gpkg").unlink()
+    assert list(index.tiles_in(tmp_path / "maps").values()) == list(tiles)
+    index.write(tmp_path / "maps", tiles)
+    with closing(sqlite3.connect(tmp_path / "maps" / "index.gpkg")) as db:  # as versions before have written it
+        db.execute("ALTER TABLE tiles DROP COLUMN passes")
+        db.commit()
+    assert {tile.passes for tile in index.tiles_in(tmp_path / "maps").values()} == {0}
+    assert main([*build, *days, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["mapped_now"] == 0
+    # A flight all of whose pictures are part of others' places is missed, too.
+    kept = {name.split("_")[0] for names in places_of(tmp_path / "maps").values() for name in names}
+    assert main([*build, *(day for day in days if Path(day).name in kept)]) == 1
+    assert "that this run does not name" in capsys.readouterr().out
 
 
 def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
