@@ -117,15 +117,15 @@ def tile_at(tile_map, place):
 @pytest.mark.slow
 def test_the_tiles_around_the_aircraft_are_in_ram_and_no_others(folder, tmp_path):
     flight = TiledFlight(folder, tmp_path / "log")
-    way = [0, 0, 0, *range(PLACES)]
+    way = [0] * 4 + [place for place in range(PLACES // 2) for _ in range(2)]
     queries = flight.fly(way)
     found = [line for line in queries if line["accepted"]]
     assert len(found) > 0.6 * len(way)
     assert all(line["position"]["lat_deg"] == pytest.approx(50 + int(line["query"]) * STEP_DEG) for line in found)
-    assert all(tile_at(flight.map, place) in held for place, held in list(zip(way, flight.held, strict=True))[3:])
+    assert all(tile_at(flight.map, place) in held for place, held in list(zip(way, flight.held, strict=True))[4:])
     assert max(map(len, flight.held)) <= 5
     assert flight.map.capacity == 6, "the budget is never exceeded: it is all that was allocated"
-    assert len(of_kind(flight.lines, "tiles")) > 8
+    assert len(of_kind(flight.lines, "tiles")) > 5
 
 
 @pytest.mark.slow
