@@ -75,7 +75,9 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
     if order.version != __version__:  # a worker that has come later
         problem = f"a worker has edgevpr {__version__}, and {order.version} asks: install the same on all machines"
         return DoneTile(key=task.key, problem=problem)
-    logging.getLogger("edgevpr").setLevel(logging.ERROR)  # the index says what a tile lacks
+    log = logging.getLogger("edgevpr")
+    level_before = log.level
+    log.setLevel(logging.ERROR)  # the index says what a tile lacks
     cv2.setNumThreads(1)  # there is a worker for every core
     try:
         with tempfile.TemporaryDirectory(prefix="edgevpr-tile-") as scratch:
@@ -84,6 +86,8 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
         return DoneTile(key=task.key)
     except EdgevprError as error:  # as text: not every error can travel
         return DoneTile(key=task.key, problem=str(error))
+    finally:
+        log.setLevel(level_before)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
