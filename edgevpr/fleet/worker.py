@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from edgevpr import __version__
 from edgevpr.core.config import Config
@@ -24,7 +23,7 @@ from edgevpr.fleet.photos import Photo, content_in, gather
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
 from edgevpr.mapmaking.passes import history_of
-from edgevpr.places.examine import Wanted, select
+from edgevpr.places.examine import Wanted, positions_in, select
 from edgevpr.places.history import History, removed_from, write_history
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
@@ -113,8 +112,8 @@ def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
     of_this = f"{source.short_name}_"
 
     def inside(place_map: PlaceMap) -> list[int]:
-        place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
-        there: list[int] = place_ids[keys_at(lat_deg, lon_deg, len(key)) == key].astype(int).tolist()
+        place_ids, lat_deg, lon_deg = positions_in(place_map)
+        there: list[int] = place_ids[keys_at(lat_deg, lon_deg, len(key)) == key].tolist()
         return there
 
     return _Inputs(

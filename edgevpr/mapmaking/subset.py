@@ -15,7 +15,7 @@ from edgevpr.core.geodesy import offset_m, shorter_deg, to_lines_m
 from edgevpr.core.quadkeys import extent_of_key, maps_in
 from edgevpr.mapmaking.missions import Area
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import Watch, merge, select, shrink
+from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text, of_several
 
@@ -42,8 +42,8 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     paths, calibrations = _maps_near(source, area, margin_m), list[MapCalibration | None]()
 
     def wanted(place_map: PlaceMap) -> list[int]:
-        place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
-        there: list[int] = place_ids[near_of(area, margin_m, lat_deg, lon_deg)].astype(int).tolist()
+        place_ids, lat_deg, lon_deg = positions_in(place_map)
+        there: list[int] = place_ids[near_of(area, margin_m, lat_deg, lon_deg)].tolist()
         if there:
             calibrations.append(calibration_of(place_map))
         return there

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
@@ -31,6 +32,13 @@ class Examined(NamedTuple):
 
 
 Wanted = Callable[[PlaceMap], Collection[int] | None]  # the ids of the places of a map that are wanted; None: all
+
+
+def positions_in(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
+    """Return the ids, int (N,), and the positions, float64 (N,) each, of the readable places; NaN: unknown."""
+    place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
+    return place_ids.astype(int), lat_deg, lon_deg
+
 
 # Called with the places that are read, their number and a label; yields the places unchanged and shows the progress.
 Watch = Callable[[Iterable[Examined], int, str], Iterable[Examined]]

@@ -131,7 +131,8 @@ class TileMap:
         """Search a tile that has been loaded from now on."""
         self._index.add(loaded.tile, loaded.places)
         self._held[loaded.tile] = loaded
-        self._note_left_out(loaded.tile)
+        for own_id, problem in loaded.place_map.left_out.items():
+            self.left_out.setdefault(loaded.tile * _OF_TILE + own_id, problem)
 
     def drop(self, tile: int) -> None:
         """Search a tile no more, and free its room. No tile may be loading meanwhile."""
@@ -232,10 +233,6 @@ class TileMap:
             yield self._held[tile].place_map, own_id
         except PlaceError as error:
             raise PlaceError(self._held[tile].place_map.path, int(place_id), error.problem) from error
-
-    def _note_left_out(self, tile: int) -> None:
-        for own_id, problem in self._held[tile].place_map.left_out.items():
-            self.left_out.setdefault(tile * _OF_TILE + own_id, problem)
 
 
 def own_number(place_id: int) -> int:

@@ -132,7 +132,8 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
         elif kind == "between":
             flight.between += [line] if point(line) else []
         elif kind == "tiles":
-            flight.tiles.update(map(str, line["held"]))
+            held = value(line, "held")
+            flight.tiles.update(map(str, held) if isinstance(held, list) else ())
         else:
             flight.remarks.append((t_s, str(kind), _words(line)))
     return flight

@@ -106,6 +106,16 @@ def test_values_of_a_wrong_type_are_unknown(tmp_path):
     assert known == (None,) * 6
 
 
+def test_tiles_are_those_that_were_ever_in_ram(tmp_path):
+    lines = [
+        ("tiles", {"held": ["120", "121"]}),
+        ("tiles", {"held": ["121", "123"]}),
+        ("tiles", {}),
+        ("tiles", {"held": 5}),
+    ]
+    assert read_flight(write_log(tmp_path / "log", *lines)).tiles == {"120", "121", "123"}
+
+
 def test_lines_of_note_are_kept_in_their_words(tmp_path):
     lines = [
         ("camera", {"said": "camera shows nothing"}),

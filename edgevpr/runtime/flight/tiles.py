@@ -95,11 +95,12 @@ class Tiles:
         away_m[list(self._map.held)] -= _HELD_NEARER * side_m
         wanted, room = list[int](), self._map.capacity
         for tile in np.argsort(away_m, kind="stable").tolist():
+            if tile in self._unusable:
+                continue
             room -= self._places(tile)
             if away_m[tile] > area.radius_m + side_m or room < 0:
                 break
-            if tile not in self._unusable:
-                wanted.append(tile)
+            wanted.append(tile)
         return wanted
 
     def _near(self, area: Reach) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ from edgevpr.runtime.preflight.choose import (
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import counted_work, on_board
-from edgevpr.runtime.recognise.opening import budget_mb, made_for, searched_places
+from edgevpr.runtime.recognise.opening import budget_mb, made_for, places_in_ram, searched_places
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import weights_of
 
@@ -82,7 +82,7 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     parts = ["the map was built with it" if config.technique is None else "it was named"]
     if weights := weights_of(technique.spec):
         parts.append(f"weights of {weights}")
-    if left_out := len(recogniser.place_map) - searched_places(recogniser):
+    if left_out := len(recogniser.place_map) - places_in_ram(recogniser):
         parts.append(f"{left_out} places are left to the map file")
     if candidates != usual:
         parts.append(f"{candidates} candidates instead of {usual}")

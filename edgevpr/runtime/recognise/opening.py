@@ -87,12 +87,17 @@ def _require_flight(config: Config, is_flight: bool) -> None:
         raise UsageError(f"{config.map} is a folder of maps, in which no sequences are matched: leave them out.")
 
 
+def places_in_ram(recogniser: Recogniser) -> int:
+    """Return the number of places in RAM; of tiles, the most that can be."""
+    place_map = recogniser.place_map
+    return place_map.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
+
+
 def searched_places(recogniser: Recogniser) -> int:
     """Return the number of places that a query is compared with: all in RAM or, of tiles, the places of one."""
     place_map = recogniser.place_map
-    if isinstance(place_map, TileMap):
-        return min(int(place_map.places_of.max()), place_map.capacity)
-    return len(recogniser.index)
+    of_a_tile = int(place_map.places_of.max()) if isinstance(place_map, TileMap) else len(recogniser.index)
+    return min(of_a_tile, places_in_ram(recogniser))
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
