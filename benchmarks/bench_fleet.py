@@ -1,11 +1,11 @@
 """How map making grows with the workers: `make bench-fleet`, or `python benchmarks/bench_fleet.py --large`.
 
-`edgevpr fleet build` maps tiles of the raster `before` of sat_marash by the workers of Dask on this computer, each a
-process of one thread. The places lie 62 or 31 m apart (--large: 9.6 m, too), and are not calibrated. The serial part
-and the shared one are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in
-so small a job the serial part is mostly the wait for the last tile. The projection holds for a job of this size, and
-assumes that nothing else grows with the workers: that the store gives each of them its pictures as fast as a local disk
-gives them to one.
+`edgevpr fleet build` maps two grounds by the workers of Dask on this computer, each a process of one thread: tiles of
+the raster `before` of sat_marash, with places 62 or 31 m apart, and photographs as in `fleet_show.py`, 1,000 and 10,000
+(--large: 100,000, too, by two workers). They are not calibrated, and not refined. The serial part and the shared one
+are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in a small job the
+serial part is mostly the wait for the last tile. The projection holds for a job of this size, and assumes that nothing
+else grows with the workers: that the store gives each of them its pictures as fast as a local disk gives them to one.
 Read and written is what the workers asked Linux for, page cache and logs included. RAM is the peak of the largest
 worker.
 """
@@ -14,21 +14,26 @@ import argparse
 import resource
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import base
 import psutil
 from base import Row
+from fleet_show import write_pictures
 
 from edgevpr.core.config import load_config
+from edgevpr.core.text import progress
 from edgevpr.fleet import building
-from edgevpr.fleet.worker import FleetOrder
+from edgevpr.fleet.photos import photos_of
+from edgevpr.fleet.worker import FleetOrder, TileTask
 from edgevpr.mapmaking.making import Cuttings
 
-SET, FOOTPRINT_M, PER_TILE = "sat_marash", 156.0, 100
-SPACINGS_M, WORKERS, PROJECTED, LARGE = (62.0, 31.0), (1, 2), (10, 100), 10_000_000
-LARGE_SPACING_M = 9.6  # 10,000 places: half an hour of two cores. 100,000 would take them half a day
+SET, FOOTPRINT_M, SPACINGS_M, PER_TILE = "sat_marash", 156.0, (62.0, 31.0), 100
+PHOTOGRAPHS, LARGE_PHOTOGRAPHS, PHOTOGRAPHS_PER_TILE = (1000, 10_000), 100_000, 500
+WORKERS, PROJECTED, ON_PAPER = (1, 2), (10, 100), 10_000_000
 _COLUMNS = {
+    "ground": "{ground}",
     "places": "{places}",
     "tiles": "{tiles}",
     "workers": "{workers}",
@@ -39,6 +44,13 @@ _COLUMNS = {
     "written KB a place": "{written_kb:.0f}",
     "RAM of a worker MB": "{ram_mb:.0f}",
 }
+_PAPER = {
+    "ground": "{ground}",
+    "hours of one core": "{alone_h:.0f}",
+    "hours of a hundred, with the efficiency of two": "{hundred_h:.1f}",
+    "read TB": "{read_tb:.2f}",
+    "written TB": "{written_tb:.2f}",
+}
 
 
 def used() -> tuple[int, int, int]:
@@ -47,10 +59,9 @@ def used() -> tuple[int, int, int]:
     return counted.read_chars, counted.write_chars, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def measure(path: Path, spacing_m: float, workers: int, out: Path) -> Row:
+def measure(tasks: Sequence[TileTask], workers: int, out: Path) -> Row:
     from dask.distributed import Client, LocalCluster
 
-    cuttings = Cuttings(orthophoto=str(path), footprint_m=FOOTPRINT_M, spacing_m=spacing_m)
     order = FleetOrder(out=out, config=load_config(None), camera="nadir", refine=False, calibrate=False)
     with (
         LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
@@ -58,19 +69,33 @@ def measure(path: Path, spacing_m: float, workers: int, out: Path) -> Row:
     ):
         client.wait_for_workers(workers)
         began_s = time.perf_counter()
-        tasks = building.tasks_of_orthophoto(cuttings, PER_TILE, None)
-        done = list(building.build(order, tasks, cluster.scheduler_address, None, lambda items, *_: items))
+        done = list(building.build(order, tasks, cluster.scheduler_address, None, progress))
         wall_s = time.perf_counter() - began_s
         read, written, ram = zip(*client.run(used).values(), strict=True)
     places = sum(each.tile.places for each in done if each.tile)
     found: Row = {
+        "ground": "photographs" if tasks[0].photos else "raster",
         "places": places,
         "tiles": sum(bool(each.tile) for each in done),
         "workers": workers,
         "wall_s": wall_s,
     }
     found |= {"read_kb": sum(read) / places / 1e3, "written_kb": sum(written) / places / 1e3, "ram_mb": max(ram) / 1e6}
+    print(found, flush=True)
     return found | {"per_s": places / wall_s}
+
+
+def tasks_of_raster(spacing_m: float) -> list[TileTask]:
+    (folder,) = base.find_sets(names=[SET])
+    path = folder / "raster" / "before.vrt"
+    cuttings = Cuttings(orthophoto=str(path), footprint_m=FOOTPRINT_M, spacing_m=spacing_m)
+    return building.tasks_of_orthophoto(cuttings, PER_TILE, None)
+
+
+def tasks_of_photographs(count: int, folder: Path) -> list[TileTask]:
+    write_pictures(folder, count)
+    photos = photos_of(sorted(map(str, folder.iterdir())))
+    return building.tasks_of_photos(photos, PHOTOGRAPHS_PER_TILE, None)[0]
 
 
 def projected(one: Row, two: Row) -> list[Row]:
@@ -79,6 +104,7 @@ def projected(one: Row, two: Row) -> list[Row]:
     shared_s = one["wall_s"] - serial_s
     rows = [one, two] + [
         {
+            "ground": one["ground"],
             "places": one["places"],
             "workers": f"{count} (projected)",
             "wall_s": serial_s + shared_s / count,
@@ -94,33 +120,49 @@ def projected(one: Row, two: Row) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--large", action="store_true")
-    spacings_m = (*SPACINGS_M, *((LARGE_SPACING_M,) if parser.parse_args().large else ()))
-    (folder,) = base.find_sets(names=[SET])
-    path, rows = folder / "raster" / "before.vrt", []
-    with tempfile.TemporaryDirectory(prefix="edgevpr-fleet-") as work:
-        for spacing_m in spacings_m:
-            both = [measure(path, spacing_m, count, Path(work) / f"{spacing_m:g} {count}") for count in WORKERS]
-            print(*both, sep="\n", flush=True)
-            rows += projected(*both)
-    found = {**base.made_by(), "rows": rows}
+    parser.add_argument("--large", action="store_true", help=f"map {LARGE_PHOTOGRAPHS:,} photographs, too")
+    large, rows = parser.parse_args().large, []
+    with tempfile.TemporaryDirectory(prefix="edgevpr-fleet-") as made:
+        work = Path(made)
+        for spacing_m in SPACINGS_M:
+            tasks = tasks_of_raster(spacing_m)
+            rows += projected(*[measure(tasks, count, work / f"maps {spacing_m:g} {count}") for count in WORKERS])
+        for number in PHOTOGRAPHS:
+            tasks = tasks_of_photographs(number, work / f"{number}")
+            rows += projected(*[measure(tasks, count, work / f"maps {number} {count}") for count in WORKERS])
+        if large:
+            tasks = tasks_of_photographs(LARGE_PHOTOGRAPHS, work / "large")
+            rows.append(measure(tasks, WORKERS[-1], work / "large maps"))
+    found = {**base.made_by(), "large": large, "rows": rows}
     base.write("fleet", found, page(found))
 
 
+def on_paper(ground: str, rows: Sequence[Row]) -> Row:
+    """Return the cost of a job of `ON_PAPER` places, from the largest job that one worker has done, and two."""
+    one, two = [[row for row in rows if row["ground"] == ground and row["workers"] == count][-1] for count in WORKERS]
+    pair = [row for row in rows if row["ground"] == ground and row["places"] == one["places"]][1]
+    alone_h = ON_PAPER / one["per_s"] / 3600
+    return {
+        "ground": ground,
+        "alone_h": alone_h,
+        "hundred_h": alone_h / 100 / pair["efficiency"],
+        "read_tb": ON_PAPER * two["read_kb"] / 1e9,
+        "written_tb": ON_PAPER * two["written_kb"] / 1e9,
+    }
+
+
 def page(found: Row) -> str:
-    one, two = [row for row in found["rows"] if row["places"] == found["rows"][-1]["places"]][:2]
-    alone_h = LARGE / one["per_s"] / 3600
     return f"""# Map making by many workers
 
 {base.told(__doc__)}
 
-{base.table(found["rows"], _COLUMNS)}
+{base.table(found["rows"], _COLUMNS, left=1)}
 
-On paper: ten million places, 30 m apart over 9,000 km2, take {alone_h:.0f} hours of one core of this machine, and write
-{LARGE * two["written_kb"] / 1e9:.2f} TB; a hundred cores with the efficiency of two take
-{alone_h / 100 / two["efficiency"]:.1f} hours.
+On paper, {ON_PAPER:,} places, from the largest job that one worker and two have done:
 
-{base.made_line(found, "make bench-fleet")}
+{base.table(map(on_paper, ("raster", "photographs"), 2 * [found["rows"]]), _PAPER)}
+
+{base.made_line(found, f"python benchmarks/bench_fleet.py{' --large' * found['large']}")}
 """
 
 
