@@ -94,19 +94,21 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     from edgevpr.runtime.recognise.opening import budget_mb
 
     config = config_of(args)
-    places, camera = args.places, config.source.camera
+    places, searched, camera = args.places, None, config.source.camera
     if args.map:
         is_folder = Path(args.map).is_dir()
         with closing(TileMap.open(args.map) if is_folder else PlaceMap.open(args.map)) as place_map:
             places, spec = len(place_map), place_map.spec
-        if is_folder:  # of which as much is in RAM as there is room for
-            places = min(places, int(1e6 * budget_mb(config, board)) // bytes_per_place(spec))
+            if isinstance(place_map, TileMap):  # of which as much is in RAM as there is room for
+                places = min(places, int(1e6 * budget_mb(config, board)) // bytes_per_place(spec))
+                searched = place_map.most_searched
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
         wanted = offers((spec.name,), settings={spec.name: spec.parameters})
     else:
         wanted = offers(techniques.names(), settings={n: camera_setting(n, camera) for n in techniques.names()})
     plan = FlightPlan(
         places=places,
+        searched=searched,
         rate_hz=config.source.rate_hz or board.rate_hz,
         flight_min=args.flight_min,
         pack=parse_pack(config.battery.pack),

@@ -28,6 +28,7 @@ from edgevpr.places.tileindex import TileIndex
 
 INDEX = "index.gpkg"  # of a folder: its table `tiles` has for each its key, places, and the hash of its inputs
 _OF_TILE = 1 << 32
+_AT_A_CORNER = 4  # tiles
 _CACHE_KB = 256  # of pages of a file, which SQLite keeps: a place is read once
 
 
@@ -84,6 +85,11 @@ class TileMap:
     def capacity(self) -> int:
         """The number of places for which there is room in RAM."""
         return self._index.capacity
+
+    @property
+    def most_searched(self) -> int:
+        """The most places that are searched at once, where tiles meet."""
+        return _AT_A_CORNER * int(self.places_of.max())
 
     @property
     def held(self) -> tuple[int, ...]:

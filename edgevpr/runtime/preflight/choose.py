@@ -61,13 +61,25 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """Requirements of a flight: places in the map, queries per second, MB of RAM for the map's index, and the direction
-    of the camera ("nadir" or "forward"; None: forward)."""
+    """Requirements of a flight: places in RAM, queries per second, MB of RAM for the map's index, the direction of the
+    camera ("nadir" or "forward"; None: forward), and the most places that a query is compared with (None: all)."""
 
     places: int
     rate_hz: float
     budget_mb: float
     camera: str | None = None
+    searched: int | None = None
+
+    @property
+    def compared(self) -> int:
+        """The number of places that a query is compared with."""
+        return self.places if self.searched is None else min(self.searched, self.places)
+
+    @property
+    def counted(self) -> str:
+        """The places as text."""
+        few = f" (some {self.compared} of them compared with a query)" if self.compared < self.places else ""
+        return f"{self.places} places{few}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,7 +191,7 @@ def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     usable_cores = board.cores * board.cpu_share
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
-    query = costs.encode + costs.match(demand.places)
+    query = costs.encode + costs.match(demand.compared)
     reachable_hz = min(1 / query.wall_s, usable_cores / query.cpu_s)
     shortfalls = []
     if map_ram_mb > demand.budget_mb:
@@ -227,7 +239,7 @@ def described(board: Board, option: Option, demand: Demand) -> str:
     """Return the accuracy of an option, the figures of its fit and, if it does not fit, why not and what would help."""
     found = option.fit
     figures = (
-        f"{option.accuracy or 'never measured'}; {demand.places} places take {found.map_ram_mb:.1f} of "
+        f"{option.accuracy or 'never measured'}; {demand.counted} take {found.map_ram_mb:.1f} of "
         f"{demand.budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and "
         f"{_rounded_down(found.reachable_hz):g} Hz of {demand.rate_hz:g} are reached with "
         f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"

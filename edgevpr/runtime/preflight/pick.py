@@ -100,10 +100,11 @@ def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
         candidates=recogniser.candidates if spec.fine else costs.candidates,
     )
     demand = Demand(
-        places=searched_places(recogniser),
+        places=places_in_ram(recogniser),
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
         camera=_camera(technique),
+        searched=searched_places(recogniser),
     )
     taken, *fewer = options(board, _label(technique), spec.name, costs, demand)
     if taken.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:

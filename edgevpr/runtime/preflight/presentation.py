@@ -19,7 +19,7 @@ def format_table(estimate: FlightEstimate) -> str:
     plan, rows = estimate.plan, estimate.techniques
     hovers = f", hovering at {plan.hover_w:g} W" if plan.hover_w else ""
     heading = (
-        f"{estimate.title}: {plan.places} places, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
+        f"{estimate.title}: {plan.counted}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency{hovers}; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
@@ -47,7 +47,7 @@ def format_boards(estimates: Sequence[FlightEstimate]) -> str:
     rows = [_BOARD, *map(_on_board, estimates)]
     none = [f"{each.title}: {each.reason}" for each in estimates if not each.recommended]
     plan = estimates[0].plan
-    heading = f"{plan.places} places, {plan.flight_min:g} min, {plan.pack.cells}S{plan.pack.capacity_mah}"
+    heading = f"{plan.counted}, {plan.flight_min:g} min, {plan.pack.cells}S{plan.pack.capacity_mah}"
     return "\n".join([heading, "", *aligned(rows, left=2), *(line for note in none for line in wrapped(note))])
 
 

@@ -94,10 +94,9 @@ def places_in_ram(recogniser: Recogniser) -> int:
 
 
 def searched_places(recogniser: Recogniser) -> int:
-    """Return the number of places that a query is compared with: all in RAM or, of tiles, the places of one."""
-    place_map = recogniser.place_map
-    of_a_tile = int(place_map.places_of.max()) if isinstance(place_map, TileMap) else len(recogniser.index)
-    return min(of_a_tile, places_in_ram(recogniser))
+    """Return the most places that a query is compared with: all in RAM or, of tiles, those of a few."""
+    place_map, in_ram = recogniser.place_map, places_in_ram(recogniser)
+    return min(place_map.most_searched, in_ram) if isinstance(place_map, TileMap) else in_ram
 
 
 def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:

@@ -28,8 +28,9 @@ from edgevpr.review.compare import compare
 from edgevpr.review.replay import replay
 from edgevpr.runtime.flight import tiles as tiles_of_flight
 from edgevpr.runtime.flight.flight import fly
+from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise import opening
-from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.runtime.recognise.opening import meter_of, open_recogniser, places_in_ram, searched_places
 from edgevpr.techniques import create
 
 SIDE_PX, PLACES, ZOOM = 256, 24, 17  # a tile has a side of 197 m at this latitude: one or two places, 111 m apart
@@ -126,6 +127,14 @@ def test_the_tiles_around_the_aircraft_are_in_ram_and_no_others(folder, tmp_path
     assert max(map(len, flight.held)) <= 5
     assert flight.map.capacity == 6, "the budget is never exceeded: it is all that was allocated"
     assert len(of_kind(flight.lines, "tiles")) > 5
+
+
+def test_what_a_query_takes_is_that_of_the_tiles_around_the_aircraft(folder):
+    config = load_config(None, {"map": str(folder)})
+    recogniser = open_recogniser(config, load_board("this"), narrowed=True)
+    assert (places_in_ram(recogniser), searched_places(recogniser)) == (PLACES, 4 * 2), "two are in the largest tile"
+    assert f"{PLACES} places (some 8 of them compared with a query) take" in outlook(recogniser, config).reason
+    recogniser.place_map.close()
 
 
 @pytest.mark.slow
