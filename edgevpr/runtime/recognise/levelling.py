@@ -45,37 +45,44 @@ class Levelling:
     are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
     `mount` of the camera; a `lens` has its own.
 
-    The longest side of pictures is scaled to a length on the ground, that of the map's places by its `layers` (None: no
-    scaling). With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal
-    keeps the camera level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
+    With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal keeps the camera
+    level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
     """
 
     def __init__(
         self,
         lens: Lens | None,
         *,
-        layers: Layers | None = None,
         below: bool = False,
         on_gimbal: bool = False,
         is_live: bool,
         mount: Mount = STRAIGHT_DOWN,
     ) -> None:
-        self.lens, self._layers = lens, layers
+        self.lens = lens
         self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
         self._has_warned = False
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, scale: float = 1.0) -> Levelled:
+    def prepare(
+        self,
+        frame: Frame,
+        vehicle: Vehicle | None,
+        overlay: Mask | None,
+        *,
+        layers: Layers | None = None,
+        scale: float = 1.0,
+    ) -> Levelled:
         """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
-        False where the picture shows no ground (None: nowhere). The picture shows `scale` times as much ground as its
-        height tells or, where that is unknown, as those of the map."""
+        False where the picture shows no ground (None: nowhere). Its longest side is scaled to a length on the ground,
+        that of the places to look among by their `layers` (None: no scaling). It shows `scale` times as much ground as
+        its height tells or, where that is unknown, as those of the map."""
         if vehicle and not (self._is_live and vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
         if vehicle and self._on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
             return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount)), scale)
-        own_m = footprint_of(frame, vehicle, self.lens) if self._layers else None
-        footprint_m = self._layers.fitting(own_m and scale * own_m) if self._layers else None
+        own_m = footprint_of(frame, vehicle, self.lens) if layers else None
+        footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
         picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self._below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
@@ -89,13 +96,13 @@ class Straightening:
     def __init__(self, lens: CalibratedLens) -> None:
         self._lens = lens
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, scale: float = 1.0) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> Levelled:
         """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
         return straightened(frame.image, overlay, UNKNOWN_VIEW, self._lens)
 
 
 def levelling_of(
-    config: SourceConfig, technique: Technique, *, layers: Layers | None = None, below: bool = False
+    config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Straightening | None:
     """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
     with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
@@ -109,7 +116,7 @@ def levelling_of(
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
     on_gimbal, is_live = config.gimbal, is_now(config)
-    return Levelling(lens, layers=layers, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
+    return Levelling(lens, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
 
 
 def lens_of(config: SourceConfig) -> Lens | None:

@@ -11,7 +11,6 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
-from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.mapinfo import index_positions
@@ -238,8 +237,7 @@ def _recogniser(
 ) -> Recogniser:
     match, length = config.match, length_of(technique.spec, config.match.sequence)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
-    layers = layers_of(place_map)
-    matcher = Matcher(technique, index, rule, search_of(length), layers=layers)
+    matcher = Matcher(technique, index, rule, search_of(length))
     mask, is_live = mask_of(config.source.mask), is_now(config.source)
     say_other_mask(place_map, mask)
     say_other_lens(place_map, config.source.lens)
@@ -248,7 +246,7 @@ def _recogniser(
     if follows and match.sequence is None and kinds_of(technique.spec):
         follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
     candidates = match.candidates or technique.candidates
-    levelling = levelling_of(config.source, technique, layers=layers)
+    levelling = levelling_of(config.source, technique)
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     preparation = Preparation(
         levelling=levelling,

@@ -74,12 +74,14 @@ class Preparation:
     gate: Gate | None = None
     strides: Strides | None = None
 
-    def picture(self, frame: Frame, vehicle: Vehicle | None = None, scale: float = 1.0) -> Levelled:
-        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for `scale`."""
+    def picture(
+        self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
+    ) -> Levelled:
+        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         if self.levelling is None:
             return enlarged(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
-        return self.levelling.prepare(frame, vehicle, mask, scale)
+        return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,7 +152,7 @@ class Recogniser:
         preparation = self._preparation
         try:
             with self.meter.step("prepare"):
-                event.picture = picture = preparation.picture(frame, vehicle, self._scale)
+                event.picture = picture = self._picture(frame, vehicle)
             with self.meter.step("gate"):
                 event.worth = preparation.gate.look(frame.image) if preparation.gate else None
             with self.meter.step("encode"):
@@ -169,6 +171,10 @@ class Recogniser:
         self._told += len(event.left_out)
         event.steps, event.cost = self.meter.steps(), self.meter.cost()
         return event
+
+    def _picture(self, frame: Frame, vehicle: Vehicle | None) -> Levelled:
+        """Prepare a picture, scaled to the places to look among, and by what the matches before have shown."""
+        return self._preparation.picture(frame, vehicle, layers=self._layers, scale=self._scale)
 
     @property
     def _scale(self) -> float:
@@ -191,7 +197,7 @@ class Recogniser:
         event = Recognition(frame=frame, vehicle=vehicle)
         try:
             with self.meter.step("prepare"):
-                event.picture = picture = self._preparation.picture(frame, vehicle, self._scale)
+                event.picture = picture = self._picture(frame, vehicle)
             self._measure_stride(event, Verification(self.technique.spec, picture, self.index, self.place_map))
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)

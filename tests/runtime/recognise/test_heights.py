@@ -12,7 +12,6 @@ from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.level import Lens
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
-from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
@@ -112,7 +111,7 @@ def cut_twice(tmp_path_factory):
 def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_height(cut_twice, height_m):
     """By the height, where it is told, from the first picture on; else by the last match."""
     technique, place_map, index, meter = cut_twice
-    layers, scan, looked = layers_of(place_map), type(technique).coarse_scores, []
+    scan, looked = type(technique).coarse_scores, []
 
     class Noting(type(technique)):
         def coarse_scores(self, query, rows, mean, **hints):
@@ -120,7 +119,7 @@ def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_he
             return scan(self, query, rows, mean, **hints)
 
     fov_deg = math.degrees(2 * math.atan(0.5))  # the footprint is the height
-    levelling = Levelling(Lens(fov_deg), layers=layers, is_live=False) if height_m else None
+    levelling = Levelling(Lens(fov_deg), is_live=False) if height_m else None
     noting = Noting(**technique.spec.parameters)
     walk = Recogniser(
         Matcher(noting, index, accept_rule(technique, load_config(None).match)),

@@ -99,7 +99,7 @@ def walk(place_map, technique):
 
 
 def scaling(is_live=False):
-    return Levelling(LENS, layers=LAYER, is_live=is_live)
+    return Levelling(LENS, is_live=is_live)
 
 
 def recognised(event, place):
@@ -121,6 +121,13 @@ def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, grou
     assert math.hypot(*event.view.aside) * FOOTPRINT_M == pytest.approx(off_m)
     assert event.steps.prepare.wall_s > 0
     assert event.cost.t_encode_s == pytest.approx((event.steps.prepare + event.steps.gate + event.steps.encode).wall_s)
+
+
+def test_pictures_are_scaled_to_the_places_that_are_searched_now(walk, ground):
+    recogniser, other_m = walk(scaling()), 0.8 * FOOTPRINT_M
+    of_other_tile = Layers(other_m, (other_m,), np.zeros(0, int), np.zeros(0, int))
+    recogniser.take(Matcher(recogniser.technique, recogniser.index, recogniser.rule, layers=of_other_tile))
+    assert recogniser.step(frame(ground, 1, **HARD)).view.footprint_m == pytest.approx(other_m)
 
 
 @pytest.mark.slow
@@ -260,7 +267,7 @@ def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_
         config = load_config(None, said | {"source.gimbal": gimbal}).source
         frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
         vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
-        view = levelling_of(config, technique, layers=LAYER).prepare(frame, vehicle, None).view
+        view = levelling_of(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
         off_m = view.lean_m if fov_deg is None else FOOTPRINT_M * np.array(view.aside)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
 
@@ -274,7 +281,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
     true_m = np.array([-ahead_m * math.sin(turn), NORTH_M[1] - ahead_m * math.cos(turn)])
     wrong_m = []
     for mount in (Mount(9.0), STRAIGHT_DOWN):
-        event = walk(Levelling(replace(LENS, mount=mount), layers=LAYER, is_live=False)).step(seen)
+        event = walk(Levelling(replace(LENS, mount=mount), is_live=False)).step(seen)
         assert recognised(event, 1)
         at = event.located.position
         wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
@@ -284,7 +291,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
 
 @pytest.mark.parametrize("lens", [LENS, None])
 def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, ground, technique, lens):
-    levelling = Levelling(lens, layers=LAYER, is_live=False)
+    levelling = Levelling(lens, is_live=False)
     follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
     told = STRAIGHT | {"height_m": 1.25 * HEIGHT_M}
     first, second = (
