@@ -30,7 +30,8 @@ from edgevpr.fleet.worker import FleetOrder, TileTask
 from edgevpr.mapmaking.making import Cuttings
 
 SET, FOOTPRINT_M, SPACINGS_M, PER_TILE = "sat_marash", 156.0, (62.0, 31.0), 100
-PHOTOGRAPHS, LARGE_PHOTOGRAPHS, PHOTOGRAPHS_PER_TILE = (1000, 10_000), 100_000, 500
+PHOTOGRAPHS = {1000: 500, 10_000: 2000}  # and the most in a tile: the fewer, the more are read for a tile beside it
+LARGE_PHOTOGRAPHS, LARGE_PER_TILE = 100_000, 10_000
 WORKERS, PROJECTED, ON_PAPER = (1, 2), (10, 100), 10_000_000
 _COLUMNS = {
     "ground": "{ground}",
@@ -92,10 +93,10 @@ def tasks_of_raster(spacing_m: float) -> list[TileTask]:
     return building.tasks_of_orthophoto(cuttings, PER_TILE, None)
 
 
-def tasks_of_photographs(count: int, folder: Path) -> list[TileTask]:
+def tasks_of_photographs(count: int, per_tile: int, folder: Path) -> list[TileTask]:
     write_pictures(folder, count)
     photos = photos_of(sorted(map(str, folder.iterdir())))
-    return building.tasks_of_photos(photos, PHOTOGRAPHS_PER_TILE, None)[0]
+    return building.tasks_of_photos(photos, per_tile, None)[0]
 
 
 def projected(one: Row, two: Row) -> list[Row]:
@@ -127,11 +128,11 @@ def main() -> None:
         for spacing_m in SPACINGS_M:
             tasks = tasks_of_raster(spacing_m)
             rows += projected(*[measure(tasks, count, work / f"maps {spacing_m:g} {count}") for count in WORKERS])
-        for number in PHOTOGRAPHS:
-            tasks = tasks_of_photographs(number, work / f"{number}")
+        for number, per_tile in PHOTOGRAPHS.items():
+            tasks = tasks_of_photographs(number, per_tile, work / f"{number}")
             rows += projected(*[measure(tasks, count, work / f"maps {number} {count}") for count in WORKERS])
         if large:
-            tasks = tasks_of_photographs(LARGE_PHOTOGRAPHS, work / "large")
+            tasks = tasks_of_photographs(LARGE_PHOTOGRAPHS, LARGE_PER_TILE, work / "large")
             rows.append(measure(tasks, WORKERS[-1], work / "large maps"))
     found = {**base.made_by(), "large": large, "rows": rows}
     base.write("fleet", found, page(found))
