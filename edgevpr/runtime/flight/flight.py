@@ -24,6 +24,7 @@ from edgevpr.places.readmap import ReadMap
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import at_recorded_rate, look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
+from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governor import Governing
@@ -32,7 +33,7 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.tiles import tiles_of
 from edgevpr.runtime.flight.vitals import Vitals
-from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, ScaleWatch, Sight, Surveyor, Tally
+from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
 from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
@@ -75,6 +76,7 @@ class Flight:
             self._map_watch.tell,
             Sight(herald).tell,
             ScaleWatch(herald).tell,
+            TurnWatch(herald, config.source).tell,
             gps.tell,
             self._surveyor.tell,
             self._log_event,

@@ -26,9 +26,6 @@ _KNOWN_WITH = 3  # accepted matches before the map can be left: with fewer, the 
 _LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten are nothing unusual
 _LOST, _LOST_AFTER = 0.9, 10  # probability of being lost, in so many queries in a row that are not accepted
 _FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches that find the map again, with fewer misses between two of them
-# Accepted matches, and a picture's footprint over that of the map, between which nothing is said: as much is found, by
-# benchmarks/results/from_space.md.
-_SCALED_BY, _SCALES = 10, (0.87, 1.4)
 _TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to the next
 
 # In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
@@ -150,29 +147,6 @@ class Sight:
         elif self._accepted >= _KNOWN_WITH and (self._misses >= _LEFT_AFTER or self._misses_lost >= _LOST_AFTER):
             self._accepted = 0
             self._map.note(True)
-
-
-class ScaleWatch:
-    """Says once if pictures show clearly more or less ground than those that were cut from an orthophoto for the map: a
-    map cut to the right size finds more. It goes by the first matches that are accepted."""
-
-    def __init__(self, herald: Herald) -> None:
-        self._herald = herald
-        self._seen: list[tuple[float, float]] = []  # ground along a picture in flight, and in the map, metres
-
-    def tell(self, event: Recognition) -> None:
-        """Take the ground that the match of an event shows."""
-        pose, where = event.best and event.best.place.pose, event.located
-        if len(self._seen) == _SCALED_BY or not (where and where.height_ratio and pose and pose.is_surveyed):
-            return
-        self._seen.append((pose.footprint_m * where.height_ratio, pose.footprint_m))
-        if len(self._seen) < _SCALED_BY:
-            return
-        flown_m, cut_m = np.median(self._seen, axis=0).tolist()
-        if not _SCALES[0] <= flown_m / cut_m <= _SCALES[1]:
-            text = f"a picture shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m"
-            ground = f"footprint {flown_m:.0f} m, map's {cut_m:.0f} m"
-            self._herald.say(Severity.WARNING, f"{text}: --footprint-m {flown_m:.0f} finds more", ground=ground)
 
 
 class GpsWatch:

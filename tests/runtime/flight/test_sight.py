@@ -7,10 +7,12 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
 from pictures import textured
 
+from edgevpr.core.config import load_config
 from edgevpr.frames.level import View
+from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.watching import ScaleWatch, Sight
+from edgevpr.runtime.flight.watching import Sight
 
 
 class Seen:
@@ -130,3 +132,30 @@ def test_pictures_of_another_scale_than_those_of_an_orthophoto_are_said_once(tmp
     for event in [missed, found, found, found]:
         watch.tell(event)
     assert [text.removeprefix("edgevpr: ") for _, text in link.texts()] == said
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "said"),
+    [
+        ([88, 92], ["pictures turned 90 degrees"]),
+        ([-179, 179], ["pictures turned 180 degrees"]),
+        ([-32, -28], ["pictures turned -30 degrees"]),
+        ([8, 12], []),
+        ([0, 90], []),
+        ([20, 80], []),
+    ],
+)
+def test_pictures_that_are_turned_against_the_heading_are_said_once(tmp_path, turned_deg, said):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    source = load_config(None, {"source.up_deg": 300.0}).source
+    watch = TurnWatch(Herald(FlightLog(tmp_path / "log", clock=clock), link), source)
+    view = SimpleNamespace(up_deg=350.0, reason=None)
+    events = [SimpleNamespace(located=SimpleNamespace(heading_deg=350.0 + turn), view=view) for turn in turned_deg]
+    missed = SimpleNamespace(located=None, view=view)
+    for event in [events[0], missed, events[1]] * 4:
+        watch.tell(event)
+    assert link.texts() == []
+    for event in [missed, *events, *events]:
+        watch.tell(event)
+    assert [text.removeprefix("edgevpr: ").replace("-180", "180") for _, text in link.texts()] == said
