@@ -24,6 +24,7 @@ from edgevpr.runtime.recognise.motion import FASTEST_M_S
 TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
 TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _FIX_GOOD_FOR_S = 60.0
+_BOTH = (True, True)
 _OFF_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
 _LEAST_SCALE = 0.5
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
@@ -54,18 +55,23 @@ class Hints:
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
-    def agree_with(self, found: Candidate, heading_within_deg: float | None) -> bool:
-        """Return True if a match agrees with these hints, as far as both are known. `heading_within_deg` is the largest
-        error of a heading (None: headings are not compared)."""
-        place, turned_deg = found.place, found.match.rotation_deg
+    def agree_with(self, found: Candidate, heading_within_deg: float | None) -> tuple[bool, bool]:
+        """Return whether a match agrees with the area, and whether with the heading, as far as both are known.
+        `heading_within_deg` is the largest error of a heading (None: headings are not compared)."""
+        place, turned_deg, is_there, is_so = found.place, found.match.rotation_deg, True, True
         if self.reach and place.position:
             here, there = self.reach.position, place.position
-            if distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg) > self.reach.radius_m:
-                return False
-        if self.heading_deg is None or place.heading_deg is None or turned_deg is None or heading_within_deg is None:
-            return True
-        off_deg = shorter_deg(turned_deg - (self.heading_deg - place.heading_deg))
-        return abs(off_deg) <= heading_within_deg
+            away_m = distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+            is_there = bool(away_m <= self.reach.radius_m)
+        if self.heading_deg is not None and place.heading_deg is not None and turned_deg is not None:
+            off_deg = shorter_deg(turned_deg - (self.heading_deg - place.heading_deg))
+            is_so = heading_within_deg is None or abs(off_deg) <= heading_within_deg
+        return is_there, is_so
+
+    def believed(self, in_reach: bool, heading: bool) -> "Hints | None":
+        """Return those of these hints that are believed; None if nothing is left."""
+        reach, heading_deg = self.reach if in_reach else None, self.heading_deg if heading else None
+        return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
 
 
 class Prior:
@@ -87,7 +93,8 @@ class Prior:
         self.footprint_m: float | None = None
         self.area: Reach | None = None
         self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
-        self.looks_again = self._are_believed = True
+        self.looks_again = self._uses = True
+        self._believed = _BOTH  # area and heading, by the last accepted match
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
         self._followed: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
         self._known: Hints | None = None
@@ -119,7 +126,7 @@ class Prior:
             self.area = Reach(known[0], margin_m + FASTEST_M_S * abs(frame.t_mono_s - known[1]))
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
-        return self._known if self._are_believed else None
+        return self._known.believed(*self._believed) if self._known and self._uses else None
 
     def scale(self, height_ratios: Sequence[float]) -> float:
         """Return the factor to enlarge the next picture by, so that it is as if taken from one of the `height_ratios`:
@@ -138,18 +145,21 @@ class Prior:
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Keep position and height of an accepted match. The next query uses hints if it agrees with them. Until there
-        is one, queries with hints and without alternate. Its picture was enlarged by `scale`, so that by its height it
-        shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it has one).
+        """Keep position and height of an accepted match. The next query uses those hints that it agrees with. Until
+        there is one, queries with hints and without alternate. Its picture was enlarged by `scale`, so that by its
+        height it shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it
+        has one).
         """
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
         if self._known is None:
-            self._are_believed = True
+            self._uses, self._believed = True, _BOTH
         elif accepted:
-            self._are_believed = self._known.agree_with(found, self._heading_within_deg)
+            self._believed = self._known.agree_with(found, self._heading_within_deg)
+            self._uses = any(self._believed)
         else:
-            self._are_believed = not self._are_believed
+            self._uses = not self._uses
+            self._believed = self._believed if any(self._believed) else _BOTH
         if accepted and found.match.height_ratio:
             height_ratio, layer_m = scale * found.match.height_ratio, self.footprint_m
             if layers and len(layers.footprints_m) > 1 and found.place.pose:
@@ -240,7 +250,7 @@ def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex
         reach = None
     if not index.knows_headings:
         heading_deg = None
-    return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
+    return Hints(reach, heading_deg).believed(*_BOTH)
 
 
 def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:

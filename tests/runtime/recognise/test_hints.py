@@ -119,20 +119,20 @@ def test_what_the_log_says():
 @pytest.mark.parametrize(
     ("hints", "candidate", "agrees"),
     [
-        (Hints(Reach(HOME, 100.0)), found(90), True),
-        (Hints(Reach(HOME, 100.0)), found(110), False),
-        (Hints(Reach(HOME, 100.0)), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), True),
-        (Hints(heading_deg=10.0), found(0, 350.0, 30.0), True),
-        (Hints(heading_deg=10.0), found(0, 350.0, 0.0), True),
-        (Hints(heading_deg=10.0), found(0, 350.0, 345.0), False),
-        (Hints(heading_deg=10.0), found(0, 350.0, 45.0), False),
-        (Hints(heading_deg=10.0), found(0, None, 180.0), True),
-        (Hints(Reach(HOME, 100.0), 10.0), found(0, 10.0, 180.0), False),
-        (Hints(Reach(HOME, 100.0), 10.0), found(110, 10.0, 0.0), False),
+        (Hints(Reach(HOME, 100.0)), found(90), (True, True)),
+        (Hints(Reach(HOME, 100.0)), found(110), (False, True)),
+        (Hints(Reach(HOME, 100.0)), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), (True, True)),
+        (Hints(heading_deg=10.0), found(0, 350.0, 30.0), (True, True)),
+        (Hints(heading_deg=10.0), found(0, 350.0, 0.0), (True, True)),
+        (Hints(heading_deg=10.0), found(0, 350.0, 345.0), (True, False)),
+        (Hints(heading_deg=10.0), found(0, 350.0, 45.0), (True, False)),
+        (Hints(heading_deg=10.0), found(0, None, 180.0), (True, True)),
+        (Hints(Reach(HOME, 100.0), 10.0), found(0, 10.0, 180.0), (True, False)),
+        (Hints(Reach(HOME, 100.0), 10.0), found(110, 10.0, 0.0), (False, True)),
     ],
 )
 def test_a_place_found_agrees_with_hints_that_would_have_led_to_it(hints, candidate, agrees):
-    assert hints.agree_with(candidate, WITHIN_DEG) is agrees
+    assert hints.agree_with(candidate, WITHIN_DEG) == agrees
 
 
 def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can_be_believed(index):
@@ -144,6 +144,20 @@ def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can
         seen.append(prior.hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
         prior.learn(found(metres), accepted, float(number))
     assert seen == [True, False, True, False, True, True, False]
+
+
+def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_leaves_the_heading(index):
+    prior, near, seen = Prior(10.0, WITHIN_DEG, is_live=True), Position(50.0, 8.0), []
+    # Metres, and degrees against the compass, of a match; None: nothing is accepted.
+    answers = [(50, 90.0), None, None, (50, 90.0), (500, 0.0), (500, 90.0), None, None, (50, 0.0), None]
+    for number, answer in enumerate(answers):
+        frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number), heading_deg=0.0)
+        hints = prior.hints(frame, vehicle(near, float(number)), index, 100.0)
+        seen.append(hints and (hints.reach is not None, hints.heading_deg is not None))
+        metres, turned_deg = answer or (50, 0.0)
+        prior.learn(found(metres, 0.0, turned_deg), answer is not None, float(number))
+    both, area, heading = (True, True), (True, False), (False, True)
+    assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
 
 def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_index):
