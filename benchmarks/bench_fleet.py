@@ -2,19 +2,21 @@
 
 `edgevpr fleet build` maps two grounds by the workers of Dask on this computer, each a process of one thread: tiles of
 the raster `before` of sat_marash, with places 62 or 31 m apart, and photographs as in `fleet_show.py`, 1,000 and 10,000
-(--large: 100,000, too, by two workers). They are not calibrated, and not refined. The serial part and the shared one
-are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in a small job the
-serial part is mostly the wait for the last tile. The projection holds for a job of this size, and assumes that nothing
-else grows with the workers: that the store gives each of them its pictures as fast as a local disk gives them to one.
+(--large: 100,000, by two workers; it takes an hour). They are not calibrated, and not refined. The serial part and the
+shared one are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in a small
+job the serial part is mostly the wait for the last tile. The projection holds for a job of this size, and assumes that
+nothing else grows with the workers: that the store gives each of them its pictures as fast as a local disk gives them
+to one.
 Read and written is what the workers asked Linux for, page cache and logs included. RAM is the peak of the largest
 worker.
 """
 
 import argparse
+import json
 import resource
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import base
@@ -32,6 +34,7 @@ from edgevpr.mapmaking.making import Cuttings
 SET, FOOTPRINT_M, SPACINGS_M, PER_TILE = "sat_marash", 156.0, (62.0, 31.0), 100
 PHOTOGRAPHS = {1000: 500, 10_000: 2000}  # and the most in a tile: the fewer, the more are read for a tile beside it
 LARGE_PHOTOGRAPHS, LARGE_PER_TILE = 100_000, 10_000
+RESULT = base.RESULTS / "fleet.json"
 WORKERS, PROJECTED, ON_PAPER = (1, 2), (10, 100), 10_000_000
 _COLUMNS = {
     "ground": "{ground}",
@@ -94,7 +97,8 @@ def tasks_of_raster(spacing_m: float) -> list[TileTask]:
 
 
 def tasks_of_photographs(count: int, per_tile: int, folder: Path) -> list[TileTask]:
-    write_pictures(folder, count)
+    if not folder.exists():
+        write_pictures(folder, count)
     photos = photos_of(sorted(map(str, folder.iterdir())))
     return building.tasks_of_photos(photos, per_tile, None)[0]
 
@@ -121,21 +125,28 @@ def projected(one: Row, two: Row) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--large", action="store_true", help=f"map {LARGE_PHOTOGRAPHS:,} photographs, too")
-    large, rows = parser.parse_args().large, []
+    parser.add_argument("--large", action="store_true", help=f"map {LARGE_PHOTOGRAPHS:,} photographs, and nothing else")
+    parser.add_argument("--pictures", type=Path, help="their folder, which is made if it is not there")
+    asked = parser.parse_args()
+    found: Row = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     with tempfile.TemporaryDirectory(prefix="edgevpr-fleet-") as made:
         work = Path(made)
-        for spacing_m in SPACINGS_M:
-            tasks = tasks_of_raster(spacing_m)
-            rows += projected(*[measure(tasks, count, work / f"maps {spacing_m:g} {count}") for count in WORKERS])
-        for number, per_tile in PHOTOGRAPHS.items():
-            tasks = tasks_of_photographs(number, per_tile, work / f"{number}")
-            rows += projected(*[measure(tasks, count, work / f"maps {number} {count}") for count in WORKERS])
-        if large:
-            tasks = tasks_of_photographs(LARGE_PHOTOGRAPHS, LARGE_PER_TILE, work / "large")
-            rows.append(measure(tasks, WORKERS[-1], work / "large maps"))
-    found = {**base.made_by(), "large": large, "rows": rows}
+        if asked.large:
+            tasks = tasks_of_photographs(LARGE_PHOTOGRAPHS, LARGE_PER_TILE, asked.pictures or work / "large")
+            found["large"] = {**base.made_by(), "row": measure(tasks, WORKERS[-1], work / "maps")}
+        else:
+            found |= {**base.made_by(), "rows": list(small_jobs(work))}
     base.write("fleet", found, page(found))
+
+
+def small_jobs(work: Path) -> Iterator[Row]:
+    def measured(name: str, tasks: Sequence[TileTask]) -> list[Row]:
+        return projected(*[measure(tasks, count, work / f"maps {name} {count}") for count in WORKERS])
+
+    for spacing_m in SPACINGS_M:
+        yield from measured(f"{spacing_m:g}", tasks_of_raster(spacing_m))
+    for number, per_tile in PHOTOGRAPHS.items():
+        yield from measured(f"{number}", tasks_of_photographs(number, per_tile, work / f"{number}"))
 
 
 def on_paper(ground: str, rows: Sequence[Row]) -> Row:
@@ -153,17 +164,19 @@ def on_paper(ground: str, rows: Sequence[Row]) -> Row:
 
 
 def page(found: Row) -> str:
+    rows, large = found["rows"], found["large"]
     return f"""# Map making by many workers
 
 {base.told(__doc__)}
 
-{base.table(found["rows"], _COLUMNS, left=1)}
+{base.table([*rows, large["row"]], _COLUMNS, left=1)}
 
 On paper, {ON_PAPER:,} places, from the largest job that one worker and two have done:
 
-{base.table(map(on_paper, ("raster", "photographs"), 2 * [found["rows"]]), _PAPER)}
+{base.table([on_paper(ground, rows) for ground in ("raster", "photographs")], _PAPER)}
 
-{base.made_line(found, f"python benchmarks/bench_fleet.py{' --large' * found['large']}")}
+{base.made_line(found, "make bench-fleet")}
+The last row: {base.made_line(large, "python benchmarks/bench_fleet.py --large")}
 """
 
 
