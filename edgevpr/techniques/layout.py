@@ -47,6 +47,7 @@ _LEAST_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more g
 _LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
 _LOOKED_CLOSER = 1000, 2000
+_RIVALS = 2048  # unlikely places that are scored
 _ROWS_AT_ONCE = 256
 _TINY = 1e-9
 
@@ -97,8 +98,14 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
     `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two beside it
     are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,) tells which places may be
     compared by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse
-    grid, less 1."""
+    grid, less 1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
+    if likely is not None and (step := np.count_nonzero(~likely) // _RIVALS) > 1:
+        some = likely.copy()
+        some[np.flatnonzero(~likely)[::step]] = True
+        of_some = None if turned_deg is None else turned_deg[some]
+        scores[some] = scan(fields, rows[some], of_some, likely[some])
+        return scores
     turns = np.full(len(rows), -1)
     if turned_deg is not None:
         turns = np.nan_to_num(np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS, nan=-1).astype(np.intp)

@@ -108,6 +108,25 @@ def test_only_likely_places_are_looked_at_closer(town):
     assert unlikely.max() == restricted[1].max(), "by the coarse grid the place comes first of them"
 
 
+@pytest.mark.parametrize("headings", [False, True])
+def test_in_a_large_map_the_places_in_reach_are_all_scored_and_of_the_others_some(town, headings):
+    technique, rows = town
+    query = technique.encode(view(1))
+    large = np.repeat(rows, 12_000 // PLACES, axis=0)
+    turned_deg = np.where(np.arange(len(large)) % 3, 0.0, np.nan) if headings else None
+    likely = np.arange(len(large)) % 100 == 7
+    scores, of_some = technique.coarse_scores(query, large, None, turned_deg, in_reach=likely)
+    _, of_all = technique.coarse_scores(query, large, None, turned_deg)
+    np.testing.assert_array_equal(np.isfinite(of_some[likely]), np.isfinite(of_all[likely]))
+    rivals = np.isfinite(of_some[~likely]).any(axis=1)
+    assert 2048 <= rivals.sum() <= 4096
+    assert np.diff(np.flatnonzero(rivals)).max() <= 5
+    few = np.repeat(rows, 4000 // PLACES, axis=0)
+    _, of_few = technique.coarse_scores(query, few, None, in_reach=np.arange(len(few)) == 7)
+    assert np.isfinite(of_few).any(axis=1).all()
+    assert (scores[~likely] == 0).all()
+
+
 def test_rows_of_any_bytes_have_finite_scores(town):
     technique, _ = town
     damaged = np.random.default_rng(2).integers(0, 256, (4, NBYTES), np.uint8)
