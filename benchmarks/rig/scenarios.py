@@ -118,6 +118,7 @@ SCENARIOS = {
         off_s=120.0,
         is_compared=False,
     ),
+    "px4_copter_vision": Scenario(is_px4=True, vehicle="copter", with_edgevpr={"EKF2_EV_CTRL": 1}, is_compared=False),
     "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
     "reboot": Scenario(gps_s=30.0, off_s=60.0, reboots=True, is_compared=False),
 }

@@ -27,6 +27,7 @@ _GPS_LAG_S = 0.2
 # PX4
 FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
 CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
+VISION_CONTROL = "EKF2_EV_CTRL"  # its bits are those of a system that measures more, and sends ODOMETRY of its own
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +40,7 @@ class Channel(Enum):
     SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR (PX4)
     GPS_INPUT = auto()  # message 232, as a GPS receiver (ArduPilot)
     ODOMETRY = auto()  # message 331 (ArduPilot)
+    VISION = auto()  # message 331, as a position only (PX4)
 
     @property
     def is_continuous(self) -> bool:
@@ -113,10 +115,14 @@ def receiver_name(parameters: Mapping[str, float], number: int) -> str:
 
 
 def px4_choice(_kind: Kind, parameters: Mapping[str, float]) -> Choice:
-    """Choose the channel for a PX4: message 296 if its parameter CONTROL lets it fuse positions, else command 43003."""
+    """Choose the channel for a PX4: message 296 or ODOMETRY if CONTROL or VISION_CONTROL let it fuse positions, else
+    command 43003."""
+    fuses_ours = int(parameters.get(CONTROL, 0)) & FUSES_POSITION
+    if parameters.get(VISION_CONTROL) == FUSES_POSITION and not fuses_ours:
+        return Choice(Channel.VISION, f"ODOMETRY, as its {VISION_CONTROL} is {FUSES_POSITION}")
     if CONTROL not in parameters:
         return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.18 has)")
-    if int(parameters[CONTROL]) & FUSES_POSITION:
+    if fuses_ours:
         return Choice(Channel.SENSOR, f"message 296, as its {CONTROL} fuses positions")
     return Choice(Channel.COMMAND, f"command 43003, as its {CONTROL} fuses no positions of message 296")
 
@@ -126,7 +132,7 @@ def _known_name(parameters: Mapping[str, float], names: tuple[str, ...]) -> str:
 
 
 ARDUPILOT_PARAMETERS = (*(name for names in _RECEIVERS + _DELAYS for name in names), _VISION)
-PX4_PARAMETERS = (CONTROL,)
+PX4_PARAMETERS = (CONTROL, VISION_CONTROL)
 _OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
 # Name, the parameters on which the channel depends, and the function that chooses it.
 _Firmware = tuple[str, tuple[str, ...], Callable[[Kind, Mapping[str, float]], Choice]]

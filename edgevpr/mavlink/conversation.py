@@ -258,10 +258,8 @@ class Conversation:
         if choice.channel is Channel.GPS_INPUT:
             t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
             return messages.gps_input(state, choice.receiver, t_s, t_unix_s)
-        if choice.channel is Channel.SENSOR:
-            if state:
-                autopilot.px4.note_sent(now_s)
-            return state and messages.position_sensor(state)
+        if choice.channel in (Channel.SENSOR, Channel.VISION):
+            return autopilot.px4.told(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")
             here, self._origin = self._origin, None
@@ -282,6 +280,8 @@ class Conversation:
         if now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
+        if self.channel is Channel.VISION and self.autopilot.origin is None:
+            self.send(messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
         is_silent = vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S
         # A ground station that asks for rates of its own sets ours back, as all of a port share them.

@@ -187,6 +187,35 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
     )
 
 
+def vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
+    """Make an ODOMETRY (331) that says a position, north, east, down of `origin` (latitude, longitude in degrees,
+    altitude in metres above sea level), and nothing else. PX4 goes by the time of its arrival."""
+    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
+    variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
+    variances[0] = variances[6] = state.accuracy_m**2
+    variances[11] = state.alt_accuracy_m**2
+    return mavlink.MAVLink_odometry_message(
+        time_usec=round(state.t_mono_s * 1e6),
+        frame_id=mavlink.MAV_FRAME_LOCAL_NED,
+        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
+        x=float(north_m),
+        y=float(east_m),
+        z=origin[2] - state.alt_m,
+        q=[math.nan] * 4,
+        vx=math.nan,
+        vy=math.nan,
+        vz=math.nan,
+        rollspeed=math.nan,
+        pitchspeed=math.nan,
+        yawspeed=math.nan,
+        pose_covariance=variances,
+        velocity_covariance=[math.nan] * 21,
+        reset_counter=0,
+        estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        quality=100,
+    )
+
+
 def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). `firmware` is a MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more, at higher rates."""

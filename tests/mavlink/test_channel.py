@@ -3,9 +3,11 @@
 import struct
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from conversing import Autopilot
 
+from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 from edgevpr.mavlink.channel import Channel, Kind, ardupilot_choice, px4_choice
 from edgevpr.mavlink.messages import Fix, MotionState
@@ -53,6 +55,10 @@ def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be()
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
     assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
     assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
+    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
+    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
+    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
+    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
     assert px4_choice(Kind.PLANE, {}).channel is Channel.COMMAND
 
 
@@ -163,6 +169,29 @@ def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_k
     assert said[0].lat == round(STATE.lat_deg * 1e7)
     ear.state = None
     assert sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
+
+
+def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position_beside_it():
+    one = struct.unpack("<f", struct.pack("<i", 1))[0]
+    asked = {"EKF2_EV_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)}
+    autopilot, _ = interviewed(PX4, asked, origin=Position(46.5, 7.5, 400.0))
+    assert sent(autopilot, "ODOMETRY", 3.0) == []
+    assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
+    wanted = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+    asks = []
+    for _ in range(6):
+        autopilot.beat()
+        asks += [said.param1 for said in sent(autopilot, "COMMAND_LONG") if said.command == 512]
+    assert wanted in asks
+    autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+    autopilot.beat()
+    said = sent(autopilot, "ODOMETRY", 3.0)
+    assert len(said) == pytest.approx(30, abs=1)
+    east_m, north_m = offset_m(46.5, 7.5, STATE.lat_deg, STATE.lon_deg)
+    assert (said[0].x, said[0].y, said[0].z) == pytest.approx((north_m, east_m, 400 - STATE.alt_m), rel=1e-5)
+    assert said[0].frame_id == mavlink.MAV_FRAME_LOCAL_NED
+    assert said[0].pose_covariance[0] == said[0].pose_covariance[6] == pytest.approx(STATE.accuracy_m**2)
+    assert np.isnan([*said[0].q, said[0].vx, said[0].vy, said[0].vz]).all(), "its own are better"
 
 
 ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS

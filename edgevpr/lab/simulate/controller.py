@@ -103,7 +103,7 @@ class FlightController:
             case "GPS_INPUT":
                 self.brain.receivers.hear(message, self.brain.now_s)
             case "ODOMETRY":
-                self.brain.external.hear(message, self.brain.now_s)
+                self.brain.take_odometry(message)
             case "GLOBAL_POSITION_SENSOR":
                 self.brain.take_global_position(message)
             case "SET_GPS_GLOBAL_ORIGIN":

@@ -82,6 +82,10 @@ class Firmware(ABC):
     def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
+    def take_odometry(self, message: Message) -> None:
+        """Process an ODOMETRY (331)."""
+        self.external.hear(message, self.now_s)
+
     def set_origin(self, at: Origin) -> bool:
         """Set the origin; the vehicle does not move. Returns True if it was set."""
         self.origin = at
@@ -219,6 +223,10 @@ PX4 = {
     "EKF2_AGP0_GATE": 3.0,
     "EKF2_AGP0_NOISE": 1.0,
     "EKF2_EV_CTRL": 0,
+    "EKF2_EV_DELAY": 0.0,
+    "EKF2_EV_NOISE_MD": 0,
+    "EKF2_EVP_GATE": 5.0,
+    "EKF2_EVP_NOISE": 0.1,
     "EKF2_GPS_CTRL": 7,
     "EKF2_NOAID_TOUT": 5_000_000,
     "EKF2_OF_CTRL": 0,

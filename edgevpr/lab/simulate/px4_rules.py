@@ -1,18 +1,18 @@
-"""The simulated PX4: the rules of 1.18-beta1 for its filter EKF2, command 43003 and message 296, with
-the flags of a real one in its own simulator. Used by `controller`. They are from EKF2.cpp, ekf.cpp
-(resetGlobalPosToExternalObservation), ekf_helper.cpp (updateHorizontalDeadReckoningstatus) and
-aux_global_position.cpp. A 1.17.0 and a 1.18-beta1 were held beside it (test_px4_contract)."""
+"""The simulated PX4: the rules of 1.18-beta1 for its filter EKF2, command 43003, message 296 and ODOMETRY, with the
+flags of a real one in its own simulator. Used by `controller`. They are from EKF2.cpp, ekf.cpp
+(resetGlobalPosToExternalObservation), ekf_helper.cpp (updateHorizontalDeadReckoningstatus), aux_global_position.cpp and
+ev_pos_control.cpp. A 1.17.0 and a 1.18-beta1 were held beside it (test_px4_contract)."""
 
 import math
 
 from edgevpr.lab.simulate.firmware import FAILED, NOT_NOW, OK, PX4, SD_GROWS_M_S, Firmware
-from edgevpr.lab.simulate.motion import Motion
+from edgevpr.lab.simulate.motion import Motion, beside
 from edgevpr.lab.simulate.sensors import FIX_3D
 from edgevpr.mavlink.wire import Message, mavlink
 
 _AIDING_GONE_S = 1.0  # no_aid_timeout_max
 _RESET_AFTER_S = 7.0  # reset_timeout_max
-_SILENT_AFTER_S = 5.0  # of message 296
+_SILENT_AFTER_S, _VISION_SILENT_AFTER_S = 5.0, 0.4  # of message 296, and of ODOMETRY
 _OLDEST_FIX_S = 15.0
 _DEFAULT_ACCURACY_M = 50.0
 
@@ -33,13 +33,14 @@ class Px4(Firmware):
 
     def __init__(self, kind: str, motion: Motion) -> None:
         super().__init__(kind, motion, PX4)
-        self._fused_s = self._aided_s = -math.inf  # last fused; last not purely inertial
-        self._other_s = self._other_heard_s = -math.inf  # message 296: last fused, last received
+        self._fused_s = self._gps_s = self._aided_s = -math.inf  # last fused; GPS was; last not purely inertial
+        self._other_s = self._other_heard_s = -math.inf  # message 296 or ODOMETRY: last fused, last received
+        self._silent_s = _SILENT_AFTER_S  # after which that is over
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
         self.origin = self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m
-        self._passed_s = self._fused_s = self.now_s - 2 * _AIDING_GONE_S
+        self._passed_s = self._fused_s = self._gps_s = self.now_s - 2 * _AIDING_GONE_S
         self._aided_s = self.now_s - _AIDING_GONE_S
 
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
@@ -50,7 +51,7 @@ class Px4(Firmware):
         if measured is not None and measured != before:
             self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)
             if self._fuse(measured, wind_m_s, _RESET_AFTER_S):
-                self._fused_s = self.now_s
+                self._fused_s = self._gps_s = self.now_s
         is_aided, is_flying = self.now_s - self._fused_s < _AIDING_GONE_S, self.motion.is_flying
         if is_aided:
             self.drift_m_s = 0j
@@ -67,9 +68,12 @@ class Px4(Firmware):
         if self._is_valid():
             flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
             flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS
-        has_ours = self._other_s > -math.inf and self.now_s - self._other_heard_s <= _SILENT_AFTER_S
-        if has_ours or self.now_s - self._fused_s < _AIDING_GONE_S:
-            flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+        has_ours = self._other_s > -math.inf and self.now_s - self._other_heard_s <= self._silent_s
+        has_gps, is_vision = self.now_s - self._gps_s < _AIDING_GONE_S, self._silent_s == _VISION_SILENT_AFTER_S
+        if has_ours or has_gps:
+            flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+        if has_gps or (has_ours and not is_vision):
+            flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
         if not self.motion.is_flying:  # at rest, whatever it knows
             flags |= mavlink.ESTIMATOR_CONST_POS_MODE
         return flags | (mavlink.ESTIMATOR_GPS_GLITCH if self.test_ratio > 1 else 0)
@@ -94,19 +98,34 @@ class Px4(Firmware):
         is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
             return
-        is_starting = self.now_s - self._other_heard_s > _SILENT_AFTER_S
+        self._silent_s, noise_m = _SILENT_AFTER_S, max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
+        self._take(message.lat / 1e7, message.lon / 1e7, message.alt, noise_m, "AGP0")
+
+    def take_odometry(self, message: Message) -> None:
+        """Fuse the position of an ODOMETRY in the local frame, as external vision. Its time stamp is ignored."""
+        variance_m2, is_used = message.pose_covariance[0], int(self.parameters["EKF2_EV_CTRL"]) & 1
+        if not is_used or self.origin is None or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
+            return
+        if not all(map(math.isfinite, (message.x, message.y, message.z, variance_m2))):
+            return
+        lat_deg, lon_deg = beside(self.origin[0], self.origin[1], complex(message.y, message.x))
+        self._silent_s, noise_m = _VISION_SILENT_AFTER_S, max(math.sqrt(variance_m2), self.parameters["EKF2_EVP_NOISE"])
+        self._take(lat_deg, lon_deg, self.origin[2], noise_m, "EV")
+
+    def _take(self, lat_deg: float, lon_deg: float, alt_m: float, noise_m: float, of: str) -> None:
+        """Fuse a position, good to `noise_m`, by the parameters `of` its kind."""
+        is_starting = self.now_s - self._other_heard_s > self._silent_s
         is_late = self.now_s - self._other_s > _RESET_AFTER_S
         self._other_heard_s = self.now_s
-        noise_m = max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
-        lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
-        delay_s = self.parameters["EKF2_AGP0_DELAY"] / 1e3
+        delay_s = self.parameters[f"EKF2_{of}_DELAY"] / 1e3
+        gate = self.parameters["EKF2_EVP_GATE" if of == "EV" else "EKF2_AGP0_GATE"]
         moved_m = self.velocity_m_s * delay_s
         innovation_m = self._innovation_m(lat_deg, lon_deg) + moved_m
         variance_m2 = self.sd_m**2 + noise_m**2
         if self.origin is None:
-            self.origin = lat_deg, lon_deg, message.alt
+            self.origin = lat_deg, lon_deg, alt_m
             self._reset_to(lat_deg, lon_deg, noise_m)
-        elif abs(innovation_m) <= self.parameters["EKF2_AGP0_GATE"] * math.sqrt(variance_m2):
+        elif abs(innovation_m) <= gate * math.sqrt(variance_m2):
             gain = self.sd_m**2 / variance_m2
             self.error_m += gain * innovation_m
             self.sd_m *= math.sqrt(1 - gain)

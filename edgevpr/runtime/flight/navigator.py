@@ -253,7 +253,7 @@ class Navigator(Listener):
         """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
         how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
         is_apart = self._is_level or t_s - self._lean_s <= _LEAN_GOOD_FOR_S
-        return _PX4_ALIKE if self._channel is Channel.SENSOR and is_apart else _ALIKE
+        return _PX4_ALIKE if self._channel in (Channel.SENSOR, Channel.VISION) and is_apart else _ALIKE
 
     def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""

@@ -16,6 +16,7 @@ from edgevpr.mavlink.channel import (
     MAVLINK_GPS,
     PX4_PARAMETERS,
     SECOND,
+    VISION_CONTROL,
     Channel,
     Choice,
     Kind,
@@ -148,25 +149,38 @@ def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Fin
 
 def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
     parameters = reading.parameters
-    if CONTROL not in parameters:
-        if reading.kind is Kind.PLANE or parameters.get("EKF2_OF_CTRL") == 1:
-            return fine("channel", _sentence(choice.reason))
-        return wrong(
-            "channel",
-            f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
-            "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
-            "optical flow.",
-            "PX4 1.18 or later, with EKF2_AGP0_CTRL",
-            "or EKF2_OF_CTRL=1",
-        )
-    wanted = (
+    is_vision = choice.channel is Channel.VISION
+    if CONTROL not in parameters and not is_vision:
+        return _px4_single_fixes(choice, reading)
+    by_296 = (
         (choice.channel is not Channel.COMMAND, f"{CONTROL}={FUSES_POSITION}"),
         (parameters.get("EKF2_AGP0_ID", SENSOR_ID) == SENSOR_ID, f"EKF2_AGP0_ID={SENSOR_ID}"),
         (parameters.get("EKF2_AGP0_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_AGP0_DELAY=0"),
     )
-    changes = [change for is_so, change in wanted if not is_so]
-    unset = "PX4 can take positions as measurements (message 296), but is not set for it as edgevpr sends them"
+    by_odometry = (
+        (parameters.get("EKF2_EV_NOISE_MD", 0) == 0, "EKF2_EV_NOISE_MD=0"),
+        (parameters.get("EKF2_EV_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_EV_DELAY=0"),
+    )
+    changes = [change for is_so, change in (by_odometry if is_vision else by_296) if not is_so]
+    message = "ODOMETRY" if is_vision else "message 296"
+    unset = f"PX4 can take positions as measurements ({message}), but is not set for it as edgevpr sends them"
     return judged("channel", not changes, _sentence(choice.reason), f"{unset}: change this, and reboot.", *changes)
+
+
+def _px4_single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
+    if reading.kind is Kind.PLANE or reading.parameters.get("EKF2_OF_CTRL") == 1:
+        return fine("channel", _sentence(choice.reason))
+    change = f"{VISION_CONTROL}={FUSES_POSITION}"
+    if reading.parameters.get(VISION_CONTROL):
+        change = f"PX4 1.18 or later, with {CONTROL}, as {VISION_CONTROL} is that of another system"
+    return wrong(
+        "channel",
+        f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
+        "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
+        "optical flow.",
+        change,
+        "or EKF2_OF_CTRL=1",
+    )
 
 
 def _port(reading: AutopilotReading, change: str) -> Finding:
@@ -201,7 +215,9 @@ RULES = {
     "px4": FirmwareRules(
         name="PX4",
         knows_fixes=(1, 15),
-        parameters=(*PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_OF_CTRL"),
+        parameters=(
+            *PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD", "EKF2_OF_CTRL",
+        ),
         findings=_px4_findings,
         # TELEM 2, the usual port for a companion.
         port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),

@@ -19,6 +19,8 @@ VERSION, GPS, POSITION, ESTIMATOR, IMU = 148, 24, 33, 230, 26
 KNOWN = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_POS_HORIZ_ABS
 FUSES, AT_REST = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS, mavlink.ESTIMATOR_CONST_POS_MODE
 
+FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+
 SET_UP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1}  # a slot is opened at the start only
 
 without = pytest.mark.skipif(not PX4, reason="EDGEVPR_PX4 names no built PX4")
@@ -100,6 +102,43 @@ def test_a_receiver_that_it_does_not_use_is_seen_in_its_flags_and_nothing_else(p
     pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
 
 
+def there_at(pilot, lat_deg, lon_deg):
+    return MotionState(
+        t_mono_s=pilot.now_s,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=0.0,
+        velocity_m_s=(0.0, 0.0, 0.0),
+        accuracy_m=1.0,
+        alt_accuracy_m=3.0,
+        speed_accuracy_m_s=1.0,
+    )
+
+
+def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(pilot):
+    set_whole(pilot, "EKF2_GPS_CTRL", 0)
+    set_whole(pilot, "EKF2_EV_CTRL", 1)
+    try:
+        assert pilot.command(512, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) == ACCEPTED
+        said = pilot.until(lambda: pilot.last.get("GPS_GLOBAL_ORIGIN"), "the origin")
+        origin = said.latitude / 1e7, said.longitude / 1e7, said.altitude / 1e3
+        pilot.until(lambda: not flags(pilot) & FUSES, "no GPS in use")
+        pilot.wait(6)
+        there = moved(*place(pilot), 0.0, 2.0)
+        answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
+        for _ in range(60):
+            pilot.send(messages.vision_position(there_at(pilot, *there), origin))
+            pilot.wait(0.1)
+        assert flags(pilot) & (FUSES | FUSES_ANY) == FUSES_ANY
+        assert distance_m(*place(pilot), *there) < 1.5
+        assert sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard) == answered
+        pilot.until(lambda: not flags(pilot) & FUSES_ANY, "an end of it")
+    finally:
+        set_whole(pilot, "EKF2_EV_CTRL", 0)
+        set_whole(pilot, "EKF2_GPS_CTRL", 7)
+    pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
+
+
 def test_positions_of_message_296_are_fused_and_never_answered(pilot):
     if pilot.last["AUTOPILOT_VERSION"].flight_sw_version >> 16 & 255 < 18:
         pytest.skip("1.17.0 has no message 296")
@@ -110,17 +149,7 @@ def test_positions_of_message_296_are_fused_and_never_answered(pilot):
         there = moved(*place(pilot), 0.0, 2.0)
         answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
         for _ in range(60):
-            state = MotionState(
-                t_mono_s=pilot.now_s,
-                lat_deg=there[0],
-                lon_deg=there[1],
-                alt_m=0.0,
-                velocity_m_s=(0.0, 0.0, 0.0),
-                accuracy_m=1.0,
-                alt_accuracy_m=3.0,
-                speed_accuracy_m_s=1.0,
-            )
-            pilot.send(messages.position_sensor(state))
+            pilot.send(messages.position_sensor(there_at(pilot, *there)))
             pilot.wait(0.1)
         assert flags(pilot) & FUSES
         assert distance_m(*place(pilot), *there) < 1.5

@@ -273,7 +273,12 @@ def test_a_px4_that_can_take_positions_is_told_how():
 
 def test_a_px4_without_message_296_must_reckon_well_by_itself():
     without = replace(PX4, parameters={})
-    assert wrong(without) == {"channel": ("PX4 1.18 or later, with EKF2_AGP0_CTRL", "or EKF2_OF_CTRL=1")}
+    assert wrong(without) == {"channel": ("EKF2_EV_CTRL=1", "or EKF2_OF_CTRL=1")}
+    others = "PX4 1.18 or later, with EKF2_AGP0_CTRL, as EKF2_EV_CTRL is that of another system"
+    assert wrong(with_parameters(without, EKF2_EV_CTRL=15)) == {"channel": (others, "or EKF2_OF_CTRL=1")}
+    assert wrong(with_parameters(without, EKF2_EV_CTRL=1)) == {}
+    unlike = with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1, EKF2_EV_DELAY=250.0)
+    assert wrong(unlike) == {"channel": ("EKF2_EV_NOISE_MD=0", "EKF2_EV_DELAY=0")}
     assert wrong(replace(without, vehicle="plane")) == {}
     assert wrong(with_parameters(without, EKF2_OF_CTRL=1)) == {}
 
@@ -318,8 +323,9 @@ def test_the_pages_of_the_vehicles_name_what_is_told_to_change():
         assert f"`{change}`" in copter
     assert "EK3_SRC2_VELXY=6" not in copter
     unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
+    by_odometry = wrong(replace(PX4, parameters={}))["channel"][:1]
     for parameter, value in (
-        change.split("=") for change in (*wrong(unset)["channel"], *RULES["px4"].port_changes(921_600))
+        change.split("=") for change in (*wrong(unset)["channel"], *by_odometry, *RULES["px4"].port_changes(921_600))
     ):
         assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
