@@ -109,6 +109,7 @@ SCENARIOS = {
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
     "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=_AGP),
     "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=_AGP),
+    "px4_plane_still": Scenario(is_px4=True, is_compared=False),  # by 43003; the simulator of 1.17.0 has no wind
     "px4_copter_unused": Scenario(
         is_px4=True,
         vehicle="copter",

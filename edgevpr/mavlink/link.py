@@ -67,8 +67,8 @@ class LinkStats:
 
     @property
     def positions_sent(self) -> int:
-        """The number of positions sent to a PX4 by message 296."""
-        return self.sent.get("GLOBAL_POSITION_SENSOR", 0)
+        """The number of positions sent by message 296 or ODOMETRY."""
+        return self.sent.get("GLOBAL_POSITION_SENSOR", 0) + self.sent.get("ODOMETRY", 0)
 
 
 def _in_turn(

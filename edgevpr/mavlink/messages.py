@@ -189,7 +189,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
 
 def vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
     """Make an ODOMETRY (331) that says a position, north, east, down of `origin` (latitude, longitude in degrees,
-    altitude in metres above sea level), and nothing else. PX4 goes by the time of its arrival."""
+    altitude in metres above sea level), and nothing else. PX4 knows our clock by our answers to its TIMESYNC."""
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
     variances[0] = variances[6] = state.accuracy_m**2

@@ -157,9 +157,9 @@ def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float():
     assert autopilot.conversation.channel is Channel.SENSOR
 
 
-def px4_that_fuses(seconds=10):
+def px4_that_fuses(name="EKF2_AGP0_CTRL", **settings):
     one = struct.unpack("<f", struct.pack("<i", 1))[0]
-    return interviewed(PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)}, seconds)
+    return interviewed(PX4, {name: (one, mavlink.MAV_PARAM_TYPE_INT32)}, **settings)
 
 
 def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_known():
@@ -172,9 +172,7 @@ def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_k
 
 
 def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position_beside_it():
-    one = struct.unpack("<f", struct.pack("<i", 1))[0]
-    asked = {"EKF2_EV_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)}
-    autopilot, _ = interviewed(PX4, asked, origin=Position(46.5, 7.5, 400.0))
+    autopilot, _ = px4_that_fuses(name="EKF2_EV_CTRL", origin=Position(46.5, 7.5, 400.0))
     assert sent(autopilot, "ODOMETRY", 3.0) == []
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
     wanted = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
@@ -192,6 +190,10 @@ def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position
     assert said[0].frame_id == mavlink.MAV_FRAME_LOCAL_NED
     assert said[0].pose_covariance[0] == said[0].pose_covariance[6] == pytest.approx(STATE.accuracy_m**2)
     assert np.isnan([*said[0].q, said[0].vx, said[0].vy, said[0].vz]).all(), "its own are better"
+    for flags in (GLOBAL | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, GLOBAL):
+        sent(autopilot, "ODOMETRY", 0.5)
+        autopilot.px4_filter(2.0, flags)
+    assert autopilot.conversation.autopilot.px4.used_share == 0.5
 
 
 ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS

@@ -93,9 +93,10 @@ def test_what_is_claimed_is_met(how):
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
 
 
-def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has():
+@pytest.mark.parametrize("channel", [Channel.SENSOR, Channel.VISION])
+def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(channel):
     navigator = Navigator(1.0, 1.0)
-    navigator.hear_channel(Channel.SENSOR)
+    navigator.hear_channel(channel)
     air = Air(navigator, wind=WIND).fly(30)
     assert not said_states(air)
     air.lose_gps()
