@@ -1,7 +1,8 @@
 """Channels: the ways in which an autopilot can be told a position, and the rule that chooses one for a firmware and a
 kind of vehicle. Used by the link in flight, and by `edgevpr doctor` for its advice.
 
-The rules were read in the source code of PX4 1.17-alpha and of ArduPilot 4.7-dev, and tried on ArduPilot's simulator.
+The rules were read in the source code of PX4 1.17-alpha and of ArduPilot 4.7-dev, and tried on the
+simulators of both.
 """
 
 import logging
