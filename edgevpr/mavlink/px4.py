@@ -1,7 +1,7 @@
 """Use of GPS and of our positions by a PX4, as its filter's report (ESTIMATOR_STATUS) tells it: it has a flag that is
 set while the filter fuses GPS or our messages 296, and one that is set while it fuses our ODOMETRY, too. Neither
-message is ever answered. Read in the sources of 1.18 (EKF2, `Ekf::get_ekf_soln_status`), and held beside a real 1.17.0 and
-1.18-beta1."""
+message is ever answered. Read in the sources of 1.18 (EKF2, `Ekf::get_ekf_soln_status`), and held beside a real
+1.17.0 and 1.18-beta1."""
 
 import math
 
