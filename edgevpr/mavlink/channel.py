@@ -28,7 +28,7 @@ _GPS_LAG_S = 0.2
 # PX4
 FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
 CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
-VISION_CONTROL = "EKF2_EV_CTRL"  # its bits are those of a system that measures more, and sends ODOMETRY of its own
+VISION_CONTROL = "EKF2_EV_CTRL"  # with more bits it may be that of another system; before 1.16 the default is 15
 
 log = logging.getLogger(__name__)
 

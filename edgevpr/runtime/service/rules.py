@@ -170,15 +170,13 @@ def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
 def _px4_single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
     if reading.kind is Kind.PLANE or reading.parameters.get("EKF2_OF_CTRL") == 1:
         return fine("channel", _sentence(choice.reason))
-    change = f"{VISION_CONTROL}={FUSES_POSITION}"
-    if reading.parameters.get(VISION_CONTROL):
-        change = f"PX4 1.18 or later, with {CONTROL}, as {VISION_CONTROL} is that of another system"
+    others = ", unless another system aboard sends ODOMETRY" if reading.parameters.get(VISION_CONTROL) else ""
     return wrong(
         "channel",
         f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
         "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
         "optical flow.",
-        change,
+        f"{VISION_CONTROL}={FUSES_POSITION}{others}",
         "or EKF2_OF_CTRL=1",
     )
 

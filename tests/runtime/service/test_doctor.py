@@ -274,7 +274,7 @@ def test_a_px4_that_can_take_positions_is_told_how():
 def test_a_px4_without_message_296_must_reckon_well_by_itself():
     without = replace(PX4, parameters={})
     assert wrong(without) == {"channel": ("EKF2_EV_CTRL=1", "or EKF2_OF_CTRL=1")}
-    others = "PX4 1.18 or later, with EKF2_AGP0_CTRL, as EKF2_EV_CTRL is that of another system"
+    others = "EKF2_EV_CTRL=1, unless another system aboard sends ODOMETRY"
     assert wrong(with_parameters(without, EKF2_EV_CTRL=15)) == {"channel": (others, "or EKF2_OF_CTRL=1")}
     assert wrong(with_parameters(without, EKF2_EV_CTRL=1)) == {}
     unlike = with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1, EKF2_EV_DELAY=250.0)
