@@ -2,7 +2,7 @@
 this vehicle, and which parameters to change if not.
 
 Every rule of ArduPilot is based on the sources of 4.7-dev, every rule of PX4 on those of 1.17-alpha; their channels
-were flown in simulation with GPS taken away, with PX4 1.18-beta1.
+were flown in simulation with GPS taken away, with PX4 1.17.0 and 1.18-beta1.
 """
 
 from collections.abc import Callable, Iterator, Mapping
