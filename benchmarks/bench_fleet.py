@@ -164,19 +164,19 @@ def on_paper(ground: str, rows: Sequence[Row]) -> Row:
 
 
 def page(found: Row) -> str:
-    rows, large = found["rows"], found["large"]
+    rows, large, by = found["rows"], found.get("large"), "python benchmarks/bench_fleet.py --large"
     return f"""# Map making by many workers
 
 {base.told(__doc__)}
 
-{base.table([*rows, large["row"]], _COLUMNS, left=1)}
+{base.table([*rows, *([large["row"]] if large else [])], _COLUMNS, left=1)}
 
 On paper, {ON_PAPER:,} places, from the largest job that one worker and two have done:
 
 {base.table([on_paper(ground, rows) for ground in ("raster", "photographs")], _PAPER)}
 
 {base.made_line(found, "make bench-fleet")}
-The last row: {base.made_line(large, "python benchmarks/bench_fleet.py --large")}
+{f"The last row: {base.made_line(large, by)}" if large else ""}
 """
 
 

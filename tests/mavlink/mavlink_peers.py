@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 import tty
+from concurrent.futures import Future
 from pathlib import Path
 
 from edgevpr.lab.simulate.autopilot import AutopilotSummary, run_autopilot
@@ -169,15 +170,17 @@ class AutopilotThread:
 
     def __init__(self, link_url: str, **options) -> None:
         self._stop = threading.Event()
-        self._summaries: list[AutopilotSummary] = []
-        self._thread = threading.Thread(
-            target=lambda: self._summaries.append(run_autopilot(link_url, stop=self._stop, **options)), daemon=True
-        )
-        self._thread.start()
+        self._ended: Future[AutopilotSummary] = Future()
+        threading.Thread(target=self._run, args=(link_url, options), daemon=True).start()
+
+    def _run(self, link_url: str, options: dict) -> None:
+        try:
+            self._ended.set_result(run_autopilot(link_url, stop=self._stop, **options))
+        except Exception as error:  # of the test that waits for it, and of no other
+            self._ended.set_exception(error)
 
     def join(self) -> AutopilotSummary:
-        self._thread.join(PATIENCE_S)
-        return self._summaries[0]
+        return self._ended.result(PATIENCE_S)
 
     def finish(self) -> AutopilotSummary:
         self._stop.set()
