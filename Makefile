@@ -115,8 +115,8 @@ from-space: $(VENV)/installed
 	$(BIN)/python benchmarks/from_space.py
 	$(BIN)/python benchmarks/seams.py
 
-# Map making by one worker and by two, and what several flights leave of their maps, into benchmarks/results/: twenty
-# minutes.
+# Map making by one worker and by two, and what several flights leave of their maps, into benchmarks/results/: half
+# an hour.
 bench-fleet: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fleet]'
 	$(BIN)/python benchmarks/bench_fleet.py
