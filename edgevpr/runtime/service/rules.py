@@ -168,16 +168,16 @@ def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
 
 
 def _px4_single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
-    if reading.kind is Kind.PLANE or reading.parameters.get("EKF2_OF_CTRL") == 1:
+    """Return the finding about command 43003. That a copter may use optical flow is no news: PX4 may by default."""
+    if reading.kind is Kind.PLANE:
         return fine("channel", _sentence(choice.reason))
     others = ", unless another system aboard sends ODOMETRY" if reading.parameters.get(VISION_CONTROL) else ""
     return wrong(
         "channel",
         f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
-        "lost after some seconds, and its failsafe decides. Let it take positions as measurements, or give it "
-        "optical flow.",
+        "lost after some seconds, and its failsafe decides. Let it take positions as measurements: change this, and "
+        "reboot.",
         f"{VISION_CONTROL}={FUSES_POSITION}{others}",
-        "or EKF2_OF_CTRL=1",
     )
 
 
@@ -214,7 +214,7 @@ RULES = {
         name="PX4",
         knows_fixes=(1, 15),
         parameters=(
-            *PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD", "EKF2_OF_CTRL",
+            *PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD",
         ),
         findings=_px4_findings,
         # TELEM 2, the usual port for a companion.
