@@ -128,7 +128,7 @@ def main() -> None:
     parser.add_argument("--large", action="store_true", help=f"map {LARGE_PHOTOGRAPHS:,} photographs, and nothing else")
     parser.add_argument("--pictures", type=Path, help="their folder, which is made if it is not there")
     asked = parser.parse_args()
-    found: Row = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    found: Row = json.loads(RESULT.read_text())  # of the other jobs
     with tempfile.TemporaryDirectory(prefix="edgevpr-fleet-") as made:
         work = Path(made)
         if asked.large:
@@ -150,33 +150,32 @@ def small_jobs(work: Path) -> Iterator[Row]:
 
 
 def on_paper(ground: str, rows: Sequence[Row]) -> Row:
-    """Return the cost of a job of `ON_PAPER` places, from the largest job that one worker has done, and two."""
+    """Return the cost of a job of `ON_PAPER` places, from the largest job that one worker and two have done."""
     one, two = [[row for row in rows if row["ground"] == ground and row["workers"] == count][-1] for count in WORKERS]
-    pair = [row for row in rows if row["ground"] == ground and row["places"] == one["places"]][1]
     alone_h = ON_PAPER / one["per_s"] / 3600
     return {
         "ground": ground,
         "alone_h": alone_h,
-        "hundred_h": alone_h / 100 / pair["efficiency"],
+        "hundred_h": alone_h / 100 / two["efficiency"],
         "read_tb": ON_PAPER * two["read_kb"] / 1e9,
         "written_tb": ON_PAPER * two["written_kb"] / 1e9,
     }
 
 
 def page(found: Row) -> str:
-    rows, large, by = found["rows"], found.get("large"), "python benchmarks/bench_fleet.py --large"
+    rows, large, by = found["rows"], found["large"], "python benchmarks/bench_fleet.py --large"
     return f"""# Map making by many workers
 
 {base.told(__doc__)}
 
-{base.table([*rows, *([large["row"]] if large else [])], _COLUMNS, left=1)}
+{base.table([*rows, large["row"]], _COLUMNS, left=1)}
 
 On paper, {ON_PAPER:,} places, from the largest job that one worker and two have done:
 
 {base.table([on_paper(ground, rows) for ground in ("raster", "photographs")], _PAPER)}
 
 {base.made_line(found, "make bench-fleet")}
-{f"The last row: {base.made_line(large, by)}" if large else ""}
+The last row: {base.made_line(large, by)}
 """
 
 

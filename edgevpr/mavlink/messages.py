@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.wire import Message, mavlink, quaternion, rotmat
@@ -155,7 +156,6 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
     (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
     the height, which we do not measure, is sent as zero.
     """
-    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     east, north, down = state.velocity_m_s
     to_earth = rotmat.Matrix3()
     to_earth.from_euler(*attitude)
@@ -165,54 +165,54 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
     pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)
     pose_variances[20] = math.sqrt(_YAW_SD**3)
     velocity_variances[0] = velocity_variances[6] = velocity_variances[11] = state.speed_accuracy_m_s**2
-    return mavlink.MAVLink_odometry_message(
-        time_usec=round(state.t_mono_s * 1e6),
+    return _odometry(
+        state,
+        origin,
         frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
-        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
-        x=float(north_m),
-        y=float(east_m),
-        z=origin[2] - state.alt_m,
         q=list(quaternion.QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
         vx=velocity.x,
         vy=velocity.y,
         vz=velocity.z,
-        rollspeed=math.nan,
-        pitchspeed=math.nan,
-        yawspeed=math.nan,
         pose_covariance=pose_variances,
         velocity_covariance=velocity_variances,
-        reset_counter=0,
-        estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
-        quality=100,
     )
 
 
 def vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
     """Make an ODOMETRY (331) that says a position, north, east, down of `origin` (latitude, longitude in degrees,
     altitude in metres above sea level), and nothing else. PX4 knows our clock by our answers to its TIMESYNC."""
-    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
     variances[0] = variances[6] = state.accuracy_m**2
     variances[11] = state.alt_accuracy_m**2
-    return mavlink.MAVLink_odometry_message(
-        time_usec=round(state.t_mono_s * 1e6),
+    return _odometry(
+        state,
+        origin,
         frame_id=mavlink.MAV_FRAME_LOCAL_NED,
-        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
-        x=float(north_m),
-        y=float(east_m),
-        z=origin[2] - state.alt_m,
         q=[math.nan] * 4,
         vx=math.nan,
         vy=math.nan,
         vz=math.nan,
+        pose_covariance=variances,
+        velocity_covariance=[math.nan] * 21,
+    )
+
+
+def _odometry(state: MotionState, origin: tuple[float, float, float], **fields: Any) -> Message:
+    """Make an ODOMETRY with the position of a state beside `origin`, and with `fields`, those of the channel."""
+    east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
+    return mavlink.MAVLink_odometry_message(
+        time_usec=round(state.t_mono_s * 1e6),
+        child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
+        x=float(north_m),
+        y=float(east_m),
+        z=origin[2] - state.alt_m,
         rollspeed=math.nan,
         pitchspeed=math.nan,
         yawspeed=math.nan,
-        pose_covariance=variances,
-        velocity_covariance=[math.nan] * 21,
         reset_counter=0,
         estimator_type=mavlink.MAV_ESTIMATOR_TYPE_VISION,
         quality=100,
+        **fields,
     )
 
 

@@ -229,7 +229,7 @@ PX4 = {
     "EKF2_EVP_NOISE": 0.1,
     "EKF2_GPS_CTRL": 7,
     "EKF2_NOAID_TOUT": 5_000_000,
-    "EKF2_OF_CTRL": 0,
+    "EKF2_OF_CTRL": 1,  # as of a real one without any flow sensor
     "MAV_1_CONFIG": 102,
     "MAV_1_MODE": 2,
     "SER_TEL2_BAUD": 921_600,

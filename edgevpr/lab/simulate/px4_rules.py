@@ -35,7 +35,7 @@ class Px4(Firmware):
         super().__init__(kind, motion, PX4)
         self._fused_s = self._gps_s = self._aided_s = -math.inf  # last fused; GPS was; last not purely inertial
         self._other_s = self._other_heard_s = -math.inf  # message 296 or ODOMETRY: last fused, last received
-        self._silent_s = _SILENT_AFTER_S  # after which that is over
+        self._is_vision = False  # it was ODOMETRY
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
@@ -69,10 +69,10 @@ class Px4(Firmware):
             flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
             flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS
         has_ours = self._other_s > -math.inf and self.now_s - self._other_heard_s <= self._silent_s
-        has_gps, is_vision = self.now_s - self._gps_s < _AIDING_GONE_S, self._silent_s == _VISION_SILENT_AFTER_S
+        has_gps = self.now_s - self._gps_s < _AIDING_GONE_S
         if has_ours or has_gps:
             flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-        if has_gps or (has_ours and not is_vision):
+        if has_gps or (has_ours and not self._is_vision):
             flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
         if not self.motion.is_flying:  # at rest, whatever it knows
             flags |= mavlink.ESTIMATOR_CONST_POS_MODE
@@ -98,8 +98,8 @@ class Px4(Firmware):
         is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
             return
-        self._silent_s, noise_m = _SILENT_AFTER_S, max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
-        self._take(message.lat / 1e7, message.lon / 1e7, message.alt, noise_m, "AGP0")
+        self._is_vision, noise_m = False, max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
+        self._take(message.lat / 1e7, message.lon / 1e7, message.alt, noise_m)
 
     def take_odometry(self, message: Message) -> None:
         """Fuse the position of an ODOMETRY in the local frame, as external vision. Its time stamp is ignored."""
@@ -109,23 +109,28 @@ class Px4(Firmware):
         if not all(map(math.isfinite, (message.x, message.y, message.z, variance_m2))):
             return
         lat_deg, lon_deg = beside(self.origin[0], self.origin[1], complex(message.y, message.x))
-        self._silent_s, noise_m = _VISION_SILENT_AFTER_S, max(math.sqrt(variance_m2), self.parameters["EKF2_EVP_NOISE"])
-        self._take(lat_deg, lon_deg, self.origin[2], noise_m, "EV")
+        self._is_vision, noise_m = True, max(math.sqrt(variance_m2), self.parameters["EKF2_EVP_NOISE"])
+        self._take(lat_deg, lon_deg, self.origin[2], noise_m)
 
-    def _take(self, lat_deg: float, lon_deg: float, alt_m: float, noise_m: float, of: str) -> None:
-        """Fuse a position, good to `noise_m`, by the parameters `of` its kind."""
+    @property
+    def _silent_s(self) -> float:
+        """The time after which no position of ours is fused any more."""
+        return _VISION_SILENT_AFTER_S if self._is_vision else _SILENT_AFTER_S
+
+    def _take(self, lat_deg: float, lon_deg: float, alt_m: float, noise_m: float) -> None:
+        """Fuse a position, good to `noise_m`."""
         is_starting = self.now_s - self._other_heard_s > self._silent_s
         is_late = self.now_s - self._other_s > _RESET_AFTER_S
         self._other_heard_s = self.now_s
-        delay_s = self.parameters[f"EKF2_{of}_DELAY"] / 1e3
-        gate = self.parameters["EKF2_EVP_GATE" if of == "EV" else "EKF2_AGP0_GATE"]
+        delay, gate = ("EKF2_EV_DELAY", "EKF2_EVP_GATE") if self._is_vision else ("EKF2_AGP0_DELAY", "EKF2_AGP0_GATE")
+        delay_s = self.parameters[delay] / 1e3
         moved_m = self.velocity_m_s * delay_s
         innovation_m = self._innovation_m(lat_deg, lon_deg) + moved_m
         variance_m2 = self.sd_m**2 + noise_m**2
         if self.origin is None:
             self.origin = lat_deg, lon_deg, alt_m
             self._reset_to(lat_deg, lon_deg, noise_m)
-        elif abs(innovation_m) <= gate * math.sqrt(variance_m2):
+        elif abs(innovation_m) <= self.parameters[gate] * math.sqrt(variance_m2):
             gain = self.sd_m**2 / variance_m2
             self.error_m += gain * innovation_m
             self.sd_m *= math.sqrt(1 - gain)
