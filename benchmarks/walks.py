@@ -24,7 +24,8 @@ from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 

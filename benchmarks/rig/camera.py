@@ -6,6 +6,7 @@ that moment, so it is as if it had been taken then.
 """
 
 import contextlib
+import math
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -14,10 +15,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import av
+import cv2
 import ground
 import numpy as np
+from scenarios import Scenario
 from truth import Truth
 
+from edgevpr.frames.level import Mount
 from edgevpr.lab.simulate.camera import CameraPose
 
 PICTURES_HZ = 5.0
@@ -38,13 +42,11 @@ class Picture:
 
 class Camera:
     """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
-    file. `seed` is that of the noise. `is_level`: on a gimbal; else fixed to the airframe. `is_stamped`: the pictures
-    have their times."""
+    file: that of the airframe. `seed` is that of the noise, the `scenario` says how the camera is mounted, and if the
+    pictures have their times."""
 
-    def __init__(
-        self, truth: Truth, lit_ground: np.ndarray, log: Path, seed: int, is_level: bool, is_stamped: bool
-    ) -> None:
-        self._truth, self._ground, self._is_level, self.is_stamped = truth, lit_ground, is_level, is_stamped
+    def __init__(self, truth: Truth, lit_ground: np.ndarray, log: Path, seed: int, scenario: Scenario) -> None:
+        self._truth, self._ground, self._scenario, self.is_stamped = truth, lit_ground, scenario, scenario.is_stamped
         self._log, self._rng = log, np.random.default_rng(seed)
         self._picture: Picture | None = None
         self._is_on, self._changed = True, threading.Condition()
@@ -96,11 +98,20 @@ class Camera:
 
     def _rendered(self, pose: CameraPose) -> bytes:
         pose = replace(pose, height_m=max(pose.height_m, 1.0))
-        if self._is_level:
+        if self._scenario.is_level:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
         elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _BEYOND_DEG:
             pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
-        return ground.picture(self._ground, pose, "later", self._rng)
+        return ground.picture(self._ground, mounted(pose, self._scenario.mount), "later", self._rng)
+
+
+def mounted(pose: CameraPose, mount: Mount) -> CameraPose:
+    """Return the pose of a camera that is mounted so under an airframe of that pose."""
+    about_down = cv2.Rodrigues(np.radians((0.0, 0.0, pose.heading_deg)))[0]
+    body = Mount(pose.pitch_deg, -pose.roll_deg).body_from_straight()
+    (nose, *_), (right, *_), (down, *below) = about_down @ body @ mount.body_from_straight()
+    angles = math.atan2(right, nose), math.atan2(*below), -math.asin(down)
+    return replace(pose, **dict(zip(("heading_deg", "roll_deg", "pitch_deg"), map(math.degrees, angles), strict=True)))
 
 
 class _Viewer(BaseHTTPRequestHandler):

@@ -65,9 +65,9 @@ class Run:
             simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners)
             self._simulator = stack.enter_context(simulator)
             if not self._is_control:
-                lit, stream = ground.lit_ground(self._work, "later"), (scenario.is_level, scenario.is_stamped)
+                lit = ground.lit_ground(self._work, "later")
                 seed = ground.SEED + scenario_of(folder.name)[1]
-                camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, *stream))
+                camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
                 between = DatagramRelay, COMPANION_PORTS, "udpin"
                 relay_of, ports, kind = between if scenario.is_px4 else (Relay, COMPANION_PORT, "tcp")
                 relay = stack.enter_context(relay_of(self._truth, folder / "sent.csv", ports, home_m))

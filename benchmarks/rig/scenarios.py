@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from edgevpr.frames.level import STRAIGHT_DOWN, Mount
+
 HEIGHT_M = 100.0
 HOME_M, CLIMB_M = (240.0, 200.0), (560.0, 230.0)  # metres east and north on the ground
 CIRCUIT_M = ((1060.0, 260.0), (1060.0, 730.0), (340.0, 730.0), (340.0, 260.0))
@@ -19,10 +21,11 @@ class Scenario:
 
     From the loss on there is wind, and the autopilot is told to use the `source_set` (None: its own choice). Without
     `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on, or a PX4 `uses_no_gps`. The camera
-    `is_level` on a gimbal, or fixed to the airframe, and its pictures are `is_stamped` with their times, or not.
-    `parameters` are the autopilot's, `with_edgevpr` those that are set for a flight with edgevpr only; `config` is what
-    edgevpr's configuration says beside the usual; its map ends `mapped_m` north (None: nowhere). `starts_early`:
-    edgevpr runs before arming. `is_compared`: the same flight without edgevpr says something."""
+    `is_level` on a gimbal, or fixed to the airframe with a `mount` that edgevpr is not told, and its pictures are
+    `is_stamped` with their times, or not. `parameters` are the autopilot's, `with_edgevpr` those that are set for a
+    flight with edgevpr only; `config` is what edgevpr's configuration says beside the usual; its map ends `mapped_m`
+    north (None: nowhere). `starts_early`: edgevpr runs before arming. `is_compared`: the same flight without edgevpr
+    says something."""
 
     vehicle: str = "plane"
     is_px4: bool = False
@@ -35,6 +38,7 @@ class Scenario:
     glitch_m_s: float = 0.0
     source_set: int | None = None
     is_level: bool = False
+    mount: Mount = STRAIGHT_DOWN
     is_stamped: bool = True
     parameters: Mapping[str, float] = field(default_factory=dict)
     with_edgevpr: Mapping[str, float] = field(default_factory=dict)
@@ -99,6 +103,7 @@ SCENARIOS = {
     "plane_still": Scenario(),
     "plane_level": Scenario(wind_m_s=6.0, is_level=True, config={"source": {"gimbal": True}}),
     "plane_mjpeg": Scenario(wind_m_s=6.0, is_stamped=False, is_compared=False),
+    "plane_mounted": Scenario(wind_m_s=6.0, gps_s=300.0, mount=Mount(7.0, -4.0), is_compared=False),
     "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
     "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),
     "copter_off_map": Scenario(

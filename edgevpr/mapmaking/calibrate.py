@@ -47,7 +47,8 @@ from edgevpr.runtime.recognise.evidence import (
     kinds_of,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found

@@ -26,7 +26,7 @@ from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
 from edgevpr.runtime.recognise.evidence import MapCalibration, kinds_of
 from edgevpr.runtime.recognise.levelling import levelling_of
 from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_lens, say_other_mask, technique_of
-from edgevpr.runtime.recognise.recogniser import Preparation
+from edgevpr.runtime.recognise.preparation import Preparation
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource

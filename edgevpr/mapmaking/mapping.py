@@ -21,7 +21,8 @@ from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, says_nothing
 from edgevpr.runtime.recognise.levelling import laid
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, best_of
 

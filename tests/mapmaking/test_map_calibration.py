@@ -26,7 +26,7 @@ from edgevpr.runtime.recognise.confidence import Logistic
 from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.recogniser import Preparation
+from edgevpr.runtime.recognise.preparation import Preparation
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow

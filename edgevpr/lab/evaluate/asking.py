@@ -26,7 +26,8 @@ from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Told, lacking, told_parts
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 

@@ -161,6 +161,11 @@ class ToAutopilot:
             self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong)
 
+    def begin_anew(self) -> None:
+        """Begin to navigate anew, since fixes err otherwise from now on."""
+        with self._link.turn("anew"):
+            self._navigator.begin_anew()
+
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Send the health, load and temperature (None: unknown) of this companion computer, and ask the autopilot for
         another source set if that is wanted (see `SourceSets`). Call it once a second."""

@@ -15,6 +15,7 @@ from typing import Any
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Frame
+from edgevpr.frames.level import Mount
 from edgevpr.frames.source import recorded_steps
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
@@ -69,7 +70,7 @@ class Flight:
         self._commands = Commands(crew.link, herald, crew.learner)
         self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks)
         gps = GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot)
-        self._surveyor = Surveyor(herald, gps, config.source)
+        self._surveyor = Surveyor(herald, gps, config.source, self._look)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.tell,
             self._vitals.tell,
@@ -255,6 +256,13 @@ class Flight:
             hints=event.hints.fields() if event.hints else None,
             totals=self.totals(),
         )
+
+    def _look(self, mount: Mount) -> None:
+        """Level the pictures to come as those of a camera that looks there, and navigate by their fixes only."""
+        recogniser = self._crew.recogniser
+        recogniser.preparation = recogniser.preparation.looking(mount)
+        if self._crew.autopilot:
+            self._crew.autopilot.begin_anew()
 
     def _learn(self, event: Recognition) -> None:
         """Add the frame of an event to the map as a new place, if `Learner` finds it worth remembering."""

@@ -79,9 +79,14 @@ class Navigator(Listener):
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
         positions, and we must not use it: the path is then summed up from accelerations."""
         with self._lock:
-            if channel.is_continuous != self._channel.is_continuous:
-                self._navigation = Navigation(INERTIAL if channel.is_continuous else RECKONED, self._map_sd_m)
-            self._channel = channel
+            before, self._channel = self._channel, channel
+            if channel.is_continuous != before.is_continuous:
+                self._begin()
+
+    def begin_anew(self) -> None:
+        """Note that from now on fixes err otherwise than those before: begin again at the autopilot's position."""
+        with self._lock:
+            self._begin()
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
@@ -187,6 +192,10 @@ class Navigator(Listener):
                 speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
                 attitude=None if attitude is None else _in_radians(attitude),
             )
+
+    def _begin(self) -> None:
+        drift = INERTIAL if self._channel.is_continuous else RECKONED
+        self._navigation, self._consistency = Navigation(drift, self._map_sd_m), Consistency()
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""

@@ -12,7 +12,7 @@ held to be wrong too; but then all of the flight must say the same, what came be
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position, Vehicle
+from edgevpr.frames.level import Mount
 from edgevpr.runtime.flight.consistency import HeardFrame, positioned
 from edgevpr.runtime.flight.navigation import reckons_by_gps
 from edgevpr.runtime.recognise.locate import in_sd
@@ -109,11 +110,11 @@ class Surveyed:
 
 
 class Sightings:
-    """Collects sightings. `mount_deg` is where the camera looks by the configuration (ahead, right), which its pictures
-    are levelled by already. `is_level`: the camera hangs in a gimbal, whatever the airframe's attitude."""
+    """Collects sightings. `mount` is where the camera is taken to look, by which its pictures are levelled. `is_level`:
+    the camera hangs in a gimbal, whatever the airframe's attitude."""
 
-    def __init__(self, mount_deg: tuple[float, float], is_level: bool) -> None:
-        self._mount_deg, self._is_level = mount_deg, is_level
+    def __init__(self, mount: Mount, is_level: bool) -> None:
+        self.mount, self._is_level = mount, is_level
         self._kept: deque[Sighting] = deque(maxlen=_MOST)
         self._origin: Position | None = None
         self._taken_s = -math.inf
@@ -131,7 +132,7 @@ class Sightings:
             return False
         t_s, height_m = event.frame.t_mono_s, where.height_m or vehicle.height_m
         seen = positioned(event, HeardFrame(t_s=t_s, sd_m=_ATTITUDE_SD * (height_m or 0.0)))
-        look = self._look(vehicle, height_m, t_s)
+        look = self._look(vehicle, height_m, seen.turn_deg or 0.0) if seen else None
         if seen is None or look is None or not vehicle.is_fresh_at(t_s):
             return False
         at = _beside(vehicle, t_s)
@@ -147,13 +148,21 @@ class Sightings:
         self._taken_s = t_s
         return True
 
-    def _look(self, vehicle: Vehicle, height_m: float | None, t_s: float) -> Doubles | None:
-        """Return how offset, mount, scale and time move a match (2, 6), but for the scale; None if it is unknown."""
+    def look(self, mount: Mount) -> None:
+        """Note that the next pictures are levelled by another mount, and keep the sightings as if all had been."""
+        by = _tangents(mount) - _tangents(self.mount)
+        kept = [replace(each, off_m=each.off_m - each.look[:, 2:4] @ by) for each in self._kept]
+        self.mount, self._kept = mount, deque(kept, maxlen=_MOST)
+
+    def _look(self, vehicle: Vehicle, height_m: float | None, turn_deg: float) -> Doubles | None:
+        """Return how offset, mount, scale and time move a match (2, 6), but for the scale; None if it is unknown. The
+        mount turns with the picture, which is turned by `turn_deg` against a compass that is wrong."""
         roll_deg, pitch_deg = (0.0, 0.0) if self._is_level else (vehicle.roll_deg, vehicle.pitch_deg)
         known = vehicle.heading_deg, height_m, roll_deg, pitch_deg, *(vehicle.velocity_m_s or (None,))
         if not all(each is not None and math.isfinite(each) for each in known) or not height_m or height_m <= 0:
             return None
         heading, roll, pitch = (math.radians(each or 0.0) for each in (vehicle.heading_deg, roll_deg, pitch_deg))
+        heading += math.radians(turn_deg)
         ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # an airframe that banks turns it too
         east, north = vehicle.velocity_m_s or (0.0, 0.0)
         return np.array(
@@ -176,7 +185,7 @@ class Sightings:
             return None
         way, covariance = there @ way, there @ covariance @ there.T
         sd = np.sqrt(np.diag(covariance))
-        angles_deg = np.degrees(np.arctan(way[2:4])) + self._mount_deg
+        angles_deg = np.degrees(np.arctan(way[2:4] + _tangents(self.mount)))
         sds_deg = np.hypot(np.degrees(sd[2:4]), _LEVEL_SD_DEG)
         ahead, right = (
             Measure((angle_deg,), sd_deg, 1.5, 1.0)
@@ -214,6 +223,12 @@ def fitted(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
             counts = (miss <= _WRONG * scatter).astype(float)
     covariance: Doubles = scatter**2 * np.linalg.inv(normal)
     return way, covariance, counts > 0
+
+
+def _tangents(mount: Mount) -> Doubles:
+    """Return by how much of its height a camera looks ahead and to the right (2,)."""
+    tangents: Doubles = np.tan(np.radians((mount.ahead_deg, mount.right_deg)))
+    return tangents
 
 
 def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles) -> bool:

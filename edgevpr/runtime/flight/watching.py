@@ -4,6 +4,7 @@ it ends no flight."""
 
 import logging
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,11 +13,13 @@ from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import beside
 from edgevpr.core.types import Receiver, Vehicle
+from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.flight.herald import Herald, Trouble
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
+from edgevpr.runtime.recognise.levelling import mount_of
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -43,6 +46,7 @@ _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver m
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
+_MOUNT = "ahead_deg", "right_deg"
 _ANEW = 3.0  # times the least that counts: a result that was told is told anew when it has changed by more
 
 _log = logging.getLogger(__name__)
@@ -170,6 +174,12 @@ class GpsWatch:
         self._agreed: set[int] = set()  # places of the last match that agreed
         self.is_wrong = False
 
+    def begin_anew(self) -> None:
+        """Forget what matches were beside GPS, since they are from now on."""
+        self._against.clear()
+        self._doubts.clear()
+        self._usual_m, self._usual_of = np.zeros(2), 0
+
     def tell(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
         vehicle = event.vehicle
@@ -232,14 +242,15 @@ class GpsWatch:
 class Surveyor:
     """Reports where the map lies and where the camera looks (see `survey`), once each is known and is not as it should
     be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is held to be wrong: what
-    was reported is taken back where that contradicts it."""
+    was reported of the map is taken back where that contradicts it. `look` is called when the camera is found to look
+    elsewhere: the pictures to come are levelled by that."""
 
-    def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig) -> None:
-        mount_deg = source.mount_ahead_deg, source.mount_right_deg
-        self._herald, self._gps, self._taken = herald, gps, 0
-        self._sightings = Sightings(mount_deg, source.gimbal)
+    def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig, look: Callable[[Mount], None]) -> None:
+        mount = mount_of(source)
+        self._herald, self._gps, self._taken, self._on_look = herald, gps, 0, look
+        self._sightings = Sightings(mount, source.gimbal)
         self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}
-        self._expected |= {"ahead_deg": mount_deg[:1], "right_deg": mount_deg[1:]}
+        self._expected |= {"ahead_deg": (mount.ahead_deg,), "right_deg": (mount.right_deg,)}
         self._told: dict[str, tuple[float, ...]] = {}
 
     def tell(self, event: Recognition) -> None:
@@ -256,12 +267,10 @@ class Surveyor:
     def _look(self, is_end: bool) -> None:
         found, names = self._sightings.result(), set[str]()
         if found is None:
-            if self._told:
-                self._told.clear()
-                said = "what was said of map and camera is taken back, GPS contradicts it"
-                self._herald.tell(
-                    "survey", Severity.WARNING, said, ground="map and camera are unknown again", said=said
-                )
+            if of_map := self._told.keys() - set(_MOUNT):
+                self._told = {name: value for name, value in self._told.items() if name not in of_map}
+                said = "what was said of the map is taken back, GPS contradicts it"
+                self._herald.tell("survey", Severity.WARNING, said, ground="the map lies unknown again", said=said)
             return
         for name, each in found.measures.items():
             before = self._told.get(name)
@@ -270,6 +279,8 @@ class Surveyor:
                 names.add(name)
         if names or (is_end and self._told):
             self._report(found, names)
+        if names.intersection(_MOUNT) and not is_end:
+            self._look_as_found()
 
     def _report(self, found: Surveyed, names: set[str]) -> None:
         """Write a line of all that is known, and say what of `names` is not as it should be."""
@@ -281,6 +292,13 @@ class Surveyor:
         for name, (sentence, ground) in sentences.items():
             if name in names:
                 self._herald.say(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
+
+    def _look_as_found(self) -> None:
+        """Level the pictures to come by what was told of the camera; what has been compared with GPS is void."""
+        mount = Mount(*(self._told.get(name, self._expected[name])[0] for name in _MOUNT))
+        self._sightings.look(mount)
+        self._gps.begin_anew()
+        self._on_look(mount)
 
 
 def _surveyed(name: str, found: Measure) -> tuple[str, str]:
@@ -295,7 +313,8 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
     sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
     side, key = sides[first > 0], f"source.mount_{name}"
     looks = f"looks {abs(first):.1f} degrees {side}"
-    return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
+    there = f"the camera {looks} of straight down, +-{found.sd:.1f}, and is taken to from now on"
+    return f"{there}: set {key}: {first:.1f}", f"camera {looks}"
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:

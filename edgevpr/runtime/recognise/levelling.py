@@ -62,6 +62,12 @@ class Levelling:
         self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
         self._has_warned = False
 
+    def looking(self, mount: Mount) -> "Levelling":
+        """Return the same for a camera that is mounted otherwise."""
+        lens = self.lens and replace(self.lens, mount=mount)
+        how = {"below": self._below, "on_gimbal": self._on_gimbal, "is_live": self._is_live}
+        return Levelling(lens, **how, mount=mount)
+
     def prepare(
         self,
         frame: Frame,

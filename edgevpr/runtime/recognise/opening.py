@@ -26,7 +26,8 @@ from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, Told
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, is_now, levelling_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Preparation, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
 from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques.card import load_card

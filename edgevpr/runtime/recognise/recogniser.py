@@ -13,8 +13,7 @@ from itertools import islice
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, enlarged
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers, layers_of
 from edgevpr.places.readmap import ReadMap
@@ -35,11 +34,10 @@ from edgevpr.runtime.recognise.judge import (
     says_nothing,
 )
 from edgevpr.runtime.recognise.landmarks import describe, packed
-from edgevpr.runtime.recognise.levelling import Levelling, Straightening, seen_as
+from edgevpr.runtime.recognise.levelling import seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
+from edgevpr.runtime.recognise.preparation import AS_IT_IS, Preparation
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import Gate
-from edgevpr.runtime.recognise.stride import Strides
 
 _log = logging.getLogger(__name__)
 _Judged = tuple[Verdict, Candidate, Located | None]  # with the best place, and the position of the aircraft
@@ -64,27 +62,6 @@ class Matcher:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Preparation:
-    """Preparation of a frame before it is searched for: `levelling` levels or straightens its picture, `mask` excludes
-    parts of it, `gate` rejects frames that are not memorable, and `strides` measures the motion since the frame before
-    (None: it is not done)."""
-
-    levelling: Levelling | Straightening | None = None
-    mask: Mask | None = None
-    gate: Gate | None = None
-    strides: Strides | None = None
-
-    def picture(
-        self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
-    ) -> Levelled:
-        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
-        mask = self.mask.fitted(frame.image) if self.mask else None
-        if self.levelling is None:
-            return enlarged(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
-        return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class WalkSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
     `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
@@ -98,7 +75,8 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `prior` makes hints that narrow each query (None: the whole map is searched). `follower` follows the flight from
-    query to query (None: each is judged alone). The governor changes `candidates`; `take` and `extend` the index.
+    query to query (None: each is judged alone). The governor changes `candidates`, a survey of the camera's mount the
+    `preparation`; `take` and `extend` the index.
     """
 
     def __init__(
@@ -108,12 +86,12 @@ class Recogniser:
         meter: QueryMeter,
         settings: WalkSettings = WalkSettings(),
         *,
-        preparation: Preparation = Preparation(),
+        preparation: Preparation = AS_IT_IS,
         prior: Prior | Told | None = None,
         follower: Follower | None = None,
     ) -> None:
         self.place_map, self.meter, self.candidates = place_map, meter, settings.candidates
-        self._settings, self._preparation = settings, preparation
+        self._settings, self.preparation = settings, preparation
         self._prior, self._follower = prior, follower
         self._told = 0  # number of left out places that events have reported
         self._new: dict[int, float] = {}  # places by their numbers, and the times they were learnt
@@ -149,7 +127,7 @@ class Recogniser:
         """
         self.meter.begin()
         event = Recognition(frame=frame, vehicle=vehicle)
-        preparation = self._preparation
+        preparation = self.preparation
         try:
             with self.meter.step("prepare"):
                 event.picture = picture = self._picture(frame, vehicle)
@@ -174,7 +152,7 @@ class Recogniser:
 
     def _picture(self, frame: Frame, vehicle: Vehicle | None) -> Levelled:
         """Prepare a picture, scaled to the places to look among, and by what the matches before have shown."""
-        return self._preparation.picture(frame, vehicle, layers=self._layers, scale=self._scale)
+        return self.preparation.picture(frame, vehicle, layers=self._layers, scale=self._scale)
 
     @property
     def _scale(self) -> float:
@@ -189,7 +167,7 @@ class Recogniser:
     @property
     def measures_strides(self) -> bool:
         """True if the motion between two frames is measured."""
-        return self._preparation.strides is not None
+        return self.preparation.strides is not None
 
     def stride(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Measure the motion from the frame before to this one, and nothing else. Never raises an Exception."""
@@ -207,7 +185,7 @@ class Recogniser:
 
     def _measure_stride(self, event: Recognition, looked: Verification) -> None:
         """Measure the stride of a frame from the one before, if its picture lies on the ground."""
-        strides = self._preparation.strides
+        strides = self.preparation.strides
         if strides and event.frame and event.view.is_laid:
             with self.meter.step("stride"):
                 event.stride = strides.to(event.frame.t_mono_s, event.view, looked.landmarks)

@@ -43,6 +43,20 @@ def test_with_gps_none_is_sent():
     assert {advice.why for _, advice in air.advices} == {"not needed: the autopilot has GPS"}
 
 
+@pytest.mark.parametrize("begins_anew", [False, True])
+def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(begins_anew):
+    air = Air(Navigator(1.0, 1.0))
+    air.map_off = air.map_off + np.array((16.0, 0.0))
+    air.fly(120)
+    air.map_off = air.map_off - np.array((16.0, 0.0))
+    if begins_anew:
+        air.navigator.begin_anew()
+    air.advices.clear()
+    held = [advice.is_held for _, advice in air.fly(30).advices]
+    assert len(held) > 25
+    assert any(held) == (not begins_anew)
+
+
 def test_one_is_sent_when_the_autopilot_is_better_off_and_else_it_says_by_how_little():
     air = lost(wind=WIND).fly(60)
     assert len(air.sent) > 30

@@ -12,7 +12,7 @@ from fakes import FakeClock, FakeLink, vehicle_at
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position, Receiver
-from edgevpr.frames.level import View
+from edgevpr.frames.level import STRAIGHT_DOWN, Mount, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.survey import Sightings
@@ -48,8 +48,9 @@ def line(t_s):
     return np.array([0.0, SPEED_M_S * t_s]), 0.0
 
 
-def events(way, seconds, seed=1, wrong=0.0, **said):
-    """The matches of a flight, one a second, with a GPS whose error lasts; `wrong` is the share of wrong ones."""
+def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said):
+    """The matches of a flight, one a second, with a GPS whose error lasts; `wrong` is the share of wrong ones. The
+    compass is wrong by `compass_deg`."""
     rng, gps_off_m = np.random.default_rng(seed), np.zeros(2)
     for t_s in map(float, range(seconds)):
         at_m, heading_deg = way(t_s)
@@ -61,22 +62,28 @@ def events(way, seconds, seed=1, wrong=0.0, **said):
         )
         gps_off_m = (1 - 1 / GPS_LASTS_S) * gps_off_m + rng.normal(0, GPS_SD_M * math.sqrt(2 / GPS_LASTS_S), 2)
         mount_m = HEIGHT_M * (math.tan(math.radians(AHEAD_DEG)) * ahead + math.tan(math.radians(RIGHT_DEG)) * right)
-        fix_m = at_m + OFF_M + SCALE * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
+        fix_m = at_m + OFF_M + scale * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
         if rng.random() < wrong:
             fix_m = fix_m + rng.normal(0, 150, 2)
         gps = moved(*HOME, *(at_m + gps_off_m))
         velocity = np.clip((after_m - at_m) / 0.01, -SPEED_M_S, SPEED_M_S)
-        known = {"heading_deg": heading_deg % 360, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
+        told_deg = (heading_deg + compass_deg) % 360
+        known = {"heading_deg": told_deg, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
         known |= {"velocity_m_s": tuple(velocity), "gps": Receiver(*gps, GPS_SD_M, t_s)} | said
         event = match_at(
-            Position(*moved(*HOME, *fix_m)), t_s, vehicle_at(*gps, t_s, **known), FIX_SD_M, (int(t_s),), SEEN
+            Position(*moved(*HOME, *fix_m)),
+            t_s,
+            vehicle_at(*gps, t_s, **known),
+            FIX_SD_M,
+            (int(t_s),),
+            replace(SEEN, up_deg=told_deg),
         )
         event.located = replace(event.located, heading_deg=heading_deg % 360)
         yield event
 
 
-def surveyed(way, seconds, mount_deg=(0.0, 0.0), **how):
-    sightings = Sightings(mount_deg, is_level=False)
+def surveyed(way, seconds, mount=STRAIGHT_DOWN, **how):
+    sightings = Sightings(mount, is_level=False)
     for event in events(way, seconds, **how):
         sightings.take(event)
     return sightings.result()
@@ -123,9 +130,15 @@ def test_on_a_straight_line_an_offset_is_no_mount():
 
 
 def test_what_is_set_of_the_mount_counts():
-    found = surveyed(lanes, 600, mount_deg=(2.0, -1.0))
+    found = surveyed(lanes, 600, mount=Mount(2.0, -1.0))
     assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG + 2.0, abs=1.0)
     assert found.right_deg.value[0] == pytest.approx(RIGHT_DEG - 1.0, abs=1.0)
+
+
+def test_a_mount_is_told_by_the_turn_of_the_picture_where_the_compass_is_wrong():
+    found = surveyed(lanes, 600, compass_deg=90.0)
+    assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=1.0)
+    assert found.right_deg.value[0] == pytest.approx(RIGHT_DEG, abs=1.0)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +160,7 @@ def test_without_gps_or_attitude_nothing_is_found(said):
 def test_a_position_that_may_be_ours_is_not_gps():
     """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
     rng = np.random.default_rng(3)
-    sightings = Sightings((0.0, 0.0), is_level=False)
+    sightings = Sightings(STRAIGHT_DOWN, is_level=False)
     for event in events(lanes, 900):
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
         late = moved(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
@@ -160,6 +173,19 @@ def test_a_position_that_may_be_ours_is_not_gps():
     assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=found.ahead_deg.sd)
 
 
+def levelled(event, mount, was):
+    """The position of a match if its picture is levelled by another mount than it was."""
+    heading = math.radians(event.vehicle.heading_deg)
+    ahead_m, right_m = (
+        HEIGHT_M * (math.tan(math.radians(one)) - math.tan(math.radians(other)))
+        for one, other in ((mount.ahead_deg, was.ahead_deg), (mount.right_deg, was.right_deg))
+    )
+    east_m = ahead_m * math.sin(heading) + right_m * math.cos(heading)
+    north_m = ahead_m * math.cos(heading) - right_m * math.sin(heading)
+    at = event.located.position
+    return Position(*moved(at.lat_deg, at.lon_deg, -east_m, -north_m))
+
+
 class Flown:
     """A surveyor that has heard a flight; `lines` are its lines of the log, `texts` what the ground was told."""
 
@@ -169,14 +195,18 @@ class Flown:
         with FlightLog(folder / "log", clock=clock) as flight_log:
             herald = Herald(flight_log, link)
             watch = GpsWatch(5.0, herald, None)
-            surveyor = Surveyor(herald, watch, config.source)
+            self.mounts, beside = [], Mount(config.source.mount_ahead_deg, config.source.mount_right_deg)
+            surveyor = Surveyor(herald, watch, config.source, self.mounts.append)
             for event in flight:
                 clock.now_s = event.frame.t_mono_s
+                if self.mounts:
+                    event.located = replace(event.located, position=levelled(event, self.mounts[-1], beside))
                 watch.tell(event)
                 surveyor.tell(event)
             self.last = clock.now_s
             surveyor.end()
         self.lines = [line for line in read_log(folder / "log") if line["kind"] == "survey"]
+        self.alarms_s = [line["t_mono_s"] for line in read_log(folder / "log") if line["kind"] == "gps"]
         self.texts = [text for _, text in link.texts() if "GPS is" not in text and "GPS agrees" not in text]
 
 
@@ -257,3 +287,31 @@ def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
     assert "taken back" in flown.lines[-1]["said"]
+    assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
+
+
+@pytest.mark.parametrize("way", [eight, lanes, circle])
+def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tmp_path, way):
+    flown = Flown(tmp_path, events(way, 1800, scale=0.0))
+    known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
+    assert known_s < 400
+    assert flown.alarms_s, "until then, each turn contradicts GPS"
+    assert all(t_s < known_s + 10 for t_s in flown.alarms_s)
+    assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
+    right_deg = 0.0 if way is circle else RIGHT_DEG  # in one circle that is a scale, and not taken for known
+    assert flown.mounts[-1].right_deg == pytest.approx(right_deg, abs=1.5)
+    assert flown.lines[-1]["ahead_deg"] == pytest.approx(AHEAD_DEG, abs=1.0), "it is still what is to be set"
+
+
+def test_a_gps_that_is_led_away_is_found_after_a_mount_was(tmp_path):
+    def then_led():
+        for event in events(eight, 1800, scale=0.0):
+            away_m = max(0.0, event.frame.t_mono_s - 1500)
+            away = moved(event.vehicle.lat_deg, event.vehicle.lon_deg, away_m, 0.0)
+            gps = replace(event.vehicle.gps, lat_deg=away[0], lon_deg=away[1])
+            event.vehicle = replace(event.vehicle, lat_deg=away[0], lon_deg=away[1], gps=gps)
+            yield event
+
+    flown = Flown(tmp_path, then_led())
+    assert 1500 < flown.alarms_s[-1] < 1530
+    assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"
