@@ -42,6 +42,7 @@ _WRONG = 4.0  # standard deviations: matches that are off by more do not count
 # Where some matches were taken while GPS was held to be wrong: the share of the others in each half of the flight, the
 # standard deviation (m) by which a half must know the offset, and the standard deviations by which halves may differ.
 _UNDOUBTED, _HALF_KNOWS_M, _HALVES_AGREE = 0.1, 2.0, 4.0
+_NO_DOUBT_M = 12.0  # so near to GPS, as the camera is found to look, a match is no reason to doubt it
 _SOFT_ROUNDS, _HARD_ROUNDS, _SOFT = 6, 3, 2.0
 _RAYLEIGH = math.sqrt(2 * math.log(2))  # median length of a deviation on two axes, over its standard deviation
 
@@ -181,7 +182,7 @@ class Sightings:
         middle_m = np.mean([each.look[:, 4] for each in kept], axis=0)
         there = np.eye(6)
         there[:2, 4] = middle_m
-        if counts.mean() < _LEAST_ALIKE or not _explains_doubts(kept, counts, there):
+        if counts.mean() < _LEAST_ALIKE or not _explains_doubts(kept, counts, there, way[2:4]):
             return None
         way, covariance = there @ way, there @ covariance @ there.T
         sd = np.sqrt(np.diag(covariance))
@@ -231,13 +232,16 @@ def _tangents(mount: Mount) -> Doubles:
     return tangents
 
 
-def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles) -> bool:
+def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles, mount: Doubles) -> bool:
     """Tell whether a fit of sightings, of which it `counts` some (n,), leaves no reason to hold GPS for wrong. A
-    receiver that is led away says something else before than after, and something else than what nobody doubted.
-    `there` (6, 6) takes what is sought to the middle of the ground."""
+    receiver that is led away says something else before than after, and something else than what nobody doubted, or
+    would if the camera were known to look beside straight down as the `mount` (2,) says. `there` (6, 6) takes what is
+    sought to the middle of the ground."""
     doubted = np.array([each.is_doubted for each in sightings])
     if not doubted.any():
         return True
+    left_m = np.array([each.off_m - each.look[:, 2:4] @ mount for each in sightings])
+    doubted &= np.linalg.norm(left_m, axis=1) > _NO_DOUBT_M
     halves = np.array_split(np.arange(len(sightings)), 2)
     if min(np.mean(~doubted[half]) for half in halves) < _UNDOUBTED or counts[~doubted].mean() < _LEAST_ALIKE:
         return False

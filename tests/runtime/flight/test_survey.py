@@ -189,12 +189,12 @@ def levelled(event, mount, was):
 class Flown:
     """A surveyor that has heard a flight; `lines` are its lines of the log, `texts` what the ground was told."""
 
-    def __init__(self, folder, flight, **source):
+    def __init__(self, folder, flight, map_sd_m=5.0, **source):
         clock = FakeClock(0.0)
         link, config = FakeLink(clock), load_config(None, {f"source.{key}": known for key, known in source.items()})
         with FlightLog(folder / "log", clock=clock) as flight_log:
             herald = Herald(flight_log, link)
-            watch = GpsWatch(5.0, herald, None)
+            watch = GpsWatch(map_sd_m, herald, None)
             self.mounts, beside = [], Mount(config.source.mount_ahead_deg, config.source.mount_right_deg)
             surveyor = Surveyor(herald, watch, config.source, self.mounts.append)
             for event in flight:
@@ -290,9 +290,10 @@ def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
 
 
+@pytest.mark.parametrize("map_sd_m", [5.0, 1.0])
 @pytest.mark.parametrize("way", [eight, lanes, circle])
-def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tmp_path, way):
-    flown = Flown(tmp_path, events(way, 1800, scale=0.0))
+def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tmp_path, way, map_sd_m):
+    flown = Flown(tmp_path, events(way, 1800, scale=0.0), map_sd_m)
     known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
     assert known_s < 400
     assert flown.alarms_s, "until then, each turn contradicts GPS"
