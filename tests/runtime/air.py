@@ -3,6 +3,7 @@ no link: reports, forces and matches are given by hand, in the order of their ti
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from fakes import vehicle_at
@@ -54,7 +55,8 @@ class Air:
     """A flight in wide circles at `speed_m_s`, with GPS until `lose_gps`. Its autopilot then reckons, wrong by `wind`
     (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
     of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
-    With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right);
+    With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right),
+    as by a compass that is wrong, and its match shows that where it `shows_turn`;
     without `matches`, no place is accepted. Without GPS, a frame is taken every `stride_s` for its stride only
     (None: none is). `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot
     follows it until it `reject_gps`."""
@@ -94,6 +96,7 @@ class Air:
         self.is_silent = self.knows_nothing = False
         self.sees, self.takes_fixes, self.matches, self.events = True, True, True, []
         self.stride_sd_m, self.stretch, self.turn, self.strode = stride_sd_m, 1.0, 0.0, None
+        self.shows_turn = False
         self.advices: list[tuple[float, Advice]] = []
         self.errors_m, self.states = [], []  # of the autopilot once a second; of a continuous channel
         self.between, self.between_due_s = [], 0.0  # fixes that no match asked for, and their errors
@@ -179,6 +182,9 @@ class Air:
         where = Position(*moved(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
         event.stride = self._stride(step)
+        if self.shows_turn:
+            event.picture = Levelled(_PICTURE, None, replace(event.view, up_deg=0.0))
+            event.located = replace(event.located, heading_deg=-math.degrees(self.turn))
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))

@@ -113,15 +113,15 @@ class Consistency:
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
-        self._joined = 0  # how many say what the held one says
+        self._joined, self._against_s = 0, -math.inf  # how many say what the held one says; time of the last of all
         self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
         self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
 
     def is_contradicted(self, now_s: float, is_followed: bool) -> bool:
         """Return True while the last fix contradicts what is expected, and another one may still agree with it. Where
-        the path `is_followed` from frame to frame, one that was right would have been joined by another soon."""
+        the path `is_followed` from frame to frame, one that was right would be followed by another soon."""
         good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
-        return self._held is not None and now_s - self._held.seen.t_s <= good_for_s
+        return self._held is not None and now_s - self._against_s <= good_for_s
 
     def weighed(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> Weighed:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
@@ -140,7 +140,7 @@ class Consistency:
             return self._believed(fix, Weighed(is_against=True, is_lost=True))
         if is_turned:
             return Weighed(turned)
-        drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
+        drift_m_s, self._against_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S, fix.seen.t_s
         if self._held is None or _differ(self._held, fix, drift_m_s) > _AGREES:
             self._held, self._joined = fix, 1
         else:

@@ -22,9 +22,12 @@ _CALM, _ROUGH = 0.3, 0.8
 _UPSET, _UPSET_S = 6.0, 10.0
 _CONTRADICTS = 4.0  # standard deviations: a stride that differs by more is not believed
 _STRIDE_SD, _STRIDE_NOISE = 0.05, 0.003  # error of scale and direction of all strides, and its change in one second
+# Its heading goes wrong then too, and so the direction of strides changes so many times faster: that of an ArduPilot
+# plane by 6 degrees in 3 s. The turn of a match shows it (radians: standard deviation, and the most that counts).
+_TURNED, _TURN_SD, _MOST_TURN = 10.0, 0.035, 0.3
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
-_SIZE, _EYE = 12, np.eye(2)
+_SIZE, _EYE, _TURN = 12, np.eye(2), 11
 _OF_FRAME, _FIX = np.zeros((2, _SIZE)), np.zeros((2, _SIZE))  # what `f` is, and what the fix of a frame is
 _OF_FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
 
@@ -108,10 +111,12 @@ class DriftFilter:
         drift = self._drift
         rough = 1.0 + _ROUGHEST * self._roughness  # gyros that tilt wrongly turn wrongly too
         wander = drift.acceleration_noise * (rough + _UPSET * self._upset)
-        self._upset *= math.exp(-step_s / _UPSET_S)
-        noise = drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE * rough
+        noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE * rough), 2)
+        noise[_TURN] += _STRIDE_NOISE * _TURNED * self._upset
         self._x = move @ self._x
-        self._p = move @ self._p @ move.T + step_s * np.diag(np.repeat(np.square(noise), 2))
+        self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
+
+        self._upset *= math.exp(-step_s / _UPSET_S)
 
     @property
     def _roughness(self) -> float:
@@ -151,6 +156,14 @@ class DriftFilter:
         self._x, self._p = x, p
         self._correct(look, np.zeros(2), variance_m2 * _EYE)
         return True
+
+    def hear_turn(self, turn: float) -> None:
+        """Correct the direction of strides by a match, whose picture is turned by `turn` (radians, clockwise) against
+        the compass. One that is turned by far does not count: then strides contradict the path, and are not used."""
+        if abs(turn) <= _MOST_TURN:
+            look = np.zeros((1, _SIZE))
+            look[0, _TURN] = 1.0
+            self._correct(look, np.array([turn]), np.array([[_TURN_SD**2]]))
 
     def hear_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame, of covariance (2, 2), `off_m` (2,) metres from the path."""

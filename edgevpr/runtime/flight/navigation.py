@@ -92,14 +92,17 @@ class Navigation:
         if (path := self._unbroken) and self._drift is INERTIAL:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
-    def hear_frame(self, frame: HeardFrame, is_query: bool = True) -> None:
-        """Process a frame, whatever is recognised in it, or one that is no query and only shows its stride."""
+    def hear_frame(self, frame: HeardFrame, is_query: bool = True, turn_deg: float | None = None) -> None:
+        """Process a frame, whatever is recognised in it, or one that is no query and only shows its stride. `turn_deg`
+        is that of its match (see `PositionedMatch`)."""
         if is_query:
             self._asks_every_s, self._asked_s = frame.t_s - self._asked_s, frame.t_s
         path, before = self._unbroken, self._framed
         self._framed = there = path.at(frame.t_s) if path else None
         if path is None or there is None:
             return
+        if turn_deg is not None:
+            self._filter.hear_turn(math.radians(turn_deg))
         stride, strode = frame.stride, None
         if stride and before and before.t_s == stride.from_s:
             moved_m = np.array(stride.moved_m)
@@ -112,7 +115,7 @@ class Navigation:
         """Compare the fix of a match with its prediction; None if the path at that time is not known. The match is of
         the last frame heard, or of a new one."""
         if self._framed is None or self._framed.t_s != seen.t_s:
-            self.hear_frame(seen.frame)
+            self.hear_frame(seen.frame, turn_deg=seen.turn_deg)
         path, there = self._unbroken, self._framed
         if path is None or there is None:
             return None

@@ -10,6 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
 from edgevpr.frames.level import Levelled, View
 from edgevpr.runtime.flight.autopilot import DRY_RUN
+from edgevpr.runtime.flight.consistency import ComparedFix, Consistency, HeardFrame, PositionedMatch
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -233,3 +234,20 @@ def test_a_dry_run_says_which_fixes_would_be_held_back(recording, tmp_path):
     assert queries[0]["fix"]["why"].startswith("held back")
     assert queries[1]["fix"]["why"] == DRY_RUN
     assert link.stats().fixes_sent == 0
+
+
+def test_while_match_after_match_contradicts_a_path_that_is_followed_it_is_in_doubt():
+    judge, here = Consistency(), np.zeros(2)
+    for t_s in range(8):
+        frame = HeardFrame(t_s=float(t_s), sd_m=0.5)
+        how = {"position": Position(*HOME), "accuracy_m": 1.0, "covariance_m2": np.eye(2), "places": (1,)}
+        fix = ComparedFix(
+            seen=PositionedMatch(frame=frame, **how),
+            path_m=here,
+            off_m=np.array([20.0, 0.0]),
+            expected_m=here,
+            covariance_m2=np.eye(2),
+        )
+        assert judge.weighed(fix, has_gps=False, is_followed=True).why, "of one place they are one"
+    assert judge.is_contradicted(8.0, is_followed=True)
+    assert not judge.is_contradicted(11.0, is_followed=True), "no other has agreed"

@@ -124,3 +124,22 @@ def test_between_queries_ten_seconds_apart_the_position_is_carried_by_pictures_t
 def test_rare_matches_overrule_such_a_path_by_two(channel):
     air = without_gps(air_of(channel, **RARE), 60)
     assert beside_m(air, 25)[1] < 15.0
+
+
+def with_a_compass_that_goes_wrong(shows_turn, seed):
+    """Errors of an autopilot whose compass turns by 9 degrees in 3 s, when GPS is lost and there is a new wind."""
+    how = {"fix_sd_m": 0.6, "other_sd_m": 0.5, "stride_sd_m": 0.3, "speed_m_s": 20.0, "seed": seed}
+    air = Air(Navigator(1.0, 1.0), wind=WIND, **how)
+    air.shows_turn = shows_turn
+    air.fly(60)
+    air.lose_gps()
+    air.errors_m.clear()
+    for turn in (0.05, 0.1, 0.15):
+        air.turn = turn
+        air.fly(1)
+    return lengths(air.fly(60).errors_m).max()
+
+
+def test_a_compass_that_goes_wrong_when_gps_is_lost_is_known_by_the_turn_of_matches():
+    assert max(with_a_compass_that_goes_wrong(True, seed) for seed in range(6)) < 7.0
+    assert max(with_a_compass_that_goes_wrong(False, seed) for seed in range(6)) > 10.0, "by strides that lead astray"
