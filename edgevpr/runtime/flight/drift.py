@@ -115,7 +115,6 @@ class DriftFilter:
         noise[_TURN] += _STRIDE_NOISE * _TURNED * self._upset
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
-
         self._upset *= math.exp(-step_s / _UPSET_S)
 
     @property

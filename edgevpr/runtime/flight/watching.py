@@ -313,8 +313,7 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
     sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
     side, key = sides[first > 0], f"source.mount_{name}"
     looks = f"looks {abs(first):.1f} degrees {side}"
-    there = f"the camera {looks} of straight down, +-{found.sd:.1f}, and is taken to from now on"
-    return f"{there}: set {key}: {first:.1f}", f"camera {looks}"
+    return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
