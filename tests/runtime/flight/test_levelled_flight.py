@@ -13,6 +13,7 @@ from edgevpr.core.types import Frame, Position, Receiver
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.flight import watching
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
 from edgevpr.runtime.recognise.opening import meter_of
@@ -114,12 +115,28 @@ def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
     assert flown.end["queries"] == len(queries)
 
 
-def test_where_the_camera_looks_is_said_before_the_flight_ends(place_map, tmp_path, monkeypatch):
+@pytest.fixture
+def surveyed(monkeypatch):
+    """Nine degrees ahead, and a map that lies 5 m beside GPS: what each survey finds."""
     known, unknown = Measure((9.0,), 0.9, 1.5, 1.0), Measure((0.0,), 9.0, 1.5, 1.0)
     off_m = Measure((3.0, -4.0), 0.5, 1.0, 1.0)
     where = Position(50.0, 8.0)
     found = Surveyed(matches=99, middle=where, off_m=off_m, scale=unknown, ahead_deg=known, right_deg=unknown)
     monkeypatch.setattr(Sightings, "result", lambda self: found)
+
+
+@pytest.mark.usefixtures("surveyed")
+def test_where_the_camera_looks_is_said_before_the_flight_ends(place_map, tmp_path):
     fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
     (line,) = of_kind(list(read_log(tmp_path / "f.jsonl")), "survey")
     assert (line["off_m"], line["off_sd"], line["scale"], line["ahead_deg"]) == ([3.0, -4.0], 0.5, None, 9.0)
+
+
+@pytest.mark.usefixtures("surveyed")
+def test_pictures_are_levelled_by_it_as_soon_as_it_is_known(place_map, tmp_path, monkeypatch):
+    monkeypatch.setattr(watching, "_SURVEYED_EVERY", 2)
+    monkeypatch.setattr(Sightings, "take", lambda self, event, is_doubted: True)
+    queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
+    _, *of_under = zip(*(query["view"]["aside"] for query in queries), strict=True)
+    behind = -80.0 * np.tan(np.radians(9.0)) / 103.9
+    assert of_under == [pytest.approx((0.0, 0.0, behind), abs=0.002)]
