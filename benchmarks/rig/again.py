@@ -25,6 +25,7 @@ from figures import read_table, spread
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.frames.level import View
 from edgevpr.lab.simulate.generated import to_metres
+from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.peer import Autopilot
 from edgevpr.mavlink.wire import PacketReader
 from edgevpr.runtime.flight.flightlog import read_log
@@ -34,6 +35,12 @@ from edgevpr.runtime.recognise.perspective import Lean
 from edgevpr.runtime.recognise.stride import Stride
 
 _EVERY_S, _FIRST_S = 0.5, 20.0
+_CHANNELS = {
+    "COMMAND_INT": Channel.COMMAND,
+    "GPS_INPUT": Channel.GPS_INPUT,
+    "ODOMETRY": Channel.ODOMETRY,
+    "GLOBAL_POSITION_SENSOR": Channel.SENSOR,
+}  # by what was sent
 
 
 def packets(path: Path) -> Iterator[tuple[float, bytes]]:
@@ -87,6 +94,7 @@ def flown_again(folder: Path) -> np.ndarray:
     heard = [(t_s - began_s, packet) for t_s, packet in packets(folder / "flight.tlog")]
     heard += [(line["t_mono_s"], line) for line in lines if line["kind"] in ("query", "gps", "survey")]
     navigator = Navigator(config["mavlink"]["min_accuracy_m"], 1 / config["source"]["rate_hz"])
+    navigator.hear_channel(_CHANNELS[str(read_table(folder / "sent.csv")["kind"][-1])])
     autopilot, reader, rows, due_s = Autopilot(197, None, navigator), PacketReader(), [], loss_s
     for t_s, what in sorted(heard, key=lambda each: each[0]):
         while due_s < t_s:
@@ -98,7 +106,6 @@ def flown_again(folder: Path) -> np.ndarray:
         if isinstance(what, bytes):
             for message in reader.feed(what):
                 autopilot.hear(message, t_s)
-                navigator.hear_channel(autopilot.interview.choice.channel)
         elif what["kind"] == "gps":
             navigator.believe_gps(not what["is_wrong"])
         elif what["kind"] == "survey" and t_s < loss_s:

@@ -158,8 +158,9 @@ class DriftFilter:
 
     def hear_turn(self, turn: float) -> None:
         """Correct the direction of strides by a match, whose picture is turned by `turn` (radians, clockwise) against
-        the compass. One that is turned by far does not count: then strides contradict the path, and are not used."""
-        if abs(turn) <= _MOST_TURN:
+        the compass. One that is turned by far does not count: then strides contradict the path, and are not used. Nor
+        does one beside a path of accelerations, which the same compass has turned."""
+        if abs(turn) <= _MOST_TURN and not self._drift.is_of_attitude:
             look = np.zeros((1, _SIZE))
             look[0, _TURN] = 1.0
             self._correct(look, np.array([turn]), np.array([[_TURN_SD**2]]))
