@@ -7,7 +7,6 @@ python benchmarks/rig/again.py RUN ...    # folders of `runs`
 """
 
 import json
-import struct
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
@@ -21,13 +20,13 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import base
 import numpy as np
 from figures import read_table, spread
+from pymavlink import mavutil
 
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.frames.level import View
 from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.peer import Autopilot
-from edgevpr.mavlink.wire import PacketReader
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -43,15 +42,11 @@ _CHANNELS = {
 }  # by what was sent
 
 
-def packets(path: Path) -> Iterator[tuple[float, bytes]]:
-    """Yield the packets of a tlog, each with its time, seconds since 1970."""
-    data, at = path.read_bytes(), 0
-    while at + 20 < len(data):
-        (stamp,) = struct.unpack_from(">Q", data, at)
-        head = data[at + 8 : at + 12]
-        size = 12 + head[1] + 13 * (head[2] & 1) if head[0] == 0xFD else 8 + head[1]
-        yield stamp / 1e6, data[at + 8 : at + 8 + size]
-        at += 8 + size
+def messages(path: Path) -> Iterator[tuple[float, Any]]:
+    """Yield the messages of a tlog, each with its time, seconds since 1970."""
+    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
+    while message := log.recv_msg():
+        yield message._timestamp, message
 
 
 def event_of(line: dict[str, Any]) -> Any:
@@ -85,17 +80,14 @@ def event_of(line: dict[str, Any]) -> Any:
 def flown_again(folder: Path) -> np.ndarray:
     """Return, twice a second without GPS: seconds after the loss, errors east and north, and what would be claimed."""
     config, run = (json.loads((folder / name).read_text()) for name in ("config.yaml", "run.json"))
-    lines, true, loss_s = (
-        list(read_log(folder / "flight.jsonl")),
-        read_table(folder / "pictures.csv"),
-        run["marks_s"]["loss"],
-    )
+    lines, true = list(read_log(folder / "flight.jsonl")), read_table(folder / "pictures.csv")
+    loss_s = run["marks_s"]["loss"]
     began_s = datetime.fromisoformat(lines[0]["time"]).timestamp() - lines[0]["t_mono_s"]
-    heard = [(t_s - began_s, packet) for t_s, packet in packets(folder / "flight.tlog")]
+    heard = [(t_s - began_s, message) for t_s, message in messages(folder / "flight.tlog")]
     heard += [(line["t_mono_s"], line) for line in lines if line["kind"] in ("query", "gps", "survey")]
     navigator = Navigator(config["mavlink"]["min_accuracy_m"], 1 / config["source"]["rate_hz"])
     navigator.hear_channel(_CHANNELS[str(read_table(folder / "sent.csv")["kind"][-1])])
-    autopilot, reader, rows, due_s = Autopilot(197, None, navigator), PacketReader(), [], loss_s
+    autopilot, rows, due_s = Autopilot(197, None, navigator), [], loss_s
     for t_s, what in sorted(heard, key=lambda each: each[0]):
         while due_s < t_s:
             if here := navigator._known(due_s):
@@ -103,9 +95,8 @@ def flown_again(folder: Path) -> np.ndarray:
                 there_m = (np.interp(due_s, true["t_s"], true[name]) for name in ("east_m", "north_m"))
                 rows.append((due_s - loss_s, *np.subtract(at_m, tuple(there_m)), navigator._claimed_m(here)))
             due_s += _EVERY_S
-        if isinstance(what, bytes):
-            for message in reader.feed(what):
-                autopilot.hear(message, t_s)
+        if not isinstance(what, dict):
+            autopilot.hear(what, t_s)
         elif what["kind"] == "gps":
             navigator.believe_gps(not what["is_wrong"])
         elif what["kind"] == "survey" and t_s < loss_s:

@@ -140,7 +140,8 @@ class Consistency:
             return self._believed(fix, Weighed(is_against=True, is_lost=True))
         if is_turned:
             return Weighed(turned)
-        drift_m_s, self._against_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S, fix.seen.t_s
+        drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
+        self._against_s = fix.seen.t_s
         if self._held is None or _differ(self._held, fix, drift_m_s) > _AGREES:
             self._held, self._joined = fix, 1
         else:

@@ -115,7 +115,7 @@ class Sightings:
     the camera hangs in a gimbal, whatever the airframe's attitude."""
 
     def __init__(self, mount: Mount, is_level: bool) -> None:
-        self.mount, self._is_level = mount, is_level
+        self._mount, self._is_level = mount, is_level
         self._kept: deque[Sighting] = deque(maxlen=_MOST)
         self._origin: Position | None = None
         self._taken_s = -math.inf
@@ -151,9 +151,9 @@ class Sightings:
 
     def look(self, mount: Mount) -> None:
         """Note that the next pictures are levelled by another mount, and keep the sightings as if all had been."""
-        by = _tangents(mount) - _tangents(self.mount)
+        by = _tangents(mount) - _tangents(self._mount)
         kept = [replace(each, off_m=each.off_m - each.look[:, 2:4] @ by) for each in self._kept]
-        self.mount, self._kept = mount, deque(kept, maxlen=_MOST)
+        self._mount, self._kept = mount, deque(kept, maxlen=_MOST)
 
     def _look(self, vehicle: Vehicle, height_m: float | None, turn_deg: float) -> Doubles | None:
         """Return how offset, mount, scale and time move a match (2, 6), but for the scale; None if it is unknown. The
@@ -186,7 +186,7 @@ class Sightings:
             return None
         way, covariance = there @ way, there @ covariance @ there.T
         sd = np.sqrt(np.diag(covariance))
-        angles_deg = np.degrees(np.arctan(way[2:4] + _tangents(self.mount)))
+        angles_deg = np.degrees(np.arctan(way[2:4] + _tangents(self._mount)))
         sds_deg = np.hypot(np.degrees(sd[2:4]), _LEVEL_SD_DEG)
         ahead, right = (
             Measure((angle_deg,), sd_deg, 1.5, 1.0)

@@ -270,7 +270,9 @@ class Surveyor:
             if of_map := self._told.keys() - set(_MOUNT):
                 self._told = {name: value for name, value in self._told.items() if name not in of_map}
                 said = "what was said of the map is taken back, GPS contradicts it"
-                self._herald.tell("survey", Severity.WARNING, said, ground="the map lies unknown again", said=said)
+                self._herald.tell(
+                    "survey", Severity.WARNING, said, ground="the map's place is unknown again", said=said
+                )
             return
         for name, each in found.measures.items():
             before = self._told.get(name)

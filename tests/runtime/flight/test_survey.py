@@ -17,6 +17,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.survey import Sightings
 from edgevpr.runtime.flight.watching import GpsWatch, Surveyor
+from edgevpr.runtime.recognise.levelling import mount_of
 
 OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
 HEIGHT_M, SPEED_M_S, FIX_SD_M, GPS_SD_M, GPS_LASTS_S = 100.0, 15.0, 2.0, 1.0, 60.0
@@ -195,7 +196,7 @@ class Flown:
         with FlightLog(folder / "log", clock=clock) as flight_log:
             herald = Herald(flight_log, link)
             watch = GpsWatch(map_sd_m, herald, None)
-            self.mounts, beside = [], Mount(config.source.mount_ahead_deg, config.source.mount_right_deg)
+            self.mounts, beside = [], mount_of(config.source)
             surveyor = Surveyor(herald, watch, config.source, self.mounts.append)
             for event in flight:
                 clock.now_s = event.frame.t_mono_s
@@ -247,9 +248,9 @@ def test_a_map_and_a_camera_that_are_right_are_not_talked_of(tmp_path):
     assert end["ahead_deg"] == pytest.approx(0.0, abs=1.0)
 
 
-def led(law, **how):
-    """A flight whose map and camera are right, and whose receiver is led to the east by a law of time."""
-    for event in right(**how):
+def led(law, flight):
+    """A flight whose receiver is led to the east by a law of time."""
+    for event in flight:
         away_m = law(event.frame.t_mono_s)
         vehicle = event.vehicle
         there = moved(vehicle.lat_deg, vehicle.lon_deg, away_m, 0.0)
@@ -271,19 +272,11 @@ def led(law, **how):
     ],
 )
 def test_of_a_gps_that_is_wrong_nothing_is_learnt(tmp_path, law, way):
-    assert Flown(tmp_path, led(law, way=way)).lines == []
+    assert Flown(tmp_path, led(law, right(way))).lines == []
 
 
 def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
-    def then_wrong():
-        for event in events(eight, 1200):
-            if event.frame.t_mono_s > 700:
-                away = moved(event.vehicle.lat_deg, event.vehicle.lon_deg, 60.0, 0.0)
-                gps = replace(event.vehicle.gps, lat_deg=away[0], lon_deg=away[1])
-                event.vehicle = replace(event.vehicle, lat_deg=away[0], lon_deg=away[1], gps=gps)
-            yield event
-
-    flown = Flown(tmp_path, then_wrong())
+    flown = Flown(tmp_path, led(lambda t_s: 60.0 * (t_s > 700), events(eight, 1200)))
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
     assert "taken back" in flown.lines[-1]["said"]
@@ -305,14 +298,6 @@ def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tm
 
 
 def test_a_gps_that_is_led_away_is_found_after_a_mount_was(tmp_path):
-    def then_led():
-        for event in events(eight, 1800, scale=0.0):
-            away_m = max(0.0, event.frame.t_mono_s - 1500)
-            away = moved(event.vehicle.lat_deg, event.vehicle.lon_deg, away_m, 0.0)
-            gps = replace(event.vehicle.gps, lat_deg=away[0], lon_deg=away[1])
-            event.vehicle = replace(event.vehicle, lat_deg=away[0], lon_deg=away[1], gps=gps)
-            yield event
-
-    flown = Flown(tmp_path, then_led())
+    flown = Flown(tmp_path, led(lambda t_s: max(0.0, t_s - 1500), events(eight, 1800, scale=0.0)))
     assert 1500 < flown.alarms_s[-1] < 1530
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"
