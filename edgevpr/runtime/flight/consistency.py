@@ -107,15 +107,15 @@ class Consistency:
 
     The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
     right fixes have the same offset from the path, and two wrong ones hardly ever do. A path that is wrong by more
-    than a drift has no such fixes: there, several in a row that an aircraft can have flown through are believed. Only
-    several are believed, too, where the camera has followed the path from frame to frame, since ground that repeats
-    itself can say the same twice, and where pictures are suddenly turned against the compass."""
+    than a drift has no such fixes: there, several of different places that an aircraft can have flown through are
+    believed. Only several are believed, too, where the camera has followed the path from frame to frame, since ground
+    that repeats itself can say the same twice, and where pictures are suddenly turned against the compass."""
 
     def __init__(self) -> None:
         self._held: ComparedFix | None = None
         self._joined, self._against_s = 0, -math.inf  # how many say what the held one says; time of the last of all
         self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
-        self._row: list[ComparedFix] = []  # of fixes held back, all of which an aircraft can have flown through
+        self._row: list[ComparedFix] = []  # fixes held back, of different places, that can have been flown through
 
     def is_contradicted(self, now_s: float, is_followed: bool) -> bool:
         """Return True while the last fix contradicts what is expected, and another one may still agree with it. Where
@@ -135,7 +135,9 @@ class Consistency:
             self._held, self._row = None, []
             there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
             return Weighed(turned if is_turned else there)
-        self._row = [*(each for each in self._row[1 - _IN_A_ROW :] if _could_follow(each, fix)), fix]
+        self._row = [each for each in self._row if _could_follow(each, fix)]
+        if all(set(each.seen.places).isdisjoint(fix.seen.places) for each in self._row):  # neighbours share places
+            self._row.append(fix)
         if len(self._row) == _IN_A_ROW:
             return self._believed(fix, Weighed(is_against=True, is_lost=True))
         if is_turned:
@@ -190,10 +192,9 @@ def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
 
 
 def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
-    """Tell whether an aircraft can have flown from one fix to another one, of other places, within some seconds."""
+    """Tell whether an aircraft can have flown from one fix to another one within some seconds."""
     apart_s = other.seen.t_s - one.seen.t_s
-    is_other = set(one.seen.places).isdisjoint(other.seen.places) and other.seen.is_turned_like(one.seen.turn_deg)
-    if not 0 < apart_s <= _ROW_WITHIN_S or not is_other:
+    if not 0 < apart_s <= _ROW_WITHIN_S or not other.seen.is_turned_like(one.seen.turn_deg):
         return False
     flown_m = float(np.hypot(*(other.path_m + other.off_m - one.path_m - one.off_m)))
     return flown_m <= _FASTEST_M_S * apart_s

@@ -148,6 +148,14 @@ def test_matches_win_over_a_path_that_parts_from_them_faster_than_it_drifts():
     assert all(advice.is_held for advice in told), "no aircraft of ours flies through these"
 
 
+def test_matches_of_neighbours_which_share_places_win_too_and_those_of_one_place_do_not():
+    aircraft, over_one = Aircraft(), Aircraft()
+    off_m = [(200 + 20 * t_s, 0) for t_s in range(1, 12)]
+    told = [(off_m[t_s], t_s + 1, (t_s, t_s + 1)) for t_s in range(10)]
+    assert aircraft.held(*told)[:8] == [True] * 6 + [False] * 2, "the first, third, fifth and seventh share none"
+    assert all(over_one.held(*((off_m, t_s, (1, 2)) for off_m, t_s, _ in told)))
+
+
 def test_a_single_wrong_one_among_right_ones_is_all_that_is_held_back():
     fixes = [((0, 0), t_s, (t_s,)) for t_s in range(1, 7)]
     fixes[3] = (500, 0), 4, (90,)
