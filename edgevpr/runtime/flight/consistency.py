@@ -64,6 +64,10 @@ class PositionedMatch:
         """Covariance (2, 2) by which the fixes of two frames differ."""
         return self.covariance_m2 + self.frame.sd_m**2 * np.eye(2)
 
+    def is_of_other_places(self, other: "PositionedMatch") -> bool:
+        """Tell whether it comes from none of the places that the other one comes from."""
+        return set(self.places).isdisjoint(other.places)
+
     def is_turned_like(self, turn_deg: float | None) -> bool:
         """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
         if self.turn_deg is None or turn_deg is None:
@@ -136,7 +140,7 @@ class Consistency:
             there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
             return Weighed(turned if is_turned else there)
         self._row = [each for each in self._row if _could_follow(each, fix)]
-        if all(set(each.seen.places).isdisjoint(fix.seen.places) for each in self._row):  # neighbours share places
+        if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
             self._row.append(fix)
         if len(self._row) == _IN_A_ROW:
             return self._believed(fix, Weighed(is_against=True, is_lost=True))
@@ -202,7 +206,7 @@ def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
 
 def _is_independent(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> bool:
     """Tell whether two fixes are of different places, or so far apart that one wrong position would not agree."""
-    if set(one.seen.places).isdisjoint(other.seen.places):
+    if other.seen.is_of_other_places(one.seen):
         return True
     flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
     return in_sd(flown_m, _of_both(one, other, drift_m_s)) > _CONTRADICTS
