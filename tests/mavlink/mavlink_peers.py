@@ -8,6 +8,7 @@ import threading
 import time
 import tty
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 
 from edgevpr.lab.simulate.autopilot import AutopilotSummary, run_autopilot
@@ -135,13 +136,16 @@ class TcpServer:
 
 
 class SerialCable:
-    """Two pseudo terminals joined back to back, at `folder`/a and `folder`/b while it is plugged in."""
+    """Two pseudo terminals joined back to back, at `folder`/a and `folder`/b while it is plugged in. What nobody reads
+    is lost, as on a line without flow control."""
 
     def __init__(self, folder: Path) -> None:
         self.ends = (folder / "a", folder / "b")
 
     def plug(self) -> None:
         masters, self._slaves = zip(*(pty.openpty() for _ in self.ends), strict=True)
+        for master in masters:
+            os.set_blocking(master, False)
         for end, slave in zip(self.ends, self._slaves, strict=True):
             tty.setraw(slave)  # a terminal left as it is would echo
             end.symlink_to(os.ttyname(slave))
@@ -160,7 +164,8 @@ class SerialCable:
     def _copy(self, a: int, b: int) -> None:
         while not self._cut.is_set():
             for ready in select.select([a, b], [], [], 0.01)[0]:
-                os.write(b if ready == a else a, os.read(ready, 4096))
+                with suppress(BlockingIOError):
+                    os.write(b if ready == a else a, os.read(ready, 4096))
         os.close(a)
         os.close(b)
 

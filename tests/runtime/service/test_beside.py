@@ -96,18 +96,19 @@ def test_fixes_are_answered_and_a_ground_station_hears_all_though_the_owner_of_t
         station = Peer(station_port, system_id=255)
 
         def hears(name, component_id, **fields):
-            while True:
-                message = station.expect(name)
-                if message.get_srcComponent() == component_id and fields.items() <= message.to_dict().items():
-                    return
+            message = station.expect(name)
+            return message.get_srcComponent() == component_id and fields.items() <= message.to_dict().items()
+
+        def answers():
+            station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EK3_ENABLE", -1), component_id=190)
+            return hears("PARAM_VALUE", 1, param_id="EK3_ENABLE")
 
         with owner(put, tmp_path):  # after the flight
             wait_until(accepted, "a fix was taken")
             for name in ("HEARTBEAT", "STATUSTEXT", "NAMED_VALUE_FLOAT"):
-                hears(name, EDGEVPR)
-            hears("HEARTBEAT", 1)
-            station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EK3_ENABLE", -1), component_id=190)
-            hears("PARAM_VALUE", 1, param_id="EK3_ENABLE")
+                wait_until(lambda name=name: hears(name, EDGEVPR), f"{name} of the flight")
+            wait_until(lambda: hears("HEARTBEAT", 1), "HEARTBEAT of the autopilot")
+            wait_until(answers, "the autopilot's answer")
         before = accepted()
         with owner(put, tmp_path):
             wait_until(lambda: accepted() > before, "a fix was taken again")
