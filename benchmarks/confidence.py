@@ -29,17 +29,18 @@ from shipped_model import FittedSite, shipped_model
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
-from edgevpr.runtime.recognise.confidence import Model
-from edgevpr.runtime.recognise.evidence import AHEAD, DOWN, DOWN_BARE, FEWEST_PLACES, kind_of
+from edgevpr.runtime.recognise.confidence import Evidence, Model
+from edgevpr.runtime.recognise.evidence import AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE, FEWEST_PLACES, kind_of
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
 
 PRECISIONS = (0.9, 0.99, 0.999)
-KINDS = {"forward": (AHEAD,), "nadir": (DOWN, DOWN_BARE)}
+KINDS = {"forward": (AHEAD, AHEAD_PROVEN), "nadir": (DOWN, DOWN_BARE)}
 FLOWN_ALONG = ("corridor", "grief_stromovka_seasons", "nordland_tiny")  # as the map was made
 _MOST_FLOWN = 250  # queries
 _BINS = 10
 Rows = dict[str, list[Row]]
+Models = dict[str, Model]  # by the kind of evidence
 _COLUMNS = {
     "set": "{set}",
     "use": "{use}",
@@ -64,7 +65,7 @@ def main() -> None:
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(partial(gather, args.work), names))
         rows = {name: _read(args.work / f"{name}.pkl") for name in names}
-        models = {name: model_without(name, rows) for name in names}
+        models = {name: models_without(name, rows) for name in names}
         flights = list(pool.map(partial(followed, models=models), FLOWN_ALONG))
     if args.ship:
         ship(args.ship, rows)
@@ -107,45 +108,54 @@ def site(rows: Sequence[Row], kind: str, without: str | None = None) -> FittedSi
     )
 
 
-def model_without(name: str, rows: Rows) -> Model:
-    """Return the model of the map of one set, from the other sites and from what the map says of itself."""
-    kind = KINDS[camera_of(name)][0]
+def models_without(name: str, rows: Rows) -> Models:
+    """Return the models of the map of one set, from the other sites and from what the map says of itself."""
     others = [of for of in rows if camera_of(of) == camera_of(name) and site_of(of) != site_of(name)]
-    model = shipped_model(kind, [site(rows[of], kind, site_of(name)) for of in others], "other sites")
-    if len({row.query for row in rows[name] if row.kind == THERE}) < FEWEST_PLACES:
-        return model
-    return adapted(model, kind, site(rows[name], kind).answers, name)
+    is_adapted = len({row.query for row in rows[name] if row.kind == THERE}) >= FEWEST_PLACES
+    models = {}
+    for kind in KINDS[camera_of(name)]:
+        model = shipped_model(kind, [site(rows[of], kind, site_of(name)) for of in others], "other sites")
+        models[kind] = adapted(model, kind, site(rows[name], kind).answers, name) if is_adapted else model
+    return models
 
 
-def judged(rows: Sequence[Row], model: Model) -> base.Row:
+def judged(rows: Sequence[Row], models: Models) -> base.Row:
     """Judge the queries of one map, its own and those of other sites."""
     own, foreign = ([row for row in rows if row.kind == kind] for kind in ("own", "foreign"))
-    sure, right = np.array([_sure(model, row) for row in own]), np.array([row.right for row in own])
+    sure, right = np.array([_sure(models, row) for row in own]), np.array([row.right for row in own])
     tenth = np.minimum((_BINS * sure).astype(int), _BINS - 1)
     apart = np.bincount(tenth, sure - right) / len(own)  # of each bin, by its share of the queries
     made = {"set": rows[0].map, "use": base.use_of(rows[0].map), "queries": len(own), "right": int(right.sum())}
     made |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
     made |= {"roc_auc": roc_auc(sure, right), "ece": float(abs(apart).sum()), "precision": {}}
     for precision in PRECISIONS:
-        taken = [row for row in own if _accepted(model, row, precision)]
+        taken = [row for row in own if _accepted(models, row, precision)]
         made["precision"][str(precision)] = {
             "accepted_right": sum(row.right for row in taken),
             "wrong": sum(not row.right and not row.near for row in taken),
             "beside": sum(row.near for row in taken),
-            "foreign": sum(_accepted(model, row, precision) for row in foreign),
+            "foreign": sum(_accepted(models, row, precision) for row in foreign),
         }
     return made
 
 
-def _sure(model: Model, row: Row) -> float:
-    return Sureness({kind_of(row.evidence): model}, PRECISIONS[-1]).confidence(row.evidence)
+def _sure(models: Models, row: Row) -> float:
+    return max(Sureness(models, PRECISIONS[-1]).confidence(each) for each in _looks(row))
 
 
-def _accepted(model: Model, row: Row, precision: float) -> bool:
-    return row.veto is None and _sure(model, row) >= model.threshold(precision)
+def _accepted(models: Models, row: Row, precision: float) -> bool:
+    sure = Sureness(models, precision)
+    return row.veto is None and any(
+        sure.confidence(each) >= models[kind_of(each)].threshold(precision) for each in _looks(row)
+    )
 
 
-def followed(name: str, models: dict[str, Model]) -> base.Row:
+def _looks(row: Row) -> tuple[Evidence, Evidence]:
+    """Return the evidence of a row before landmarks are compared, ahead, and all of it: both can make a match sure."""
+    return {**row.evidence, "proof": 0.0}, row.evidence
+
+
+def followed(name: str, models: dict[str, Models]) -> base.Row:
     """Fly along the way of a map in several manners, each query by itself and followed, and count fixes."""
     dataset = walks.dataset_of(DATA / name)
     truth = {query.path.name: query for query in dataset.queries}
@@ -165,7 +175,7 @@ def followed(name: str, models: dict[str, Model]) -> base.Row:
     made: base.Row = {"set": name, "ways": {}}
     with walks.map_of(DATA / name) as (place_map, index, technique):
         rule = accept_rule(technique, walks.config().match)
-        rule = replace(rule, sure=Sureness({AHEAD: models[name]}, walks.config().match.accept_precision))
+        rule = replace(rule, sure=Sureness(models[name], walks.config().match.accept_precision))
         for way, paths in ways.items():
             counts = {}
             for mode in ("alone", "followed"):

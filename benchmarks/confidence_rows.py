@@ -65,7 +65,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
     with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
         rule = accept_rule(technique, walks.config().match)
         rule = replace(rule, sure=replace(rule.sure, precision=0.5))  # only what speaks against the best places refuses
-        walk = walks.walk(place_map, index, technique, rule=rule)
+        walk = walks.walk(place_map, index, technique, rule=rule, all_evidence=True)
         for other in [each.name for each in base.find_sets()] + list(LIKE):
             if other != name and site_of(other) == site_of(name):
                 continue
@@ -91,7 +91,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                     evidence=dict(event.evidence),
                     veto=event.reason if refused else None,
                 )
-        if technique.spec.cells and np.isnan(index.lat_deg).any():
+        if technique.spec.looks_down and np.isnan(index.lat_deg).any():
             return  # such a map is not calibrated
         frames = list(walks.frames_of(folder / "ref"))
         order = np.random.default_rng(15).permutation(len(frames))

@@ -79,13 +79,15 @@ def walk(
     search: SequenceSearch | None = None,
     verify: bool = True,
     min_accuracy_m: float = 1.0,
+    all_evidence: bool = False,
     levelling: Levelling | None = None,
     **more: Any,
 ) -> Recogniser:
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
     rule = rule or accept_rule(technique, config().match, 1, calibration_of(place_map))
-    settings = WalkSettings(candidates=technique.candidates, verify=verify, min_accuracy_m=min_accuracy_m)
+    looks = {"verify": verify, "all_evidence": all_evidence}
+    settings = WalkSettings(candidates=technique.candidates, min_accuracy_m=min_accuracy_m, **looks)
     matcher, preparation = Matcher(technique, index, rule, search), Preparation(levelling=levelling)
     return Recogniser(matcher, place_map, meter(), settings, preparation=preparation, **more)
 

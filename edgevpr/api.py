@@ -91,7 +91,7 @@ class Map:
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
-        is_nadir = self._recogniser.technique.spec.cells is not None
+        is_nadir = self._recogniser.technique.spec.looks_down
         self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
 
     def __enter__(self) -> "Map":

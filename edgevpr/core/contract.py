@@ -45,7 +45,8 @@ class TechniqueSpec:
     `scan_counts`: the score of the scan is a part of the final score (see `places.retrieve`).
     `heading_within_deg`: only rotations of the query within so many degrees of the expected one are tried, where the
     headings are known. None: headings are not used.
-    `cells`: number of cells of `FineMatch.shift_cells` along a picture's longest side. None: shifts give no metres.
+    `cells`: number of cells of `FineMatch.shift_cells` along a picture's side. None: matches have no such shift.
+    `looks_down`: pictures show what is under the camera, so that shifts give metres.
     `height_ratios`: heights of the camera, over that of the map, at which a query can be recognised.
     `in_full`: most candidates that are compared by `match`. Of more, those with the best estimates by
     `Technique.glance` are chosen. None: all candidates are compared by `match`.
@@ -63,6 +64,7 @@ class TechniqueSpec:
     scan_counts: bool = field(default=False, compare=False)
     heading_within_deg: float | None = field(default=None, compare=False)
     cells: int | None = field(default=None, compare=False)
+    looks_down: bool = field(default=False, compare=False)
     height_ratios: tuple[float, ...] = field(default=(), compare=False)
     in_full: int | None = field(default=None, compare=False)
 
@@ -146,7 +148,7 @@ class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
     coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Those whose `spec.fine` is None need
     no `match`, those whose `spec.packed` is None no `pack`, those whose `spec.in_full` is None no `glance`, those whose
-    `spec.cells` is None no `turned`."""
+    `spec.looks_down` is False no `turned`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number

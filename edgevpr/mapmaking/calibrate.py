@@ -39,6 +39,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, prior
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
+    AHEAD_PROVEN,
     DOWN,
     DOWN_BARE,
     FEWEST_PLACES,
@@ -62,7 +63,7 @@ _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outsid
 # Strength with which the fit holds on to the shipped weights, and to the bias (see `fitted`). Chosen on corridor and
 # sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance decided
 # whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
-_PULL = {AHEAD: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
+_PULL = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 
@@ -97,7 +98,7 @@ def ask(
     assert rule.sure is not None  # set for a technique that has a confidence model
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
-    looks_down = technique.spec.cells is not None
+    looks_down = technique.spec.looks_down
     layers = layers_of(place_map)
     near_m = overlap_m(layers, index, rule)
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
@@ -133,7 +134,7 @@ def looked_for(
     """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
     shows no ground (None: it shows ground everywhere)."""
     prepared = Preparation(mask=None if shown is None else Mask(shown, sha256=""))
-    settings = WalkSettings(candidates=matcher.technique.candidates)
+    settings = WalkSettings(candidates=matcher.technique.candidates, all_evidence=True)
     walk = Recogniser(matcher, place_map, meter, settings, preparation=prepared)
     return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
@@ -164,7 +165,7 @@ def calibrate(
     require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
-    is_placed = technique.spec.cells is None or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
+    is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
     as_mapped = _as_mapped(technique, place_map, pictures, watch, preparation or Preparation())
     answers = list(ask(technique, place_map, index, accept_rule(technique, config), meter, as_mapped))
@@ -181,7 +182,7 @@ def calibrate(
 
 def asked_of(technique: Technique) -> int:
     """Return the number of pictures that are used to calibrate a map of this technique."""
-    return ASKED_AHEAD if technique.spec.cells is None else ASKED_DOWN
+    return ASKED_DOWN if technique.spec.looks_down else ASKED_AHEAD
 
 
 def _as_mapped(

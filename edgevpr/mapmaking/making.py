@@ -189,7 +189,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         if covered := covered_by(place_map):
             _log.info("%s", covered)
         refined, calibration = None, None
-        if order.refine and technique.spec.cells is not None and isinstance(pictures, FlownPictures):
+        if order.refine and technique.spec.looks_down and isinstance(pictures, FlownPictures):
             images = pictures.source if Path(pictures.source).is_dir() else None
             with _if_possible("refined"):
                 refined = refine_map(place_map, technique, images, shown)
@@ -234,7 +234,7 @@ def _say_beforehand(
 def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
     """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not at hand).
     Raises UsageError if the map's technique does not allow it, or SciPy is missing."""
-    if technique.spec.cells is None:
+    if not technique.spec.looks_down:
         raise UsageError(
             f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
             "with `--camera nadir` can be refined."

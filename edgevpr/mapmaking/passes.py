@@ -90,7 +90,7 @@ def history_of(
     with PlaceMap.open(path) as place_map:
         technique = technique_of(place_map)
         places = list(place_map.places())
-        if technique.spec.cells is None or not places:
+        if not technique.spec.looks_down or not places:
             return History()
         ground = _ground(place_map, places, folders)
         wanted = inside(place_map)

@@ -1,8 +1,9 @@
 """The queries of a flight, or of `match`, as steps and layers over the ground, and as lanes over time."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
+from typing import Any
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import nines
@@ -145,6 +146,13 @@ def few(reason: str) -> str:
     return "not sure enough" if _BY_CONFIDENCE.match(reason) else NUMBER.sub("…", re.split(r"[:;,] ", reason)[0])
 
 
+def _kind_of(evidence: Mapping[str, Any]) -> str:
+    """Return the kind of evidence, as the models are named, by the figures that the log has."""
+    if "likeness" in evidence:
+        return "ahead_proven" if evidence.get("proof") else "ahead"
+    return "down" if "landmarks" in evidence else "down_bare"
+
+
 def _judged(query: LoggedQuery) -> ByConfidence | None:
     """Return how the confidence of a query was judged; None if something else decided, or the log does not say."""
     said, evidence = _BY_CONFIDENCE.match(query.reason), value(query.line, "evidence")
@@ -153,7 +161,7 @@ def _judged(query: LoggedQuery) -> ByConfidence | None:
     at = query.at or query.place_at
     return ByConfidence(
         confidence=float(said[2]),
-        kind="ahead" if "likeness" in evidence else "down" if "landmarks" in evidence else "down_bare",
+        kind=_kind_of(evidence),
         followed=None if said[1] is None else float(said[1]),
         accepted=query.accepted,
         off_m=float(distance_m(*query.true_at, *at)) if query.true_at and at else None,

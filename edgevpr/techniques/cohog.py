@@ -120,7 +120,8 @@ class CoHog:
             packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
             scan_counts=self._votes and not self._is_nadir,
             heading_within_deg=_HEADING_WITHIN_DEG if self._is_nadir else None,
-            cells=self.w1 // self.w2 if tells_height else None,
+            cells=self.w1 // self.w2 if self._votes else None,
+            looks_down=tells_height,
             height_ratios=HEIGHT_RATIOS if tells_height else (),
             in_full=_IN_FULL[self.camera] if self._votes else None,
         )

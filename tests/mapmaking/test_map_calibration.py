@@ -102,7 +102,7 @@ def test_a_calibration_is_kept_in_the_map(place_map):
     assert sorted(asked) == sorted(2 * [f"{number}.png" for number in range(PLACES)])
     assert (found.asked, found.precision) == (2 * PLACES, CONFIG.accept_precision)
     assert sorted(found.recognisable) == list(range(1, PLACES + 1))
-    assert list(found.models) == ["ahead"]
+    assert list(found.models) == ["ahead", "ahead_proven"]
     assert 0 <= found.accepted <= 1
 
 

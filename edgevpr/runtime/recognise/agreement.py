@@ -1,7 +1,7 @@
 """Verification of the best place by landmarks, which had no part in finding it, and the agreement of two pictures: how
 many of their landmarks coincide after one rotation, one scaling and one shift.
 
-It is for cameras that look straight down only: ahead, near and far landmarks shift by different amounts. Points are
+Ahead, near and far landmarks shift by different amounts, so fewer agree, and they only speak for a match. Points are
 complex numbers here, x + iy (to the right, down), as shares of the longest side from the picture's middle. A *way* to
 lay the query on the place is two of them: a point is multiplied by the first (rotation and scale), then the second (the
 shift) is added.
@@ -26,7 +26,15 @@ from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, describe, unpacked
+from edgevpr.runtime.recognise.landmarks import (
+    AHEAD_PX,
+    DOWN_PX,
+    OF_PLACE,
+    OF_QUERY,
+    Landmarks,
+    describe,
+    unpacked,
+)
 
 # Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
 # expected as their match says, 31 had four inliers, 7 five, 3 six and none more (benchmarks/verification.py). Of
@@ -178,7 +186,16 @@ class Verification:
     @cached_property
     def landmarks(self) -> Landmarks:
         """Landmarks of the query."""
-        return describe(self.picture.image, self.picture.mask, OF_QUERY)
+        most, longest_px = (OF_QUERY, DOWN_PX) if self._spec.looks_down else (OF_QUERY // 2, AHEAD_PX)
+        return describe(self.picture.image, self.picture.mask, most, longest_px)
+
+    @property
+    def _sides(self) -> tuple[float, float]:
+        """Width and height of the picture that a technique has made a square of, as shares of its longest side."""
+        if self._spec.looks_down:  # its picture was put into the square, and not stretched
+            return 1.0, 1.0
+        height, width = self.picture.image.shape[:2]
+        return width / max(height, width), height / max(height, width)
 
     def proof(self, ranking: Ranking) -> Agreement | None:
         """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that its
@@ -196,6 +213,14 @@ class Verification:
             return 0
         expected, known = self._place(ranking, int(away[0]))
         return OF_PLACE if known is None else agreement(self.landmarks, known, expected).inliers
+
+    def inliers(self, ranking: Ranking) -> int:
+        """Return the number of landmarks of the query and of the best place that agree on the overlay of its match: 0
+        if those of the place are unknown, or if they are at rest, as a display is. Raises PlaceError as `proof` does.
+        """
+        expected, known = self._place(ranking, int(ranking.slots[0]))
+        found = None if known is None else agreement(self.landmarks, known, expected)
+        return 0 if found is None or found.is_at_rest else found.inliers
 
     def same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
@@ -216,12 +241,12 @@ class Verification:
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
         """Return the overlay of the query on the place in row `slot`, by its match, and the place's landmarks (None:
-        unknown). Both are None if the match has no shift or rotation."""
+        unknown). Both are None if the match has no shift."""
         match, cells = ranking.compared.get(slot), self._spec.cells
-        if match is None or match.shift_cells is None or match.rotation_deg is None or cells is None:
+        if match is None or match.shift_cells is None or cells is None:
             return None, None
-        dx, dy = match.shift_cells
-        expected = Overlay((dx / cells, dy / cells), match.rotation_deg, match.height_ratio)
+        dx, dy = (cells_off * side for cells_off, side in zip(match.shift_cells, self._sides, strict=True))
+        expected = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
         try:
             blob = self._map.landmarks_of(int(self._index.place_ids[slot]))
         except PlaceError as error:

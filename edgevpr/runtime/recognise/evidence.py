@@ -1,8 +1,9 @@
 """Evidence of a match: the figures that its confidence is computed from (see `confidence`), and map calibration.
 
-There are three kinds: for a camera that looks ahead (AHEAD), and for one that looks straight down, with landmarks
-(DOWN) or without (DOWN_BARE). A place *elsewhere* is outside the best place's neighbourhood. Regions *agree* if they
-show the same shift between query and place. Larger figures speak for the match, but for `rank_gap`.
+There are four kinds: for a camera that looks straight down, with landmarks (DOWN) or without (DOWN_BARE), and for one
+that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks speak for the match). A place *elsewhere* is outside the best
+place's neighbourhood. Regions *agree* if they show the same shift between query and place. Larger figures speak for the
+match, but for `rank_gap`.
 
 * agree: logarithm of what `share_of` returns, the share of regions that agree
 * lead: `agree` minus the largest `agree` of a place elsewhere
@@ -11,6 +12,7 @@ show the same shift between query and place. Larger figures speak for the match,
 * likeness: `Support.likeness` (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
 * landmarks: logarithm of one more than the number of landmarks that agree as expected (down)
+* proof: what `proven` returns, of the landmarks (ahead)
 * tried: `Ranking.tried`, which no model weighs (see `Model.chance`)
 """
 
@@ -32,14 +34,18 @@ from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of, prior
 
-AHEAD, DOWN, DOWN_BARE = "ahead", "down", "down_bare"
+AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
 _BARE = ("lead", "coverage", "structure")
 _LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
+_MAP_AHEAD = ("coverage", "likeness", "structure")
+_PLACE_AHEAD = ("lead", "coverage", "rank_gap", "structure")
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
-OF_MAP = {AHEAD: ("coverage", "likeness", "structure"), **_LOOKING_DOWN}
-OF_PLACE = {AHEAD: ("lead", "coverage", "rank_gap", "structure"), **_LOOKING_DOWN}
+OF_MAP = {AHEAD: _MAP_AHEAD, AHEAD_PROVEN: _MAP_AHEAD, **_LOOKING_DOWN}
+OF_PLACE = {AHEAD: _PLACE_AHEAD, AHEAD_PROVEN: (*_PLACE_AHEAD, "proof"), **_LOOKING_DOWN}
 WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, where its spec is not at hand (see `kinds_of`)
 _LEAST = 1e-3  # least share, so that its logarithm exists
+# So many landmarks agree with a place that only looks alike. Were fewer told apart, wrong matches would scatter more.
+_LANDMARKS_BY_CHANCE = 8
 _BY_CHANCE = 0.07  # share that pictures of foreign ground reach; stands for a place elsewhere if there is none
 FEWEST_PLACES = 30  # a map with fewer is not calibrated
 _HARDLY = 0.5  # mean confidence below which a place is hardly recognisable
@@ -102,15 +108,15 @@ class MapCalibration:
 
 def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
     """Return the kinds of evidence that a technique gives; an empty tuple if its matches are judged by fixed limits."""
-    if spec.cells is not None:
+    if spec.looks_down:
         return DOWN, DOWN_BARE
-    return (AHEAD,) if spec.scan_counts else ()
+    return (AHEAD, AHEAD_PROVEN) if spec.scan_counts else ()
 
 
 def kind_of(evidence: Evidence) -> str:
     """Return the kind of this evidence, by the figures it has."""
     if "likeness" in evidence:
-        return AHEAD
+        return AHEAD_PROVEN if evidence.get("proof") else AHEAD
     return DOWN if "landmarks" in evidence else DOWN_BARE
 
 
@@ -133,6 +139,8 @@ def described(evidence: Evidence) -> str:
     )
     if "landmarks" in evidence:
         return f"{ahead}, {math.expm1(evidence['landmarks']):.0f} landmarks agree"
+    if evidence.get("proof"):
+        return f"{ahead}, and {math.exp(evidence['proof']):.2f} times as many landmarks"
     return f"{ahead}, {math.exp(evidence['coverage']):.1%} of the place agrees"
 
 
@@ -163,9 +171,17 @@ def evidence_of(
         support = {slot: match.support for slot, match in matches.items() if match.support}
         evidence["rank_gap"] = support[best].log_rank - min(each.log_rank for each in support.values())
         evidence["likeness"] = support[best].likeness
+        evidence["proof"] = 0.0  # see `proven`
     elif proof is not None:
         evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
     return evidence
+
+
+def proven(inliers: int, rival: int) -> float:
+    """Return the evidence of the landmarks, ahead, where `inliers` agree with those of the best place and `rival` with
+    those of the best place elsewhere: the logarithm of how many times more agree than with the rival and by chance. It
+    is 0 at least, so it never speaks against a match."""
+    return max(0.0, math.log(max(inliers, _LANDMARKS_BY_CHANCE) / max(rival, _LANDMARKS_BY_CHANCE)))
 
 
 def share_of(match: FineMatch) -> float:

@@ -71,6 +71,12 @@ class Sureness:
         """Return the probability that the query of this evidence shows ground of the map."""
         return self.models[kind_of(evidence)].confidence_of_map(evidence)
 
+    def is_open(self, evidence: Evidence) -> bool:
+        """Return True if more evidence of the place can still decide: the match leads, its query is likely to show
+        ground of the map, and it is not sure yet."""
+        is_likely = leads(evidence) and self.of_map(evidence) >= _EVEN
+        return is_likely and self.confidence(evidence) < self.threshold(evidence)
+
     def threshold(self, evidence: Evidence) -> float:
         """Return the confidence needed to accept a match with this kind of evidence."""
         return self.needed(kind_of(evidence))

@@ -134,7 +134,7 @@ class Learner:
     def _tied(self, frame: Frame, event: Recognition) -> Frame:
         """Correct the position of a frame by the places around it, if they agree with its recorded position."""
         recogniser = self._recogniser
-        if frame.pose or frame.position is None or event.ranking is None or recogniser.technique.spec.cells is None:
+        if frame.pose or frame.position is None or event.ranking is None or not recogniser.technique.spec.looks_down:
             return frame
         try:
             found = named(event.ranking, recogniser.index, self._map, first=HEARD)

@@ -21,19 +21,21 @@ from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named,
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification
-from edgevpr.runtime.recognise.evidence import evidence_of, log_share, share_of
+from edgevpr.runtime.recognise.confidence import Evidence
+from edgevpr.runtime.recognise.evidence import evidence_of, log_share, proven, share_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, Reach, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
     NEW_FOR_S,
     AcceptRule,
     Findings,
+    Sureness,
     Verdict,
     is_hardly_ahead,
     judge,
     says_nothing,
 )
-from edgevpr.runtime.recognise.landmarks import describe, packed
+from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, describe, packed
 from edgevpr.runtime.recognise.levelling import seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.preparation import AS_IT_IS, Preparation
@@ -64,10 +66,12 @@ class Matcher:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WalkSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` turns the check by landmarks on. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
+    `verify` turns the check by landmarks on; with `all_evidence` they are compared where they decide nothing, too, as a
+    model needs to be fitted. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
 
     candidates: int | None = None
     verify: bool = True
+    all_evidence: bool = False
     min_accuracy_m: float = 1.0
 
 
@@ -197,9 +201,10 @@ class Recogniser:
         return Recognition(frame=None, reason=_sentence(error), failed=True, steps=steps, cost=cost)
 
     def landmarks(self, event: Recognition) -> bytes | None:
-        """Return the landmarks to store for a frame that becomes a place; None if the camera does not look down."""
-        picture = event.picture if self.technique.spec.cells else None
-        return packed(describe(picture.image, picture.mask)) if picture else None
+        """Return the landmarks to store for a frame that becomes a place; None if the technique has no use for them."""
+        picture, spec = event.picture, self.technique.spec
+        longest_px = DOWN_PX if spec.looks_down else AHEAD_PX
+        return packed(describe(picture.image, picture.mask, longest_px=longest_px)) if picture and spec.cells else None
 
     def _recognise(
         self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor
@@ -268,20 +273,21 @@ class Recogniser:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
         flight makes another place more likely, judge that one (`followed`: the flight's result is known already).
         Returns the verdict, the place judged, and the aircraft's position (None: unknown)."""
-        index, place_map, cells, rule = self.index, self.place_map, self.technique.spec.cells, self.rule
+        index, place_map, spec, rule = self.index, self.place_map, self.technique.spec, self.rule
         with self.meter.step("compare"):
             (best,) = named(ranking, index, place_map, first=1)
         rule = self._rule_of(best.place.place_id) if self._rule_of else rule
         where = proof = evidence = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
-        if verifies := is_worth_it and self._settings.verify and self.search is None and cells is not None:
+        verifies = is_worth_it and self._settings.verify and self.search is None and spec.cells is not None
+        if verifies and spec.looks_down:
             with self.meter.step("verify"):
                 proof = looked.proof(ranking)
         if is_worth_it:
             with self.meter.step("locate"):
-                found = named(ranking, index, place_map, first=HEARD if cells else 1)
-                where = located(found, cells, looked.picture.view, proof)
+                found = named(ranking, index, place_map, first=HEARD if spec.looks_down else 1)
+                where = located(found, spec.cells, looked.picture.view, proof)
                 if where is None and best.place.position:
                     where = at_place(best.place.position, self.accuracy_m)
         same: Collection[int] = where.places if where else ()
@@ -289,7 +295,9 @@ class Recogniser:
             with self.meter.step("verify"):
                 same = looked.same_ground(ranking)
         if rule.sure:
-            evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, cells is not None)
+            evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, spec.looks_down)
+        if rule.sure and evidence and verifies and not spec.looks_down:
+            evidence["proof"] = self._proven(ranking, looked, rule.sure, evidence)
         if self._following and followed is None and rule.sure and evidence is not None:
             with self.meter.step("locate"):
                 followed = self._following.heard(ranking, index, evidence, rule.sure, where)
@@ -314,10 +322,17 @@ class Recogniser:
         )
         verdict = judge(findings, index, rule, self.search)
         is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
-        if verdict.accepted and evidence and cells is not None and not is_turned_known:
+        if verdict.accepted and evidence and spec.looks_down and not is_turned_known:
             findings = replace(findings, ahead_of_turned=evidence["agree"] - self._turned(event, best))
             verdict = judge(findings, index, rule, self.search)
         return verdict, best, where
+
+    def _proven(self, ranking: Ranking, looked: Verification, sure: Sureness, evidence: Evidence) -> float:
+        """Return the evidence of the landmarks where the camera looks ahead: 0 where it would decide nothing."""
+        if not (self._settings.all_evidence or sure.is_open(evidence)):
+            return 0.0
+        with self.meter.step("verify"):
+            return proven(looked.inliers(ranking), looked.rival(ranking, self.rule.neighbour_m, ()))
 
     def _turned(self, event: Recognition, best: Candidate) -> float:
         """Return how much agrees, as in the evidence, with the best place if the picture is turned otherwise."""

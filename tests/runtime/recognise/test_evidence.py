@@ -13,6 +13,7 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
+    AHEAD_PROVEN,
     DOWN,
     DOWN_BARE,
     OF_MAP,
@@ -21,6 +22,7 @@ from edgevpr.runtime.recognise.evidence import (
     evidence_of,
     kind_of,
     kinds_of,
+    proven,
     require_usable,
 )
 from edgevpr.techniques import create
@@ -70,6 +72,7 @@ def test_evidence_has_the_names_that_models_ask_for():
     down = {5: FineMatch(0.2, coverage=0.3)}
     for kind, evidence in (
         (AHEAD, looked_ahead({5: ahead(0.2)})),
+        (AHEAD_PROVEN, looked_ahead({5: ahead(0.2)}) | {"proof": 0.1}),
         (DOWN, looked_down(down, agreement(12))),
         (DOWN_BARE, looked_down(down)),
     ):
@@ -79,7 +82,7 @@ def test_evidence_has_the_names_that_models_ask_for():
 
 
 def test_a_technique_has_the_kinds_of_its_camera():
-    assert kinds_of(create("cohog", {"w1": 208}).spec) == (AHEAD,)
+    assert kinds_of(create("cohog", {"w1": 208}).spec) == (AHEAD, AHEAD_PROVEN)
     assert kinds_of(create("cohog", {"camera": "nadir"}).spec) == (DOWN, DOWN_BARE)
     assert kinds_of(create("hog").spec) == kinds_of(create("cohog", {"matching": "thesis"}).spec) == ()
 
@@ -97,6 +100,14 @@ def test_a_place_elsewhere_whose_regions_agree_better_is_seen():
     found = looked_ahead({5: ahead(0.2, log_rank=0.9), 20: rival})
     assert found["rank_gap"] == pytest.approx(0.4)
     assert looked_ahead({5: ahead(0.2, log_rank=0.9), 20: ahead(0.15, log_rank=2.0)})["rank_gap"] == 0.0
+
+
+@pytest.mark.parametrize(("inliers", "rival", "times"), [(32, 0, 4), (32, 16, 2), (32, 40, 1), (7, 3, 1), (0, 250, 1)])
+def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_and_by_chance(inliers, rival, times):
+    proof = proven(inliers, rival)
+    assert proof == pytest.approx(math.log(times))
+    known = looked_ahead({5: ahead(0.2)}) | {"proof": proof}
+    assert described(known).endswith(f"and {times}.00 times as many landmarks" if proof else "of the place agrees")
 
 
 @pytest.mark.parametrize(

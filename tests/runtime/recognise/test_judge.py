@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sureness import NEEDED, sure_rule
+from sureness import NEEDED, sure_rule, told
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
@@ -47,6 +47,15 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
     )
+
+
+@pytest.mark.parametrize(
+    ("confidence", "of_map", "lead", "is_open"),
+    [(0.3, 0.99, 0.7, True), (NEEDED, 0.99, 0.7, False), (0.3, 0.4, 0.7, False), (0.3, 0.99, 0.0, False)],
+)
+def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
+    sure = told(lambda evidence: confidence, lambda evidence: of_map)
+    assert sure.is_open(CLEAR | {"lead": lead}) == is_open
 
 
 def test_a_match_that_offers_no_evidence_is_never_sure():

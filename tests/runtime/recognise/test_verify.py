@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from fakes import FakeClock
-from sureness import landmarks_count, sure_rule
+from sureness import landmarks_count, sure_rule, told
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
@@ -100,6 +100,43 @@ def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, 
     assert np.array(event.proof.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
     said = fields_of(event)["landmarks"]
     assert (said["inliers"], said["scale"]) == (event.proof.inliers, pytest.approx(1, abs=0.02))
+
+
+@pytest.fixture(scope="module")
+def mapped_ahead(tmp_path_factory):
+    """A map made by a camera that looks ahead, of pictures twice as wide as high."""
+    technique, path = create("cohog"), tmp_path_factory.mktemp("ahead") / "m.gpkg"
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map((wide(seed) for seed in range(PLACES)), technique, place_map, meter())
+    return path
+
+
+def wide(seed, right_px=0, down_px=0):
+    cut = frame(seed, right_px, down_px)
+    return replace(cut, image=cut.image[:160])
+
+
+def proof_of(path, confidence, of_map=1.0, moved_px=(10, -16)):
+    """What landmarks say of a query of the second place, whose match is so sure without them."""
+    rule = sure_rule(lambda evidence: confidence)
+    rule = replace(rule, sure=told(lambda evidence: confidence, lambda evidence: of_map))
+    event = asked(path, create("cohog"), wide(1, *moved_px), rule)
+    assert event.proof is None, "they never speak against a match"
+    assert event.best.place.place_id == 2
+    return event.evidence["proof"]
+
+
+def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(mapped_ahead):
+    assert proof_of(mapped_ahead, 0.5) > math.log(2)
+    assert proof_of(mapped_ahead, 0.95) == 0, "it is sure"
+    assert proof_of(mapped_ahead, 0.5, of_map=0.1) == 0, "they would not tell that it is on the map"
+    assert proof_of(mapped_ahead, 0.5, moved_px=(0, 0)) == 0, "a display drawn over every picture agrees as well"
+
+
+def test_looking_ahead_a_map_without_landmarks_is_a_map(mapped_ahead, tmp_path):
+    path = Path(shutil.copy(mapped_ahead, tmp_path))
+    keep(path, None, None)
+    assert proof_of(path, 0.5) == 0
 
 
 def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
