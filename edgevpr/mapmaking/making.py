@@ -187,7 +187,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 remove(path)
             raise
         if covered := covered_by(place_map):
-            _log.info("%s", covered)
+            _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
         refined, calibration = None, None
         if order.refine and technique.spec.looks_down and isinstance(pictures, FlownPictures):
             images = pictures.source if Path(pictures.source).is_dir() else None

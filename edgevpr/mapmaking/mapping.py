@@ -99,11 +99,12 @@ class Covered:
     track_m: float
     step_m: float
 
-    def __str__(self) -> str:
+    def described(self, is_flown: bool) -> str:
+        """Describe the ground in one sentence, and the track if the pictures were taken in a flight."""
         lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
         high, wide, track, step = (f"{each / 1000:.1f} km" if each >= 1000 else f"{each:.0f} m" for each in lengths_m)
         where = f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
-        return f"{where}; the track is {track} long, {step} from picture to picture (median)"
+        return f"{where}; the track is {track} long, {step} from picture to picture (median)" if is_flown else where
 
 
 def covered_by(place_map: PlaceMap) -> Covered | None:

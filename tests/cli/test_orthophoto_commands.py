@@ -180,10 +180,13 @@ def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, g
 
 
 @pytest.mark.slow
-def test_a_map_cut_at_two_footprints_says_both(tmp_path, ground, capsys):
+def test_a_map_cut_at_two_footprints_says_both(tmp_path, ground, capsys, caplog):
     place_map = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", "120,80", "--spacing-m", 50, "--no-calibrate", "--json")
-    assert run("map", "build", place_map, *cut) == 0
+    with caplog.at_level("INFO"):
+        assert run("map", "build", place_map, *cut) == 0
+    assert "the map extends" in caplog.text
+    assert "the track" not in caplog.text, "nobody has flown it"
     capsys.readouterr()
     assert run("map", "info", place_map, "--json") == 0
     assert json.loads(capsys.readouterr().out)["footprints_m"] == [80, 120]
