@@ -7,7 +7,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 def write_log(path):
     with FlightLog(path) as log:
         for lat_deg in (50.0, 51.0):
-            log.write("start")
+            log.write("start", t_mono_s=lat_deg)  # two of one millisecond would be one flight
             at = {"lat_deg": lat_deg, "lon_deg": 8.0}
             log.write("query", query="one.jpg", accepted=True, reason="sure", located=at)
     return path

@@ -13,9 +13,9 @@ def query(name: str, **fields) -> dict:
     return {"query": name, "accepted": True, "reason": "sure", "confidence": 1.0, **found, "fix": fix} | fields
 
 
-def write_log(path: Path, *lines: tuple[str, dict], end: bool = True) -> Path:
-    """Write a flight, a line a second."""
-    seconds = iter(range(1000, 10_000))
+def write_log(path: Path, *lines: tuple[str, dict], end: bool = True, first_s: int = 1000) -> Path:
+    """Write a flight, a line a second. Two of one millisecond are one flight, unless they begin at other seconds."""
+    seconds = iter(range(first_s, 10_000))
     with FlightLog(path) as log:
         for kind, fields in (("start", {}), *lines, *([("end", {})] if end else [])):
             log.write(kind, **{"t_mono_s": float(next(seconds))} | fields)

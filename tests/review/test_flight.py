@@ -43,7 +43,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
 
 def test_the_last_of_several_flights_is_taken(tmp_path):
     log, newer = write_log(tmp_path / "log", ("query", query("a")), end=False), tmp_path / "newer"
-    write_log(newer, ("query", query("b")), ("query", query("c")))
+    write_log(newer, ("query", query("b")), ("query", query("c")), first_s=5000)
     with open(log, "ab") as handle:
         handle.write(newer.read_bytes())
     assert [each.name for each in read_flight(log).queries] == ["b", "c"]
