@@ -8,7 +8,9 @@ from logs import query, write_log
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.review.logged import FixOutcome, read_flight
+from edgevpr.review.queries import steps_of
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.recognise.evidence import kind_of
 
 
 def outcomes(flight):
@@ -141,3 +143,13 @@ def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
         with pytest.raises(UsageError, match="no such"):
             read_flight(missing)
+
+
+@pytest.mark.parametrize(
+    "figures", [{"likeness": 0.9, "proof": 0.0}, {"likeness": 0.9, "proof": 0.4}, {"landmarks": 2.0}, {}]
+)
+def test_the_kind_of_evidence_has_the_name_of_its_model(tmp_path, figures):
+    """The page's precision looks up what a match of this kind needs."""
+    line = query("a", reason="confidence 0.99, 0.98 needed: it is so", evidence={"lead": 1.0, **figures})
+    (step,) = steps_of((), read_flight(write_log(tmp_path / "log", ("query", line))))
+    assert step.judged.kind == kind_of(line["evidence"])
