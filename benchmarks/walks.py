@@ -86,8 +86,9 @@ def walk(
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
     rule = rule or accept_rule(technique, config().match, 1, calibration_of(place_map))
-    looks = {"verify": verify, "all_evidence": all_evidence}
-    settings = WalkSettings(candidates=technique.candidates, min_accuracy_m=min_accuracy_m, **looks)
+    settings = WalkSettings(
+        candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
+    )
     matcher, preparation = Matcher(technique, index, rule, search), Preparation(levelling=levelling)
     return Recogniser(matcher, place_map, meter(), settings, preparation=preparation, **more)
 

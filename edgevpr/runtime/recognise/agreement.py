@@ -177,6 +177,11 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
     )
 
 
+def landmarks_in(picture: Levelled, spec: TechniqueSpec, most: int = OF_PLACE) -> Landmarks:
+    """Find the `most` best landmarks of a picture, of the size at which those of a technique's places are found."""
+    return describe(picture.image, picture.mask, most, DOWN_PX if spec.looks_down else AHEAD_PX)
+
+
 class Verification:
     """Compares the landmarks of one query, which are computed when first needed, with those of places."""
 
@@ -186,8 +191,8 @@ class Verification:
     @cached_property
     def landmarks(self) -> Landmarks:
         """Landmarks of the query."""
-        most, longest_px = (OF_QUERY, DOWN_PX) if self._spec.looks_down else (OF_QUERY // 2, AHEAD_PX)
-        return describe(self.picture.image, self.picture.mask, most, longest_px)
+        most = OF_QUERY if self._spec.looks_down else OF_QUERY // 2
+        return landmarks_in(self.picture, self._spec, most)
 
     @property
     def _sides(self) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.agreement import Verification
+from edgevpr.runtime.recognise.agreement import Verification, landmarks_in
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import evidence_of, log_share, proven, share_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
@@ -35,7 +35,7 @@ from edgevpr.runtime.recognise.judge import (
     judge,
     says_nothing,
 )
-from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, describe, packed
+from edgevpr.runtime.recognise.landmarks import packed
 from edgevpr.runtime.recognise.levelling import seen_as
 from edgevpr.runtime.recognise.locate import HEARD, Located, at_place, located
 from edgevpr.runtime.recognise.preparation import AS_IT_IS, Preparation
@@ -203,8 +203,7 @@ class Recogniser:
     def landmarks(self, event: Recognition) -> bytes | None:
         """Return the landmarks to store for a frame that becomes a place; None if the technique has no use for them."""
         picture, spec = event.picture, self.technique.spec
-        longest_px = DOWN_PX if spec.looks_down else AHEAD_PX
-        return packed(describe(picture.image, picture.mask, longest_px=longest_px)) if picture and spec.cells else None
+        return packed(landmarks_in(picture, spec)) if picture and spec.cells else None
 
     def _recognise(
         self, event: Recognition, frame: Frame, looked: Verification, descriptor: Descriptor
