@@ -17,6 +17,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking.beforehand import require_ahead, say_what_lens, say_what_will_lack
+from edgevpr.mapmaking.display import say_what_stands_still
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, covered_by
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
@@ -168,6 +169,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         try:
             if isinstance(pictures, FlownPictures):
                 _say_beforehand(pictures, config, technique, source.total, len(place_map) if order.calibrate else None)
+                say_what_stands_still(pictures.source, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
                 _say_and_fetch(source, pictures.spacing_m, technique, shown)
