@@ -17,22 +17,28 @@ class Told:
 
     confidence: Callable[[Evidence], float]
     of_map: Callable[[Evidence], float] | None = None
+    needed: float = NEEDED
 
     def confidence_of_map(self, evidence: Evidence) -> float:
         return (self.of_map or self.confidence)(evidence)
 
     def threshold(self, precision: float) -> float:
-        return NEEDED
+        return self.needed
 
 
-def told(confidence: Callable[[Evidence], float], of_map: Callable[[Evidence], float] | None = None) -> Sureness:
+def told(
+    confidence: Callable[[Evidence], float],
+    of_map: Callable[[Evidence], float] | None = None,
+    needed: float = NEEDED,
+) -> Sureness:
     """The decision by a confidence that is told what to say."""
-    return Sureness(dict.fromkeys(OF_MAP, Told(confidence, of_map)), 0.999)
+    return Sureness(dict.fromkeys(OF_MAP, Told(confidence, of_map, needed)), 0.999)
 
 
-def sure_rule(confidence: Callable[[Evidence], float], **limits: float) -> AcceptRule:
-    """The rule that accepts a match whose confidence is `NEEDED`."""
-    return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": told(confidence), **limits})
+def sure_rule(confidence: Callable[[Evidence], float], needed: float = NEEDED, **limits: float) -> AcceptRule:
+    """The rule that accepts a match whose confidence is `needed`."""
+    sure = told(confidence, needed=needed)
+    return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": sure, **limits})
 
 
 def landmarks_count(evidence: Evidence) -> float:

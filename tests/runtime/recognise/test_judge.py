@@ -1,6 +1,7 @@
 """The judge of a single query: by its confidence, or by score and lead; and what speaks against a match."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,24 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
 def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
     sure = told(lambda evidence: confidence, lambda evidence: of_map)
     assert sure.is_open(CLEAR | {"lead": lead}) == is_open
+
+
+@pytest.mark.parametrize(
+    ("confidence", "followed", "accepted"),
+    [(0.5, 0.9999, True), (0.5, 0.9991, True), (0.5, 0.9989, False), (0.9985, 0.9991, False), (0.5, 1.0, True)],
+    ids=["as needed by itself", "as precise as asked", "less", "of which the match says most", "certain"],
+)
+def test_a_flight_that_makes_a_place_much_likelier_needs_the_precision_only(confidence, followed, accepted):
+    rule = sure_rule(lambda evidence: confidence, needed=0.9999)
+    assert judged(rule=rule, evidence=CLEAR, by_flight=followed).accepted == accepted
+    assert not judged(rule=rule, evidence=CLEAR).accepted
+
+
+def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
+    rule = replace(accept_rule(create("cohog"), load_config(None, {}).match), sure=told(lambda evidence: 0.5))
+    assert judged((0.19, 0.2), rule, evidence=CLEAR, by_flight=0.9999).accepted
+    assert not judged((0.19, 0.2), rule, evidence=CLEAR).accepted
+    assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, by_flight=0.9999).accepted
 
 
 def test_a_match_that_offers_no_evidence_is_never_sure():
