@@ -37,6 +37,10 @@ Scan = tuple[Singles, Singles | None]
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 3  # hypotheses per place
+# Among so many places, where no heading is known, so many times the candidates are compared: wrong pairs of a place and
+# a rotation come before the right one more often. Of the sets from the air it finds .838 instead of .802 over 10,000
+# places, .858 instead of .853 over 5,000, .883 instead of .878 over 2,000, and over 1,000 .893 instead of .898.
+_LARGE, _OF_LARGE = 2000, 2
 _MANY = 3  # unreadable places in one query, from which on the file may be at fault
 # In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
 # one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
@@ -109,6 +113,7 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
+    Among 2,000 places and more, looking down with no heading known, twice as many are compared.
     If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
     compared, under all hypotheses of the expected height if nothing else is expected: exact, but slow.
     If all candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as
@@ -123,7 +128,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m:
     looks = _Comparison(query, scanned, candidates)
     readable = looks.readable
     there = readable if in_reach is None else in_reach & readable
-    count = len(index) if spec.fine is None or looks.is_exact or candidates is None else candidates
+    count = candidates
+    if count is None or spec.fine is None or looks.is_exact:
+        count = len(index)
+    elif spec.height_ratios and query.expected.turned_deg is None and np.count_nonzero(there) >= _LARGE:
+        count *= _OF_LARGE
     chosen = looks.best(there, count, spec.in_full)
     chosen += looks.best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
     if not chosen:

@@ -10,6 +10,7 @@ from ranking import Ruler, rank
 from edgevpr.core.contract import Descriptor, FineMatch
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import Frame, Position
+from edgevpr.places import retrieve
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named
@@ -195,6 +196,32 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     assert technique.tried == [None] * 25
     assert few.slots[0] == everything.slots[0]
     assert few.scores[0] == everything.scores[0]
+
+
+@pytest.mark.parametrize(
+    ("large", "known", "compared"),
+    [
+        (25, {}, 28),
+        (26, {}, 14),
+        (25, {"turned_deg": np.zeros(25)}, 14),
+        (25, {"in_reach": np.arange(25) < 24}, 14 + 3),
+    ],
+    ids=["a large map", "a small map", "known headings", "few in reach"],
+)
+def test_in_a_large_map_twice_as_many_are_compared_where_no_heading_is_known(
+    ruler_map, monkeypatch, large, known, compared
+):
+    class Tall(Turned):
+        spec = dataclasses.replace(Ruler.spec, height_ratios=(1.0,))
+
+        def coarse_scores(self, query, rows, mean, **hints):
+            return super().coarse_scores(query, rows, mean)
+
+    monkeypatch.setattr(retrieve, "_LARGE", large)
+    _, place_map = ruler_map
+    technique = Tall()
+    rank(technique, technique.encode(43), place_map, load_index(place_map, technique, 10_000), 14, **known)
+    assert sum(len(hypotheses) for hypotheses in technique.tried) == compared
 
 
 def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
