@@ -131,8 +131,8 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m:
     count = candidates
     if count is None or spec.fine is None or looks.is_exact:
         count = len(index)
-    elif spec.height_ratios and query.expected.turned_deg is None and np.count_nonzero(there) >= _LARGE:
-        count *= _OF_LARGE
+    elif query.expected.turned_deg is None:
+        count *= times_as_many(bool(spec.height_ratios), int(np.count_nonzero(there)))
     chosen = looks.best(there, count, spec.in_full)
     chosen += looks.best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
     if not chosen:
@@ -159,6 +159,11 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m:
         unread=_unread(scanned[0], readable, slots[0]),
         tried=_tried(scanned[1], slots, len(spec.height_ratios)),
     )
+
+
+def times_as_many(tries_rotations: bool, places: int) -> int:
+    """Return how many times the candidates are compared among so many places where no heading is known."""
+    return _OF_LARGE if tries_rotations and places >= _LARGE else 1
 
 
 class _Comparison:

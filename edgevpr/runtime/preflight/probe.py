@@ -18,6 +18,7 @@ from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.retrieve import times_as_many
 from edgevpr.places.rows import MOST_LANDMARK_BYTES
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.power import machine
@@ -48,6 +49,7 @@ class TechniqueCosts:
     `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
     technique has one stage, and compares all). `scan_per_place`: cost of scanning one place. `scan_once`: cost of
     preparing a query for the scan.
+    `tries_rotations`: more candidates are compared in a large map (see `times_as_many`).
     `process_mb`: peak resident memory of the process without a map.
     `is_network`: pictures go through a network. `sequence`: number of queries matched together.
     """
@@ -62,6 +64,7 @@ class TechniqueCosts:
     scan_once: StageCost = NO_COST
     compare_once: StageCost = NO_COST
     in_full: int = 1
+    tries_rotations: bool = False
     is_network: bool = False
     sequence: int = 1
 
@@ -69,7 +72,7 @@ class TechniqueCosts:
         """Return the cost of matching one query in a map of `places` places."""
         if self.candidates is None:
             return self.match_per_place * places
-        compared = min(places, self.candidates)
+        compared = min(places, self.candidates * times_as_many(self.tries_rotations, places))
         full = self.compare_once * min(1.0, compared / self.in_full)
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
@@ -115,15 +118,16 @@ def probe(
         small = bench.tries(trial_map, index, 1, _TRIES if spec.fine else 1)
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
         many = _many(technique, index)
-        large = bench.tries(trial_map, many, candidates)
-        fewer = max(spec.in_full or 1, candidates // 2)
+        times = times_as_many(bool(spec.height_ratios), len(many))
+        most, fewer = candidates // times, max(spec.in_full or 1, candidates // 2) // times
+        large = bench.tries(trial_map, many, most)
         half = bench.tries(trial_map, many, fewer) if spec.in_full else large
     once = _least([steps.scan for steps in small]) if spec.fine else NO_COST
     # The time of scanning six places is not spent on them, but on preparing the query and on the call.
     scan = _beyond(_least([steps.scan if spec.fine else steps.match for steps in large]), once) * (1 / len(many))
     compare, part = (_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
-        one_more = _beyond(compare, part) * (1 / max(1, candidates - fewer))
+        one_more = _beyond(compare, part) * (1 / max(1, times * (most - fewer)))
         # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
         compare_once = _beyond(compare, one_more * candidates) + verify
@@ -134,6 +138,7 @@ def probe(
         match_per_place=one_more,
         compare_once=compare_once,
         in_full=spec.in_full or 1,
+        tries_rotations=bool(spec.height_ratios),
         ram_bytes_per_place=ram_bytes(spec, bench.sequence),
         disk_bytes_per_place=disk_bytes(spec),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
