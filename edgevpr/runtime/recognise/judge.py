@@ -51,10 +51,10 @@ _NO_LEAD = math.log(1.05)
 # Probabilities: the highest where a place elsewhere agrees as well; the least for accepting, at any precision, by the
 # match alone, and by the flight so far.
 _EVEN, _LEAST_SURE, _SURE_BY_FLIGHT = 0.5, 0.9, 0.99
-# How many times the flight must raise the odds of a match before its probability counts for what it says. What a match
-# needs by itself is often more than the precision: of many matches the luckiest wrong one must be refused. It has no
-# luck in the queries before. In seven manners of flying along corridor, the seasons and nordland_tiny, and over 240
-# foreign pictures each, nothing more was wrong, and nordland_tiny has .59 instead of .47 of its queries accepted.
+# How many times the flight must raise the odds of a match for the precision to be enough. By itself a match often needs
+# more, since of many matches the luckiest wrong one must be refused; the queries before do not share its luck. In seven
+# manners of flying along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures each, nothing
+# more was wrong; of nordland_tiny's queries .59 instead of .47 are accepted.
 _RAISED = 10.0
 _LEAST_FOLLOWED = 0.5  # least probability by the flight so far, for a match that is sure by itself
 
