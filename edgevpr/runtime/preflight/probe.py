@@ -119,7 +119,7 @@ def probe(
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
         many = _many(technique, index)
         times = times_as_many(bool(spec.height_ratios), len(many))
-        most, fewer = candidates // times, max(spec.in_full or 1, candidates // 2) // times
+        most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
         large = bench.tries(trial_map, many, most)
         half = bench.tries(trial_map, many, fewer) if spec.in_full else large
     once = _least([steps.scan for steps in small]) if spec.fine else NO_COST
