@@ -5,7 +5,7 @@ looks straight down move in any direction, and turn. A few pairs of neighbours a
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import islice, pairwise
 from pathlib import Path
@@ -116,16 +116,24 @@ def _seen(uri: str, mask: Mask | None) -> tuple[bool, str]:
 def _pictures(uri: str) -> Iterator[list[Image]]:
     """Yield runs of neighbouring pictures of a folder or video. Those that cannot be used are left out."""
     if not Path(uri).is_dir():
-        film = _film(uri)
-        yield [frame.image for frame in islice(filter(None, read_to_end(film, lambda error: None)), _FILMED)]
-        film.close()
+        yield list(filmed(uri, _FILMED))
         return
     for run in _runs(list_images(uri)):
-        images = []
-        for path in run:
-            with suppress(ImageError):
-                images.append(read_image(path))
-        yield images
+        yield list(readable(run))
+
+
+def filmed(uri: str, most: int) -> Iterator[Image]:
+    """Yield the first `most` pictures of a video, a second apart. Those that cannot be used are left out."""
+    film = _film(uri)
+    yield from (frame.image for frame in islice(filter(None, read_to_end(film, lambda error: None)), most))
+    film.close()
+
+
+def readable(paths: Iterable[Path]) -> Iterator[Image]:
+    """Yield the pictures of these files that can be used."""
+    for path in paths:
+        with suppress(ImageError):
+            yield read_image(path)
 
 
 def _film(uri: str) -> Source:

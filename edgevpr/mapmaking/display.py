@@ -5,19 +5,16 @@ The edges of moving ground point anywhere, so in the mean of many pictures they 
 
 import logging
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Image, Singles
-from edgevpr.core.errors import ImageError
 from edgevpr.core.text import at_work
-from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.images import list_images
 from edgevpr.frames.mask import Mask
-from edgevpr.frames.source import open_source, read_to_end
+from edgevpr.mapmaking.beforehand import filmed, readable
 
 _log = logging.getLogger(__name__)
 _WIDE, _HIGH = 320, 240
@@ -73,13 +70,8 @@ def _small(allowed: Bools) -> Bools:
 
 
 def _pictures(uri: str) -> Iterator[Image]:
-    """Yield pictures spread over a folder, or of the first seconds of a video, but for those that cannot be used."""
+    """Return pictures spread over a folder, or of the first seconds of a video."""
     if not Path(uri).is_dir():
-        film = open_source(uri, step_s=1.0, live=False)
-        yield from (frame.image for frame in islice(filter(None, read_to_end(film, lambda error: None)), _PICTURES))
-        film.close()
-        return
+        return filmed(uri, _PICTURES)
     paths = list_images(uri)
-    for at in sorted({*np.linspace(0, len(paths) - 1, _PICTURES).astype(int).tolist()}):
-        with suppress(ImageError):
-            yield read_image(paths[at])
+    return readable(paths[at] for at in sorted({*np.linspace(0, len(paths) - 1, _PICTURES).astype(int).tolist()}))
