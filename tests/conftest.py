@@ -1,5 +1,6 @@
 """What the tests of several rooms share."""
 
+import logging
 import os
 import signal
 
@@ -44,6 +45,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def documented(monkeypatch):
     """Whatever test prints a result as JSON, it is as its schema says."""
     monkeypatch.setattr(shared, "json", Checked)
+
+
+@pytest.fixture(autouse=True)
+def heard():
+    """After a test that called a command with -q, the next one of the process is told of progress again."""
+    yield
+    logging.getLogger("edgevpr").setLevel(logging.NOTSET)
 
 
 @pytest.fixture
