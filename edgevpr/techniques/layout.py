@@ -155,7 +155,8 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
     laid = [_shifted(each, grid.side) for each in queries]
     asked = np.concatenate(laid) if len(laid) > 1 else laid[0]  # a megabyte: no copy that is not needed
-    scatter = np.einsum("sd,sd->s", asked, asked)
+    strengths = ((each**2).sum(axis=0, keepdims=True) for each in queries)
+    scatter = np.concatenate([_shifted(each, grid.side).sum(axis=1) for each in strengths])
     least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
@@ -165,7 +166,7 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
         # Wide pictures leave the same cells of every place empty.
         filled = (part != _NOTHING).any(axis=0)
         if was is None or (filled != was).any():
-            was, kept = filled, asked.take(np.flatnonzero(np.repeat(filled, 2)), axis=1)
+            was, kept = filled, asked.compress(np.repeat(filled, 2), axis=1)
         places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
         found = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
         strength = np.einsum("nd,nd->n", places, places)
