@@ -4,7 +4,9 @@ recorded."""
 import csv
 import dataclasses
 import json
+import os
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, moved, offset_m
 from edgevpr.core.types import Frame, Position
+from edgevpr.frames.images import read_image
 from edgevpr.lab.simulate.camera import Camera, lit, photograph
 from edgevpr.lab.simulate.generated import mapping_flight, to_position
 from edgevpr.lab.simulate.landscape import make_scene
@@ -20,12 +23,14 @@ from edgevpr.mapmaking.refine import refine
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.runtime.recognise.opening import technique_of
+from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
 
 NOISE_M, GLITCH_M = 5.0, 250.0
 FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
 EVERY, LEGS = 1, 2  # pictures of the two first legs
+_DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
 def photographer(seed):
@@ -229,6 +234,24 @@ def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
     for place, was in zip(places, before, strict=True):
         if place.pose is None and was is not None:
             assert place.position == was, "a place that is not tied stays"
+
+
+@pytest.mark.data
+def test_where_landmarks_are_missing_votes_tie_pictures(tmp_path):
+    folder = _DATA / "aerial_garfield28"
+    if not folder.is_dir():
+        pytest.skip("the pictures are not here")
+    technique = create("cohog", {"camera": "nadir"})
+    with PlaceMap.create(tmp_path / "m.gpkg", technique.spec) as place_map:
+        for row in csv.DictReader((folder / "mosaic_positions.csv").open()):
+            if (path := folder / "ref" / row["file"]).is_file():
+                here, image = (float(row["x_px"]) / 10, -float(row["y_px"]) / 10), read_image(path)
+                frame = Frame(image=image, name=row["file"], t_mono_s=0.0, position=Position(*moved(50.0, 8.0, *here)))
+                place_map.add(frame, technique.encode(image))
+    found, _ = refined_of(tmp_path / "m.gpkg", folder / "ref")
+    assert (found.refined, found.contradictory) == (19, ())
+    assert found.moved_m < 1.0
+    assert found.ties > 65, "of a hundred pairs many overlap by a strip only"
 
 
 def test_places_of_a_surveyed_picture_stay(built, tmp_path):

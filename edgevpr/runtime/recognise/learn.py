@@ -140,7 +140,7 @@ class Learner:
             found = named(event.ranking, recogniser.index, self._map, first=HEARD)
         except PlaceError:  # the unreadable place is left out from now on; the frame can be learnt without it
             return frame
-        if found[0].match.score < recogniser.rule.min_score:
+        if found[0].match.score < recogniser.technique.min_score:
             return frame
         where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the picture's middle
         learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
