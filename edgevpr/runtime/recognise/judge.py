@@ -31,8 +31,8 @@ _OF_MARGIN_AT_OTHER_SPEEDS = 0.5
 _LONGEST = 10
 
 # Looking down, if a place elsewhere agrees without any shift or rotation, as the best one does, both share what is
-# drawn over every frame. Such places scored .012 or more behind a display; of 162 pictures at rest of seven sets without
-# one, none had a place elsewhere at rest that scored more than .008, but where two places show the same ground.
+# drawn over every frame. Such places scored .012 or more behind a display. Of 162 pictures at rest, of seven sets
+# without one, none had a place elsewhere at rest with more than .008, but where two places show the same ground.
 _DISPLAY_SCORE = 0.01
 _AT_REST_CELLS = 1.5
 _AT_REST_DEG = 7.5
@@ -299,8 +299,11 @@ def _is_at_rest(match: FineMatch | None) -> bool:
 
 
 def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
-    """Return the reason if the mean score of a sequence is not to be trusted, else None: the newest queries no longer
-    fit, or a place elsewhere fits about as well if it is passed at another speed."""
+    """Return the reason if the mean score of a sequence is not to be trusted, else None: the newest query shows other
+    places, the newest queries no longer fit, or a place elsewhere fits about as well if it is passed at another speed.
+    """
+    if ranking.compared and int(ranking.slots[0]) not in ranking.compared:
+        return "other places resemble the newest query more than this one does"
     away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"

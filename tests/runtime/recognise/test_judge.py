@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,13 @@ def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
     assert accept_rule(create("cohog", {"w1": 208}), config).sure
     assert accept_rule(create("cohog", {"w1": 208}), config, length=3).sure is None
     assert accept_rule(create("hog"), config).sure is None
+
+
+def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_with():
+    search = SimpleNamespace(frames=2, length=2)
+    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
+    ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
+    assert "newest query" in judge(Findings(ranking), index, RULE, search).reason
 
 
 def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
