@@ -155,9 +155,9 @@ def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
     laid = [_shifted(each, grid.side) for each in queries]
     asked = np.concatenate(laid) if len(laid) > 1 else laid[0]  # a megabyte: no copy that is not needed
-    strengths = ((each**2).sum(axis=0, keepdims=True) for each in queries)
+    strengths = [(each**2).sum(axis=0, keepdims=True) for each in queries]
     scatter = np.concatenate([_shifted(each, grid.side).sum(axis=1) for each in strengths])
-    least = [_LEAST_SCATTER**2 * _strength(each) * grid.side**2 for each in queries]
+    least = [_LEAST_SCATTER**2 * float(each.mean()) * grid.side**2 for each in strengths]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
     was, kept = None, asked
