@@ -99,12 +99,17 @@ def _card(rng, height, width):
     return picture
 
 
-def display(picture, rng):
-    """Draw what a flight controller draws over a picture: figures, a cross, a ladder, a horizon line."""
-    height, width = picture.shape[:2]
+def figures(picture, rng):
+    """Write the figures that a flight controller writes over a picture."""
     texts = ("16.2V", "12.4A", "ALT 83m", "GPS 14", "12:31", "ACRO", "RSSI 87", "HOME 412m", "-35.363261", "DISARMED")
     for text in rng.permutation(texts)[: rng.integers(3, len(texts) + 1)]:
         _write(picture, rng, str(text), (rng.uniform(0, 0.85), rng.uniform(0.06, 0.97)), rng.uniform(0.5, 1.1))
+    return picture
+
+
+def display(picture, rng):
+    """Draw what a flight controller draws over a picture: figures, a cross, a ladder, a horizon line."""
+    height, width = figures(picture, rng).shape[:2]
     middle, white = (width // 2, height // 2), (255, 255, 255)
     cv2.drawMarker(picture, middle, white, cv2.MARKER_CROSS, height // 12, 2)
     roll = np.tan(rng.normal(0, 0.2))

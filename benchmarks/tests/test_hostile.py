@@ -62,7 +62,12 @@ def test_a_run_of_pictures_counts_every_kind_and_nothing_wrong_is_accepted():
     assert [(row["kind"], row["tried"]) for row in rows] == [
         ("of nothing", 2),
         ("spoilt", 11),
+        ("of other sites", 2),
         ("of the other camera", 2),
+        ("its own behind a display", 2),
+        ("of other sites behind a display", 2),
+        ("its own behind figures", 2),
+        ("of other sites behind figures", 2),
     ]
     assert sum(row["accepted_wrong"] for row in rows) == 0
     assert rows == hostile_pictures.run(count=2, seed=31, names=["corridor"])
