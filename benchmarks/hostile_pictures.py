@@ -3,8 +3,8 @@
 In the map of every image set are asked: pictures of nothing real (screens without a signal, displays on a blank ground,
 noise, sky), the set's own queries spoilt (covered, out of focus, smeared), pictures of other sites, and pictures by a
 camera that looks the other way. Then a display, or figures alone, are drawn over everything, the pictures of the map
-among it, and no mask is painted: its own queries and other sites are asked again. A picture that is recognised as its own place is no fault.
-Everything follows from a seed.
+among it, and no mask is painted: its own queries and other sites are asked again. A picture that is recognised as its
+own place is no fault. Everything follows from a seed.
 """
 
 import tempfile
