@@ -68,7 +68,7 @@ class Shown:
 
     mask: np.ndarray | None = None
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None, **_: object) -> Levelled:
         """Return the picture with the mask."""
         return Levelled(frame.image, self.mask, UNKNOWN_VIEW)
 

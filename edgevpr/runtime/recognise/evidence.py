@@ -120,6 +120,11 @@ def kind_of(evidence: Evidence) -> str:
     return DOWN if "landmarks" in evidence else DOWN_BARE
 
 
+def has_twin(evidence: Evidence) -> bool:
+    """Return True if at least half as many landmarks agree with a place elsewhere: both show the same kind of thing."""
+    return "rival" in evidence and _count(evidence["landmarks"]) < 2 * _count(evidence["rival"])
+
+
 def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
@@ -138,7 +143,8 @@ def described(evidence: Evidence) -> str:
         f"{math.exp(evidence['lead']):.2f} times as many regions agree as elsewhere ({math.exp(evidence['agree']):.1%})"
     )
     if "landmarks" in evidence:
-        return f"{ahead}, {math.expm1(evidence['landmarks']):.0f} landmarks agree"
+        elsewhere_too = f", and {_count(evidence['rival'])} with a place elsewhere" if "rival" in evidence else ""
+        return f"{ahead}, {_count(evidence['landmarks'])} landmarks agree{elsewhere_too}"
     if evidence.get("proof"):
         return f"{ahead}, and {math.exp(evidence['proof']):.2f} times as many landmarks"
     return f"{ahead}, {math.exp(evidence['coverage']):.1%} of the place agrees"
@@ -173,7 +179,7 @@ def evidence_of(
         evidence["likeness"] = support[best].likeness
         evidence["proof"] = 0.0  # see `proven`
     elif proof is not None:
-        evidence["landmarks"] = math.log1p(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
+        evidence["landmarks"] = of_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
     return evidence
 
 
@@ -269,6 +275,15 @@ def read_calibration(text: str) -> MapCalibration:
     found["models"] = {kind: model_of(model) for kind, model in found["models"].items()}
     found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
     return MapCalibration(**found)
+
+
+def of_count(landmarks: int) -> float:
+    """Return a number of landmarks as it stands in the evidence."""
+    return math.log1p(landmarks)
+
+
+def _count(of_evidence: float) -> int:
+    return round(math.expm1(of_evidence))
 
 
 def log_share(share: float) -> float:

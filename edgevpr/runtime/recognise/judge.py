@@ -19,7 +19,7 @@ from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence, Model, prior
-from edgevpr.runtime.recognise.evidence import MapCalibration, described, kind_of, kinds_of
+from edgevpr.runtime.recognise.evidence import MapCalibration, described, has_twin, kind_of, kinds_of
 from edgevpr.runtime.recognise.locate import Located
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
@@ -119,7 +119,7 @@ class Findings:
     """All that is known of the best place of a `ranking` when it is judged.
 
     `is_new` is True for a place learnt within the last `NEW_FOR_S` seconds. `proof` is the agreement of the landmarks
-    of query and place (None: not compared), and `rival` the number of agreeing landmarks of the best place elsewhere.
+    of query and place (None: not compared).
     `where` is the position computed from the best places (None: only that of the best place is known); the places it
     was computed from are not elsewhere. `evidence` is that of the match (None: the rule needs none), and `by_flight`
     the probability of the place by the flight so far (None: the query is judged alone). `ahead_of_turned` is the lead,
@@ -129,7 +129,6 @@ class Findings:
     ranking: Ranking = field(kw_only=False)
     is_new: bool = False
     proof: Agreement | None = None
-    rival: int = 0
     where: Located | None = None
     evidence: Evidence | None = None
     by_flight: float | None = None
@@ -230,7 +229,7 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
 
 def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
-    evidence, followed, rival = findings.evidence, findings.by_flight, findings.rival
+    evidence, followed = findings.evidence, findings.by_flight
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
@@ -242,8 +241,6 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
         return Verdict(False, figures)
     if followed is not None and followed < _LEAST_FOLLOWED:
         return Verdict(False, f"the flight so far speaks against it: {figures}")
-    if findings.proof and is_hardly_ahead(evidence) and findings.proof.inliers < 2 * rival:
-        return Verdict(False, f"{rival} landmarks of a place elsewhere agree as well; {figures}")
     if findings.ahead_of_turned is not None and findings.ahead_of_turned < _AHEAD_OF_TURNED:
         return Verdict(False, f"the same place agrees nearly as well if the picture is turned otherwise; {figures}")
     return Verdict(True, figures)
@@ -257,8 +254,8 @@ def _is_sure_by_flight(followed: float, confidence: float, needed: float, precis
 
 
 def leads(evidence: Evidence) -> bool:
-    """Return True if no place elsewhere agrees about as well."""
-    return evidence["lead"] >= _NO_LEAD
+    """Return True if no place elsewhere agrees about as well, by the regions and by the landmarks."""
+    return evidence["lead"] >= _NO_LEAD and not has_twin(evidence)
 
 
 def is_hardly_ahead(evidence: Evidence | None) -> bool:

@@ -22,7 +22,7 @@ from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification, landmarks_in
 from edgevpr.runtime.recognise.confidence import Evidence
-from edgevpr.runtime.recognise.evidence import evidence_of, log_share, proven, share_of
+from edgevpr.runtime.recognise.evidence import evidence_of, log_share, of_count, proven, share_of
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, Reach, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
@@ -297,15 +297,14 @@ class Recogniser:
             evidence = evidence_of(ranking, index, rule.neighbour_m, proof, same, spec.looks_down)
         if rule.sure and evidence and verifies and not spec.looks_down:
             evidence["proof"] = self._proven(ranking, looked, rule.sure, evidence)
+        if evidence and verifies and proof and is_hardly_ahead(evidence):
+            with self.meter.step("verify"):
+                evidence["rival"] = of_count(looked.rival(ranking, rule.neighbour_m, same))
         if self._following and followed is None and rule.sure and evidence is not None:
             with self.meter.step("locate"):
                 followed = self._following.heard(ranking, index, evidence, rule.sure, where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
                 return self._judged(event, ranking.led_by(followed.slot), looked, followed)
-        rival = 0
-        if verifies and proof and is_hardly_ahead(evidence):
-            with self.meter.step("verify"):
-                rival = looked.rival(ranking, rule.neighbour_m, same)
         event.ranking, event.best, event.followed = ranking, best, followed
         event.proof, event.evidence = proof, evidence
         event.confidence = rule.sure.confidence(evidence) if rule.sure and evidence else None
@@ -314,7 +313,6 @@ class Recogniser:
             ranking,
             is_new=age_s <= NEW_FOR_S,
             proof=proof,
-            rival=rival,
             where=where,
             evidence=evidence,
             by_flight=followed.confidence if followed else None,

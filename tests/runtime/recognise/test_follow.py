@@ -1,5 +1,7 @@
 """Following a flight: what looks at a map become with those before them, over maps in order and maps with positions."""
 
+import math
+
 import numpy as np
 import pytest
 from fakes import vehicle_at
@@ -21,6 +23,7 @@ STRIDE = 3  # places from look to look, at one a second: each look is of new gro
 SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
 NOTHING = np.zeros((4, 4), np.uint8)
 SURE = 0.98
+STEP_M = 0.6 * SPACING_M * STRIDE, 0.8 * SPACING_M * STRIDE
 BESIDE = 7  # places elsewhere that a look is a little like
 
 
@@ -55,14 +58,16 @@ class Flight:
         stride = moved_m and Stride(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
         self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
-    def hear(self, place, p, of_map=None, others=(), lead=1.0):
-        """A look whose best place is this one (a number between two is one between two places)."""
+    def hear(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
+        """A look whose best place is this one (a number between two is one between two places). 80 landmarks agree with
+        it, and `rival` with a place elsewhere."""
         best = round(place)
         others = [slot for slot in others or _beside(best, len(self.index)) if slot != best]
         slots = np.array([best, *others], int)
-        scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.2] * len(others), np.float32)
+        scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.25 if rival else 0.2] * len(others), np.float32)
         compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
         evidence = {"agree": -1.0, "lead": lead, "coverage": -1.0}
+        evidence |= {"landmarks": math.log1p(80), "rival": math.log1p(rival)}
         sure = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
         where = None
         if self.has_poses:
@@ -285,3 +290,19 @@ def test_a_belief_that_is_wrong_costs_queries_and_not_the_flight(posed_map, move
     assert found[-1].confidence >= 0.9
     assert found[-1].mass > SURE
     assert off_m(found[-1], 65) < SPACING_M
+
+
+def test_of_twins_none_becomes_sure_however_often_the_same_one_looks_best(posed_map):
+    flight = Flight(posed_map, IN_METRES)
+    for place in range(20, 60, STRIDE):
+        followed = flight.look(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
+        assert followed.confidence < 0.9
+
+
+def test_the_flight_knows_which_of_two_twins_it_is_over(posed_map):
+    flight = Flight(posed_map, IN_METRES)
+    flight.over([17, 20], 0.9999, moved_m=STEP_M)
+    for place in range(20 + STRIDE, 32, STRIDE):
+        followed = flight.look(place + 60, 0.9999, others=[place], lead=0.15, rival=75, moved_m=STEP_M)
+        assert followed.slot == place
+        assert followed.confidence > 0.98

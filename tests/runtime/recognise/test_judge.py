@@ -162,16 +162,18 @@ def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
 
 @pytest.mark.parametrize(
     ("lead", "inliers", "rival", "accepted"),
-    [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.5, 20, 11, True)],
+    [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.1, 0, 0, True)],
 )
 def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
-    evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5, "landmarks": math.log1p(inliers)}
-    verdict = judged(
-        (0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=found(inliers), rival=rival, evidence=evidence
-    )
+    counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
+    evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5} | counted
+    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=found(inliers), evidence=evidence)
     assert verdict.accepted is accepted
+    assert f"{inliers} landmarks agree, and {rival} with a place elsewhere" in verdict.reason
     if not accepted:
-        assert verdict.reason.startswith("11 landmarks of a place elsewhere agree as well")
+        assert verdict.reason.startswith("confidence 0.5000, ")
+        by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, by_flight=0.999)
+        assert by_flight.accepted, "the flight knows which of the two it is"
 
 
 @pytest.mark.parametrize(
