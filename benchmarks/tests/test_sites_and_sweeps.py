@@ -6,11 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import walks
 from foreign_places import GENERATED, MIRRORED, foreign
 from sites import chosen, covering
 from sweep_changes import OF_CAMERA, SWEEPS, spoilt, view
+from sweeps import Shown
 
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
+from edgevpr.runtime.recognise.preparation import Preparation
 
 SIZE = (320, 240)
 MIDDLE = (np.array(SIZE) - 1) / 2
@@ -84,3 +87,11 @@ def test_a_sweep_of_the_picture_starts_from_hardly_any_and_goes_on(sweep):
         off.append(float(np.abs(after - grey).mean()))
     assert off[0] < 2
     assert off[-1] > off[0] + 1
+
+
+def test_what_a_sweep_shows_is_asked_as_it_is_with_its_mask():
+    image, shown = picture(), Shown()
+    shown.mask = np.zeros(image.shape[:2], bool)
+    levelled = Preparation(levelling=shown).picture(walks.frame(image))
+    assert levelled.image is image
+    assert levelled.mask is shown.mask
