@@ -29,7 +29,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 RATIOS = (0.5, 0.59, 0.71, 0.84, 1.0, 1.19, 1.41, 1.68, 2.0)
 TILTS_DEG = (0.0, 20.0)
 _ACROSS_DEG = 66.0
-_OVERLAP, _TOUCHING = 0.3, 0.02
+OVERLAP, TOUCHING = 0.3, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def asked(walk: Recogniser, dataset: Dataset, pictures: Pictures, ratio: float, 
         turn_deg, towards_deg = rng.uniform(0, 360, 2)
         view = camera(image, max(1.0, 1 / ratio), turn_deg, tilt_deg, towards_deg)
         truth, ignored = truth_of(query, image, view, pictures)
-        right = {place for place, (overlap, _) in truth.items() if overlap >= _OVERLAP}
+        right = {place for place, (overlap, _) in truth.items() if overlap >= OVERLAP}
         if not right:
             continue
         ignored |= truth.keys() - right
@@ -148,7 +148,7 @@ def truth_of(query: ScoredQuery, image: np.ndarray, view: np.ndarray, pictures: 
         mine, there = through(onto, ground), corners(pictures.references[name])
         common = cut(mine, there)
         overlap = area(common) / min(area(mine), area(there)) if len(common) else 0.0
-        if overlap > _TOUCHING:
+        if overlap > TOUCHING:
             truth[name] = overlap, onto @ np.linalg.inv(view)
     return truth, ignored
 

@@ -4,11 +4,12 @@ Looking down (aerial_swindale, on which nothing was tuned): the queries, of othe
 each other as a mosaic. Over it a camera of 66 degrees across stands where a place of the map was taken, and is then
 turned, tilted, raised or shifted, over ground that is taken to be flat. So what it sees beyond the place's own picture
 is real, as far as the flights went. Asked for are the places of whose picture the mosaic covers at least eight tenths,
-in those views of which it covers seven tenths; `asked` says how many. Right is the place itself: others that overlap
-the view count neither way, and neither do those that could not be laid beside it.
+in those views of which it covers seven tenths; `asked` says how many. Right are the place itself and those of which, or
+of the view, three tenths are common; others that touch the view, or could not be laid beside it, count neither way.
 
 Looking ahead (corridor, on which parameters were tuned): 24 of the queries. A turn is exact. Shift and distance are
-those of a wall: a picture that moves aside or shrinks. Beyond the edge of a picture there is nothing: 40 degrees of yaw
+those of a wall: a picture that moves aside or shrinks. A corridor is none: enlarged, it looks as from farther along, so
+that wrong places accepted there are three to eight on. Beyond the edge of a picture there is nothing: 40 degrees of yaw
 leave two fifths of it.
 
 Where a view shows nothing it is black and masked, so no edge of it is taken for one of the world. A change of the
@@ -30,7 +31,7 @@ import numpy as np
 import walks
 from base import RESULTS, Row, camera_of
 from from_orthophoto import laid, mosaic_of
-from height_and_tilt import area, corners, cut, through
+from height_and_tilt import OVERLAP, TOUCHING, area, corners, cut, through
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr import techniques
@@ -44,14 +45,14 @@ SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ah
 TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures
 WORK = Path("sweeps_work")
 _MOST_ASKED = 24
-_LEAST_COVERED, _LEAST_SHOWN, _TOUCHING = 0.8, 0.7, 0.02
+_LEAST_COVERED, _LEAST_SHOWN = 0.8, 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """Where a sweep starts from: `ground`, a picture or a mosaic, `covered` bool where there is any, and `onto` (3, 3)
-    from it to the picture of `size` (width, height) before any change. `right` are the names of right places, `ignored`
-    of those that count neither way, `lies` the corners of other places on the ground."""
+    from it to the picture of `size` (width, height) before any change. `right` are the names of places that are right
+    whatever changes, `ignored` of those that count neither way, `lies` the corners of other places on the ground."""
 
     name: str
     ground: np.ndarray
@@ -119,14 +120,16 @@ def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, lev
         if sweep not in OF_CAMERA:
             image = spoilt(sweep, level, image, rng)
         shares.append(mask.mean())
-        ignored = start.ignored | _overlapping(start, change @ start.onto)
+        common = _common(start, change @ start.onto)
+        right = start.right | {place for place, share in common.items() if share >= OVERLAP}
+        ignored = start.ignored | {place for place, share in common.items() if TOUCHING < share < OVERLAP}
         for (walk, shown, names), of_it in zip(asked, found, strict=True):
             shown.mask = None if mask.all() else mask
             event = walk.step(walks.frame(image, start.name))
             ranked = walks.ranked(event, names)
-            of_it["hits"].append(next((place for place in ranked if place not in ignored), None) in start.right)
+            of_it["hits"].append(next((place for place in ranked if place not in ignored), None) in right)
             of_it["accepted"] += event.accepted
-            if event.accepted and ranked[0] not in start.right | ignored:
+            if event.accepted and ranked[0] not in right | ignored:
                 of_it["wrong"].append((start.name, ranked[0]))
     return [
         {
@@ -153,14 +156,11 @@ def seen(start: Start, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return image, mask
 
 
-def _overlapping(start: Start, onto: np.ndarray) -> frozenset[str]:
-    """Return the other places that show ground of a view."""
-    if not start.lies:
-        return frozenset()
+def _common(start: Start, onto: np.ndarray) -> dict[str, float]:
+    """Return what each other place and a view have in common, as a share of the smaller of both."""
     width, height = start.size
     ground = through(np.linalg.inv(onto), corners(np.empty((height, width))))
-    share = {name: area(cut(ground, lies)) / min(area(ground), area(lies)) for name, lies in start.lies.items()}
-    return frozenset(name for name, common in share.items() if common > _TOUCHING)
+    return {name: area(cut(ground, lies)) / min(area(ground), area(lies)) for name, lies in start.lies.items()}
 
 
 def _over_mosaic(folder: Path) -> Iterator[Start]:
