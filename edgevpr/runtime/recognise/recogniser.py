@@ -361,7 +361,7 @@ class Recogniser:
         assert event.descriptor is not None
         with self.meter.step("compare"):
             query, best = self._query(event.descriptor), int(ranking.slots[0])
-            matches = unmoved_elsewhere(query, best, self.rule.neighbour_m)
+            matches = unmoved_elsewhere(query, best, self.accuracy_m)
         return sum(map(is_at_rest, matches)) / max(len(matches), 1)
 
 
