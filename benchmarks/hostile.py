@@ -23,7 +23,7 @@ from base import Row
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
     "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
-    "pictures": ("Pictures that say nothing, of other ground, and behind a display", hostile_pictures.run, 50),
+    "pictures": ("Pictures that say nothing, of other ground, and behind a display", hostile_pictures.run, 100),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
     "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
     "bytes": ("Bytes and packets: random, changed, and forged", hostile_bytes.run, 1_000_000),

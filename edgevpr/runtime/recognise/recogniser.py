@@ -17,17 +17,7 @@ from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers, layers_of
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.retrieve import (
-    NOTHING,
-    Expectation,
-    Query,
-    Ranking,
-    compare,
-    named,
-    scan,
-    together,
-    unmoved_elsewhere,
-)
+from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification, landmarks_in
@@ -41,7 +31,6 @@ from edgevpr.runtime.recognise.judge import (
     Findings,
     Sureness,
     Verdict,
-    is_at_rest,
     is_hardly_ahead,
     judge,
     says_nothing,
@@ -268,17 +257,14 @@ class Recogniser:
 
     def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
         """Search the map once for a query, with the share `part` of the candidates. Raises as `compare` does."""
-        query = self._query(descriptor, expected)
+        technique, place_map, index = self.technique, self.place_map, self.index
+        query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
         with self.meter.step("scan"):
-            self.place_map.require_unchanged()
+            place_map.require_unchanged()
             scanned = scan(query)
         with self.meter.step("compare"):
             candidates = self.candidates and max(1, round(part * self.candidates))
             return compare(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))
-
-    def _query(self, descriptor: Descriptor, expected: Expectation = NOTHING) -> Query:
-        technique, place_map, index = self.technique, self.place_map, self.index
-        return Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
 
     def _judged(
         self, event: Recognition, ranking: Ranking, looked: Verification, followed: Followed | None = None
@@ -332,13 +318,9 @@ class Recogniser:
             by_flight=followed.confidence if followed else None,
         )
         verdict = judge(findings, index, rule, self.search)
-        if verdict.accepted and evidence and spec.looks_down:
-            is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
-            findings = replace(
-                findings,
-                ahead_of_turned=None if is_turned_known else evidence["agree"] - self._turned(event, best),
-                at_rest_elsewhere=self._at_rest_elsewhere(event, ranking) if is_at_rest(best.match) else 0.0,
-            )
+        is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
+        if verdict.accepted and evidence and spec.looks_down and not is_turned_known:
+            findings = replace(findings, ahead_of_turned=evidence["agree"] - self._turned(event, best))
             verdict = judge(findings, index, rule, self.search)
         return verdict, best, where
 
@@ -355,14 +337,6 @@ class Recogniser:
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
             return log_share(share_of(self.technique.turned(event.descriptor, fine, best.match)))
-
-    def _at_rest_elsewhere(self, event: Recognition, ranking: Ranking) -> float:
-        """Return the share of a few places elsewhere that agree with the query at rest (0: there are none)."""
-        assert event.descriptor is not None
-        with self.meter.step("compare"):
-            query, best = self._query(event.descriptor), int(ranking.slots[0])
-            matches = unmoved_elsewhere(query, best, self.accuracy_m)
-        return sum(map(is_at_rest, matches)) / max(len(matches), 1)
 
 
 def _sentence(error: Exception) -> str:

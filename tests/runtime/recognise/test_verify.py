@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 from fakes import FakeClock
-from pictures_of_nothing import figures
 from sureness import landmarks_count, sure_rule, told
 
 from edgevpr.core.types import Frame, Position
@@ -170,22 +169,6 @@ def made(path, technique, frames):
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter())
     return path
-
-
-def behind_figures(image):
-    return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
-
-
-def test_of_a_picture_at_rest_places_elsewhere_tell_whether_there_is_a_display(tmp_path, mapped, technique):
-    anything = sure_rule(lambda evidence: 1.0)
-    drawn = [replace(frame(place), image=behind_figures(frame(place).image)) for place in range(PLACES)]
-    path = made(tmp_path / "drawn.gpkg", technique, drawn)
-    at_rest = asked(path, technique, drawn[1], anything)
-    assert (at_rest.accepted, at_rest.position) == (False, None)
-    assert "display" in at_rest.reason
-    moved = replace(drawn[1], image=behind_figures(frame(1, 20, -10).image))
-    assert asked(path, technique, moved, anything).accepted
-    assert asked(mapped, technique, frame(1), anything).accepted, "without a display"
 
 
 def far(image):
