@@ -20,7 +20,7 @@ from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import has_twin, share_of
-from edgevpr.runtime.recognise.judge import Sureness, leads
+from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
 from edgevpr.runtime.recognise.motion import FASTEST_M_S, Moved, moved
 from edgevpr.runtime.recognise.stride import Stride
@@ -193,7 +193,7 @@ def _proposals(
     if where and survey.origin:
         here, there = survey.origin, where.position
         at[0] = offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
-        if leads(evidence):  # of places that are equally likely none may be known better than the others
+        if not has_twin(evidence):  # of places that are equally likely none may be known better than the others
             covariance[0] = matrix_of(where.covariance_m2)
         heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
@@ -203,13 +203,12 @@ def _proposals(
     confidence = sure.confidence(evidence)
     left = max(0.0, sure.of_map(evidence) - confidence)
     p = np.zeros(len(slots))
-    if leads(evidence):
+    if has_twin(evidence):  # more votes only mean that it was pictured from nearer by
+        votes = np.minimum(votes, _LIKE_THE_BEST * votes.max(initial=0))
+        p[~same] = (confidence + _OTHERS * left) * _shares(votes[~same])
+    else:
         p[near & ~same] = confidence * _shares(votes[near & ~same])
         p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
-    else:  # the best place is no likelier than others that agree as well
-        if has_twin(evidence):  # more votes only mean that it was pictured from nearer by
-            votes = np.minimum(votes, _LIKE_THE_BEST * votes.max(initial=0))
-        p[~same] = (confidence + _OTHERS * left) * _shares(votes[~same])
     # The probability of a place without a position is given to no other place.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(
