@@ -25,9 +25,9 @@ from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
 from edgevpr.runtime.recognise.motion import FASTEST_M_S, Moved, moved
 from edgevpr.runtime.recognise.stride import Stride
 
+_LIKE_THE_BEST = 0.5  # share of the best place's votes from which on its twins are as likely (half, as in `has_twin`)
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
-_LIKE_THE_BEST = 0.5  # share of the best place's votes from which on its twins are as likely
 _OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
 _PROPOSED = 20  # most places that one query proposes
 # Distances that count as one position, in places and in footprints; and the probability that is more likely than not.

@@ -15,7 +15,7 @@ from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE
-from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_hardly_ahead, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -174,6 +174,11 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
         assert verdict.reason.startswith("confidence 0.5000, ")
         by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, by_flight=0.999)
         assert by_flight.accepted, "the flight knows which of the two it is"
+
+
+def test_a_place_that_is_clearly_ahead_needs_no_landmarks_to_be_told_from_others():
+    assert is_hardly_ahead({"lead": 0.1})
+    assert not is_hardly_ahead({"lead": 0.5})
 
 
 @pytest.mark.parametrize(
