@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
 from edgevpr.runtime.recognise.motion import FASTEST_M_S, Moved, moved
 from edgevpr.runtime.recognise.stride import Stride
 
-_LIKE_THE_BEST = 0.5  # share of the best place's votes from which on its twins are as likely (half, as in `has_twin`)
+_LIKE_THE_BEST = 0.5  # share of the best place's votes from which on its twins are as likely, as in `has_twin`
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
 _OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
