@@ -120,9 +120,10 @@ class Findings:
 
     `is_new` is True for a place learnt within the last `NEW_FOR_S` seconds. `proof` is the agreement of the landmarks
     of query and place (None: not compared). `where` is the position computed from the best places (None: only that of
-    the best place is known); the places it was computed from are not elsewhere. `evidence` is that of the match (None: the rule needs none), and `by_flight`
-    the probability of the place by the flight so far (None: the query is judged alone). `ahead_of_turned` is the lead,
-    as in the evidence, over the same place with the picture turned otherwise (None: not compared).
+    the best place is known); the places it was computed from are not elsewhere. `evidence` is that of the match (None:
+    the rule needs none), and `by_flight` the probability of the place by the flight so far (None: the query is judged
+    alone). `ahead_of_turned` is the lead, as in the evidence, over the same place with the picture turned otherwise
+    (None: not compared).
     """
 
     ranking: Ranking = field(kw_only=False)
