@@ -148,7 +148,7 @@ class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
     coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Those whose `spec.fine` is None need
     no `match`, those whose `spec.packed` is None no `pack`, those whose `spec.in_full` is None no `glance`, those whose
-    `spec.looks_down` is False no `turned`."""
+    `spec.looks_down` is False no `turned` and no `unmoved`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -194,3 +194,6 @@ class Technique(Protocol):
 
     def turned(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
         """Compare the query with the place of a `match` again, at its height, but under other rotations only."""
+
+    def unmoved(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
+        """Compare the query with a place as if it had been taken from the same height, not turned."""

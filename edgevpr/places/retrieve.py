@@ -37,6 +37,7 @@ Scan = tuple[Singles, Singles | None]
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 3  # hypotheses per place
+_ASKED_UNMOVED = 9  # places elsewhere, at most
 # Among so many places, where no heading is known, so many times the candidates are compared: wrong pairs of a place and
 # a rotation come before the right one more often. Of the sets from the air it finds .832 of the queries over 10,000
 # places, .858 over 5,000 and .883 over 2,000, where it was .802, .853 and .878. Twice as many find .838 over 10,000,
@@ -197,7 +198,7 @@ class _Comparison:
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
         glances: list[Glance] = []
-        for slot, fine, hypotheses in self._read(chosen):
+        for slot, fine, hypotheses in _read(self._query, chosen):
             score, likely = self._query.technique.glance(self._query.descriptor, fine, hypotheses)
             glances.append((self._with_scan(slot, score), (slot, likely)))
         glances.sort(key=lambda glance: -glance[0])
@@ -211,11 +212,11 @@ class _Comparison:
         return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
 
     def compare(self, chosen: list[Choice]) -> None:
-        """Compare the chosen places in full. Raises as `_read` does."""
+        """Compare the chosen places in full. Raises as `_read`."""
         if self._has_one_stage:
             self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
             return
-        for slot, fine, hypotheses in self._read(chosen):
+        for slot, fine, hypotheses in _read(self._query, chosen):
             match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
             self.scores[slot] = self._with_scan(slot, match.score)
             self.matches[slot] = replace(match, score=self.scores[slot])
@@ -223,20 +224,31 @@ class _Comparison:
     def _with_scan(self, slot: int, score: float) -> float:
         return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
 
-    def _read(self, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
-        """Yield the slots of the chosen places with their fine parts and hypotheses. Raises PlaceError if a place
-        cannot be read, after all have been tried; it is then left out. Raises MapError if the file cannot be read."""
-        unreadable, place_map, index = [], self._query.place_map, self._query.index
-        for slot, hypotheses in chosen:
-            try:
-                fine, point = place_map.fine_part(index.place_ids[slot])
-                _require_there(place_map, index, slot, point)
-            except PlaceError as error:
-                unreadable.append(error)
-            else:
-                yield slot, fine, hypotheses
-        if unreadable:
-            raise _left_out_now(place_map, unreadable, len(chosen))
+
+def _read(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
+    """Yield the slots of the chosen places with their fine parts and hypotheses. Raises PlaceError if a place cannot be
+    read, after all have been tried; it is then left out. Raises MapError if the file cannot be read."""
+    unreadable, place_map, index = [], query.place_map, query.index
+    for slot, hypotheses in chosen:
+        try:
+            fine, point = place_map.fine_part(index.place_ids[slot])
+            _require_there(place_map, index, slot, point)
+        except PlaceError as error:
+            unreadable.append(error)
+        else:
+            yield slot, fine, hypotheses
+    if unreadable:
+        raise _left_out_now(place_map, unreadable, len(chosen))
+
+
+def unmoved_elsewhere(query: Query, best: int, apart_m: float) -> list[FineMatch]:
+    """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
+    been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare` does."""
+    index, left_out = query.index, list(query.place_map.left_out)
+    others = elsewhere(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
+    slots = np.flatnonzero(others)
+    some = slots[:: -(-len(slots) // _ASKED_UNMOVED) or 1].tolist()
+    return [query.technique.unmoved(query.descriptor, fine) for _, fine, _ in _read(query, [(at, None) for at in some])]
 
 
 def together(one: Ranking, other: Ranking) -> Ranking:

@@ -253,6 +253,10 @@ class CoHog:
         off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
         return self.match(query, fine, (first + np.flatnonzero(off_deg >= _TURNED_DEG)).tolist())
 
+    def unmoved(self, query: Descriptor, fine: Bytes) -> FineMatch:
+        """See `Technique.unmoved`."""
+        return self._likest(query, self._reference(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
+
     def _likest(
         self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None
     ) -> tuple[int, FineMatch, Ints]:

@@ -10,14 +10,24 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
-from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.types import Candidate, Frame, Vehicle
 from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers, layers_of
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, named, scan, together
+from edgevpr.places.retrieve import (
+    NOTHING,
+    Expectation,
+    Query,
+    Ranking,
+    compare,
+    named,
+    scan,
+    together,
+    unmoved_elsewhere,
+)
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification, landmarks_in
@@ -26,11 +36,13 @@ from edgevpr.runtime.recognise.evidence import evidence_of, log_share, of_count,
 from edgevpr.runtime.recognise.follow import Followed, Follower
 from edgevpr.runtime.recognise.hints import Prior, Reach, Told, expected_of, other_heights
 from edgevpr.runtime.recognise.judge import (
+    LIKE_AT_REST,
     NEW_FOR_S,
     AcceptRule,
     Findings,
     Sureness,
     Verdict,
+    is_at_rest,
     is_hardly_ahead,
     judge,
     says_nothing,
@@ -257,14 +269,17 @@ class Recogniser:
 
     def _look(self, descriptor: Descriptor, expected: Expectation, part: float = 1.0) -> Ranking:
         """Search the map once for a query, with the share `part` of the candidates. Raises as `compare` does."""
-        technique, place_map, index = self.technique, self.place_map, self.index
-        query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
+        query = self._query(descriptor, expected)
         with self.meter.step("scan"):
-            place_map.require_unchanged()
+            self.place_map.require_unchanged()
             scanned = scan(query)
         with self.meter.step("compare"):
             candidates = self.candidates and max(1, round(part * self.candidates))
             return compare(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))
+
+    def _query(self, descriptor: Descriptor, expected: Expectation = NOTHING) -> Query:
+        technique, place_map, index = self.technique, self.place_map, self.index
+        return Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
 
     def _judged(
         self, event: Recognition, ranking: Ranking, looked: Verification, followed: Followed | None = None
@@ -318,9 +333,11 @@ class Recogniser:
             by_flight=followed.confidence if followed else None,
         )
         verdict = judge(findings, index, rule, self.search)
-        is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
-        if verdict.accepted and evidence and spec.looks_down and not is_turned_known:
-            findings = replace(findings, ahead_of_turned=evidence["agree"] - self._turned(event, best))
+        if verdict.accepted and spec.looks_down and self.search is None:
+            is_turned_known = event.hints and event.hints.heading_deg is not None and best.place.heading_deg is not None
+            findings = replace(findings, at_rest_elsewhere=self._at_rest_elsewhere(event, ranking, best.match))
+            if evidence and not is_turned_known:
+                findings = replace(findings, ahead_of_turned=evidence["agree"] - self._turned(event, best))
             verdict = judge(findings, index, rule, self.search)
         return verdict, best, where
 
@@ -337,6 +354,18 @@ class Recogniser:
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
             return log_share(share_of(self.technique.turned(event.descriptor, fine, best.match)))
+
+    def _at_rest_elsewhere(self, event: Recognition, ranking: Ranking, best: FineMatch) -> float:
+        """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not
+        at rest, or there are none)."""
+        if not is_at_rest(best):
+            return 0.0
+        assert event.descriptor is not None
+        with self.meter.step("compare"):
+            query = self._query(event.descriptor)
+            matches = unmoved_elsewhere(query, int(ranking.slots[0]), self.accuracy_m)
+        least = LIKE_AT_REST * share_of(best)
+        return sum(is_at_rest(match) and share_of(match) >= least for match in matches) / max(len(matches), 1)
 
 
 def _sentence(error: Exception) -> str:

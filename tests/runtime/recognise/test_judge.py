@@ -15,7 +15,7 @@ from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE
-from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_hardly_ahead, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, is_hardly_ahead, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -78,6 +78,14 @@ def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
     assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, by_flight=0.9999).accepted
 
 
+@pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
+def test_no_flight_makes_sure_what_a_place_elsewhere_beats_in_the_same_picture(lead, accepted):
+    rule = sure_rule(lambda evidence: 0.5)
+    verdict = judged(rule=rule, evidence=CLEAR | {"lead": lead}, by_flight=0.9999)
+    assert verdict.accepted is accepted
+    assert verdict.reason.startswith("a place elsewhere agrees better: ") is not accepted
+
+
 def test_a_match_that_offers_no_evidence_is_never_sure():
     assert not judged(rule=sure_rule(lambda evidence: 1.0)).accepted
 
@@ -117,33 +125,27 @@ def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_wit
     assert "newest query" in judge(Findings(ranking), index, RULE, search).reason
 
 
-def behind(*others, best=(0.3, (0.2, -0.1), 0.0)):
-    """The verdict on a best place and places elsewhere: the score, step and rotation of each."""
-    matches = [FineMatch(score, shift_cells=step, rotation_deg=turn) for score, step, turn in (best, *others)]
-    return judged([match.score for match in matches], matches=matches)
-
-
-@pytest.mark.parametrize(("score", "step"), [(0.15, (0.0, 0.0)), (0.15, (-1.4, 1.4)), (0.012, (0.0, 0.0))])
-def test_places_far_apart_that_have_not_moved_either_share_a_display(score, step):
-    verdict = behind((0.2, (9.0, 3.0), 0.0), (score, step, 0.0))
-    assert not verdict.accepted
-    assert "display" in verdict.reason
+@pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (3 / 9, True), (4 / 9, False), (1.0, False)])
+def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share, accepted):
+    verdict = judged(at_rest_elsewhere=share)
+    assert verdict.accepted is accepted
+    assert ("display" in verdict.reason) is not accepted
 
 
 @pytest.mark.parametrize(
-    "other", [(0.15, (1.6, 0.0), 0.0), (0.15, (0.0, 0.0), 15.0), (0.007, (0.0, 0.0), 0.0), (0.15, (0.0, 0.0), None)]
+    ("shift_cells", "rotation_deg", "height_ratio", "expected"),
+    [
+        ((0.2, -0.1), 0.0, 1.0, True),
+        ((-0.7, 0.7), 353.0, None, True),
+        ((0.8, 0.0), 0.0, 1.0, False),
+        ((0.0, 0.0), 15.0, 1.0, False),
+        ((0.0, 0.0), 0.0, 1.3, False),
+        ((0.0, 0.0), None, None, False),
+    ],
 )
-def test_places_that_agree_by_another_step_share_none(other):
-    assert behind(other).accepted
-    assert behind(other, (0.1, None, None)).accepted
-
-
-def test_a_picture_that_has_moved_is_no_display():
-    still = (0.15, (0.0, 0.0), 0.0)
-    assert not behind(still).accepted
-    assert behind(still, best=(0.3, (5.0, 0.0), 0.0)).accepted
-    assert behind(still, best=(0.3, (0.0, 0.0), 180.0)).accepted
-    assert behind(still, best=(0.3, (0.0, 0.0), None)).accepted, "looking ahead"
+def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation_deg, height_ratio, expected):
+    match = FineMatch(0.3, shift_cells=shift_cells, rotation_deg=rotation_deg, height_ratio=height_ratio)
+    assert is_at_rest(match) is expected
 
 
 def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from fakes import FakeClock
+from pictures_of_nothing import figures
 from sureness import landmarks_count, sure_rule, told
 
 from edgevpr.core.types import Frame, Position
@@ -169,6 +170,24 @@ def made(path, technique, frames):
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, technique, place_map, meter())
     return path
+
+
+def behind_figures(image):
+    return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
+
+
+def test_of_a_picture_at_rest_places_elsewhere_tell_whether_there_is_a_display(tmp_path, mapped, technique):
+    anything = sure_rule(lambda evidence: 1.0)
+    drawn = [replace(frame(place), image=behind_figures(frame(place).image)) for place in range(PLACES)]
+    path = made(tmp_path / "drawn.gpkg", technique, drawn)
+    changed = cv2.addWeighted(frame(1).image, 0.3, frame(7).image, 0.7, 0)
+    at_rest = asked(path, technique, replace(frame(1), image=behind_figures(changed)), anything)
+    assert (at_rest.accepted, at_rest.position) == (False, None)
+    assert "display" in at_rest.reason
+    assert asked(mapped, technique, replace(frame(1), image=changed), anything).accepted, "without a display"
+    assert asked(path, technique, drawn[1], anything).accepted, "its ground agrees much better than the figures"
+    moved = replace(drawn[1], image=behind_figures(frame(1, 20, -10).image))
+    assert asked(path, technique, moved, anything).accepted
 
 
 def far(image):
