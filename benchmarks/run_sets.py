@@ -38,8 +38,8 @@ JOINED = "aerial_joined"  # all sets from the air as one map: the rows that are 
 JOINED_ROWS = ("cohog", "cohog, exact")
 # What is not measured, and why.
 LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
-# Rows that no board is offered: other weights, another way to match, or a comparison with everything.
-NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "known")
+# Rows that no board is offered: other weights, another way to match or to ask, or a comparison with everything.
+NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "known", "followed")
 # Of a set whose sites have no positions on Earth: where they are said to be, how far apart, and the size of a pixel.
 _FIRST_SITE, _SITES_APART_M, _PIXEL_M = (37.0, 36.0), 20_000.0, 0.5
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
