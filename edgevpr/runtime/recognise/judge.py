@@ -263,9 +263,9 @@ def leads(evidence: Evidence) -> bool:
     return evidence["lead"] >= _NO_LEAD and not has_twin(evidence)
 
 
-def is_hardly_ahead(evidence: Evidence | None) -> bool:
+def is_hardly_ahead(evidence: Evidence) -> bool:
     """Return True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
-    return evidence is not None and evidence["lead"] < _HARDLY_AHEAD
+    return evidence["lead"] < _HARDLY_AHEAD
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:
