@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from edgevpr.core.arrays import Bools, Floats, Image
 
@@ -29,20 +30,27 @@ def _strongest(grey: Floats, valid: Bools) -> float:
     rows, columns = grey.shape
     one, three = np.abs(grey[:, 2:-1] - grey[:, 1:-2]), np.abs(grey[:, 3:] - grey[:, :-3])
     seen = valid[:, 3:] & valid[:, 2:-1] & valid[:, 1:-2] & valid[:, :-3]
-    steps = np.zeros((WINDOW_PX, 2 * WINDOW_PX), np.float32)  # lines that leave the picture go on in nothing
+    # Lines that leave the picture go on in nothing.
+    steps = np.zeros((WINDOW_PX, 2 * WINDOW_PX + _BESIDE_PX), np.float32)
     steps[:rows, : columns - 3] = np.minimum(one, _MOST_GREY) * ((one > _HARD * three) & seen)
     along = _line_sums(steps) / WINDOW_PX
     return float((along - cv2.blur(along, (_BESIDE_PX, 1)))[:, : columns - 3].max())
 
 
 def _line_sums(values: Floats) -> Floats:
-    """Return the sums of `values`, float32 (N, W), N a power of two, along lines: float32 (N, W), [k, x] along the line
-    from (row 0, column x) to (row N - 1, column x + k). Columns go round. Each sum is of those of the line's upper and
-    lower half (Goetz and Druckmueller, Pattern Recognition 29(4), 1996)."""
+    """Return the sums of `values`, float32 (N, W), N a power of two, along lines: float32 (N, W - N + 1), [k, x] along
+    the line from (row 0, column x) to (row N - 1, column x + k). Each sum is of those of the line's upper and lower
+    half (Goetz and Druckmueller, Pattern Recognition 29(4), 1996)."""
     sums = values[:, None]  # of N lines with one row each
     while len(sums) > 1:
-        upper, lower = sums[::2], sums[1::2]
-        longer = [upper[:, k // 2] + np.roll(lower[:, k // 2], -((k + 1) // 2), -1) for k in range(2 * sums.shape[1])]
-        sums = np.stack(longer, axis=1)
+        upper, lower = sums[::2], np.ascontiguousarray(sums[1::2])
+        lines, slopes, columns = lower.shape
+        of_line, of_slope, of_column = lower.strides
+        # The lower half of the line with slope j begins j columns to the right; as a view, without a copy.
+        sheared = (lines, slopes, columns - slopes), (of_line, of_slope + of_column, of_column)
+        longer = np.empty((lines, 2 * slopes, columns - slopes), np.float32)
+        for more in (0, 1):
+            np.add(upper[..., : columns - slopes], as_strided(lower[..., more:], *sheared), out=longer[:, more::2])
+        sums = longer
     total: Floats = sums[0]
     return total
