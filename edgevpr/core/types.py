@@ -42,13 +42,18 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Position from a GPS receiver: degrees, standard deviation `sd_m` of one axis, and `t_s`, the time of its arrival
-    (seconds on the clock of the frames)."""
+    """The newest report of a GPS receiver: degrees, standard deviation `sd_m` of one axis, and `t_s`, the time of its
+    arrival (seconds on the clock of the frames). `velocity_m_s`: over the ground (east, north), None if unknown.
+    `alt_m`: above sea level, None if unknown. `steady_for_s`: for how long its fixes have followed each other without a
+    gap or jump and with a plausible accuracy."""
 
     lat_deg: float
     lon_deg: float
     sd_m: float
     t_s: float
+    velocity_m_s: tuple[float, float] | None = None
+    alt_m: float | None = None
+    steady_for_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +68,8 @@ class Vehicle:
     `tilting_deg_s`. `height_m`: above the ground. `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed
     downwards.
     `position_sd_m`: standard deviation of one axis of the position; also None if the autopilot does not rely on it.
-    `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
+    `innovation_ratio`: of measured positions, those of edgevpr among them, to the filter's gate; above 1 it refuses
+    them. `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
     `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
 
     lat_deg: float
@@ -79,6 +85,7 @@ class Vehicle:
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
     position_sd_m: float | None = None
+    innovation_ratio: float | None = None
     gps: Receiver | None = None
     t_fix_s: float = -math.inf
 

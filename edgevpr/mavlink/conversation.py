@@ -255,6 +255,8 @@ class Conversation:
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
         choice, autopilot = self.autopilot.interview.choice, self.autopilot
         state = self.settings.listener.state_at(t_s := now_s - choice.lag_s)
+        if self.requests.is_paused:
+            state = None
         if choice.channel is Channel.GPS_INPUT:
             t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
             return messages.gps_input(state, choice.receiver, t_s, t_unix_s)

@@ -19,6 +19,11 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 TEXT_BYTES = 50
 SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
 _YAW_SD = math.radians(5.0)
+# A reserve must never outbid a real receiver that has a 3D fix, which takes four satellites. At the same fix type
+# ArduPilot changes to the one with more satellites, and blends by accuracies (AP_GPS::update_primary, AP_GPS_Blended).
+_RESERVE_SATELLITES = 2
+_RESERVE_SD_M, _RESERVE_SD_M_S = 100.0, 10.0
+_SATELLITES = 6  # the smallest number with which a filter starts
 _GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800  # 1980-01-06; leap seconds since then, as of 2017
 
 
@@ -61,7 +66,7 @@ class Fix:
 class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
     standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
-    `attitude` is (roll, pitch, yaw) in radians, None if unknown."""
+    `attitude` is (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a real GPS receiver is good."""
 
     t_mono_s: float
     lat_deg: float
@@ -72,6 +77,7 @@ class MotionState:
     alt_accuracy_m: float
     speed_accuracy_m_s: float
     attitude: tuple[float, float, float] | None = None
+    is_reserve: bool = False
 
 
 def heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> Message:
@@ -120,10 +126,16 @@ def position_sensor(state: MotionState) -> Message:
 
 
 def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
-    """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix".
-    `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970 (None: unknown)."""
+    """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix", a
+    reserve as a poor fix. `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970
+    (None: unknown)."""
     week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
+    satellites, sd_m, sd_m_s = 0, 0.0, 0.0
+    if state:
+        satellites, sd_m, sd_m_s = _SATELLITES, state.accuracy_m, state.speed_accuracy_m_s
+    if state and state.is_reserve:
+        satellites, sd_m, sd_m_s = _RESERVE_SATELLITES, _RESERVE_SD_M, _RESERVE_SD_M_S
     return mavlink.MAVLink_gps_input_message(
         time_usec=round(t_mono_s * 1e6),
         gps_id=receiver,
@@ -133,16 +145,15 @@ def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_
         fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
         hdop=0.0,
         vdop=0.0,
-        # The smallest number with which a filter starts, so that a real receiver is always preferred.
-        satellites_visible=6 if state else 0,
+        satellites_visible=satellites,
         lat=round(state.lat_deg * 1e7) if state else 0,
         lon=round(state.lon_deg * 1e7) if state else 0,
         alt=state.alt_m if state else 0,
         vn=north,
         ve=east,
         vd=down,
-        speed_accuracy=state.speed_accuracy_m_s if state else 0,
-        horiz_accuracy=state.accuracy_m if state else 0,
+        speed_accuracy=sd_m_s,
+        horiz_accuracy=sd_m,
         vert_accuracy=state.alt_accuracy_m if state else 0,
     )
 

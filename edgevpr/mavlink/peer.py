@@ -12,11 +12,10 @@ from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Use
-from edgevpr.mavlink.vehicle import GPS_GONE_AFTER_S, GPS_REPORTS, Attitude, Attitudes, Certainty, Heights, Readiness
+from edgevpr.mavlink.receivers import GPS_REPORTS, Receivers
+from edgevpr.mavlink.vehicle import Attitude, Attitudes, Certainty, Heights, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
-GPS_SD_M = 5.0  # of a receiver that does not say how good it is
-_GPS_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
@@ -104,6 +103,10 @@ class Listener:
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude then."""
 
+    def believes_gps(self) -> bool:
+        """Return False while matches prove the GPS receiver wrong."""
+        return True
+
     def state_at(self, t_s: float) -> MotionState | None:
         """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
         return None
@@ -134,7 +137,7 @@ class Autopilot:
         self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
         self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
         self.px4 = Px4Use()
-        self._gps: dict[str, tuple[int, Receiver]] = {}  # receivers with a fix, each with the time stamp of its report
+        self.receivers = Receivers()
 
     @property
     def system_id(self) -> int | None:
@@ -198,11 +201,11 @@ class Autopilot:
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
                 self._heights.hear(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
-                self._hear_gps(message, now_s)
+                self.receivers.handle(message, now_s)
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
                 self.certainty.hear(message, now_s)
                 if name == "ESTIMATOR_STATUS":
-                    self.px4.hear(message, now_s, self._best_gps(now_s) is not None)
+                    self.px4.hear(message, now_s, self._receiver(now_s), self._listener.believes_gps())
             case "GLOBAL_POSITION_INT":
                 self._hear_position(message, now_s)
             case "ATTITUDE":
@@ -217,9 +220,10 @@ class Autopilot:
 
     def _hear_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
-        gps, lat_deg, lon_deg = self._best_gps(now_s), message.lat / 1e7, message.lon / 1e7
+        gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
-        has_gps = is_near and self.px4.uses_gps
+        # By a continuous channel the estimate may be made of our own positions: it says nothing about the receiver.
+        has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.certainty.note_known(gps.sd_m, now_s)
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
@@ -238,23 +242,12 @@ class Autopilot:
             gps=gps,
             height_m=self._heights.now(message.relative_alt / 1e3, now_s),
             position_sd_m=self.certainty.now(now_s),
+            innovation_ratio=self.certainty.innovation_ratio(now_s),
         )
         self._listener.hear_vehicle(self.vehicle)
 
-    def _hear_gps(self, message: Message, now_s: float) -> None:
-        choice, name = self.interview.choice, message.get_type()
-        if choice.channel is Channel.GPS_INPUT and name == GPS_REPORTS[choice.receiver]:
-            return  # this report is of the positions that we have sent ourselves
-        if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
-            self._gps.pop(name, None)
-            return
-        time_usec, before = self._gps.get(name, (0, None))
-        # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
-        t_s = before.t_s if before and message.time_usec and message.time_usec == time_usec else now_s
-        sd_m = GPS_SD_M if message.h_acc in _GPS_UNKNOWN else message.h_acc / 1e3
-        self._gps[name] = message.time_usec, Receiver(message.lat / 1e7, message.lon / 1e7, sd_m, t_s)
-
-    def _best_gps(self, now_s: float) -> Receiver | None:
-        """Return the newest report of the most accurate GPS receiver; None if none had a fix in the last 2.5 s."""
-        new = (receiver for _, receiver in self._gps.values() if now_s - receiver.t_s <= GPS_GONE_AFTER_S)
-        return min(new, key=lambda receiver: receiver.sd_m, default=None)
+    def _receiver(self, now_s: float) -> Receiver | None:
+        """Return the newest report of the best GPS receiver that is not played by us; None if none has a fix."""
+        choice = self.interview.choice
+        own = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
+        return self.receivers.best(now_s, own)

@@ -1,17 +1,27 @@
-"""Use of GPS and of our positions by a PX4, as its filter's report (ESTIMATOR_STATUS) tells it: it has a flag that is
-set while the filter fuses GPS or our messages 296, and one that is set while it fuses our ODOMETRY, too. Neither
-message is ever answered. Read in the sources of 1.18 (EKF2, `Ekf::get_ekf_soln_status`), and held beside a real
-1.17.0 and 1.18-beta1."""
+"""Use of GPS and of our positions by a PX4, as its filter's report (ESTIMATOR_STATUS) tells it.
+
+PX4 does not reset its position to a GPS that comes back while it takes positions of ours, however far off these are
+(EKF2, `isGnssPosResetAllowed`). So they have to stop before it can use GPS again, and they stop only where PX4 shows
+that it would: it fuses the velocity of its receiver, which needs no position of ours, as soon as its checks of the
+receiver pass. Read in the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and
+held beside a real 1.17.0 and 1.18-beta1."""
 
 import math
 
+from edgevpr.core.types import Receiver
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.wire import Message, mavlink
 
 _FUSES_ABSOLUTE, _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-_OUR_MARK_S = 6.0  # so long after our last position the flag may still be about ours: PX4 waits for 5 s
+_OURS_FOR_S = 6.0  # so long after our last message 296 the flag may still be about ours: PX4 waits for 5 s
+_VISION_FOR_S = 1.0  # of ODOMETRY, whose flag is another one, it only has to notice the end
 _UNUSED_FOR_S = 2.0  # of a receiver with a fix: one that has just lost it, or got it, is judged by its reports
+_SENDING_FOR_S = 1.0
+# A receiver that has come back has to be steady for so long before it is left to PX4: less would follow a flapping one.
+_STEADY_S = 1.5
+_FIRST_PAUSE_S = 30.0  # from a try that PX4 did not take to the next; twice as long each time
+_LONGEST_PAUSE_S = 240.0
 
 
 class Px4Use:
@@ -22,9 +32,10 @@ class Px4Use:
     def __init__(self) -> None:
         self.uses_gps = True
         self.used = self.unused = 0
-        self._sent_s, self._ours = -math.inf, _FUSES_ABSOLUTE
+        self._sent_s, self._is_vision = -math.inf, False
         self._unused_since_s: float | None = None
-        self._is_telling = False  # before 1.16 the flag is that of a position, of whatever source
+        self._reports_fusion = False  # before 1.16 the flag is that of a position, of whatever source
+        self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
 
     @property
     def used_share(self) -> float | None:
@@ -39,22 +50,41 @@ class Px4Use:
         which needs the `origin` of its local frame: latitude, longitude in degrees, altitude in metres."""
         if state is None or (is_vision and origin is None):
             return None
-        self._sent_s, self._ours = now_s, _FUSES_ANY if is_vision else _FUSES_ABSOLUTE
+        self._sent_s, self._is_vision = now_s, is_vision
         return messages.vision_position(state, origin) if is_vision and origin else messages.position_sensor(state)
 
-    def hear(self, report: Message, now_s: float, has_fix: bool) -> None:
-        """Process an ESTIMATOR_STATUS. `has_fix`: a GPS receiver has one."""
+    def hear(self, report: Message, now_s: float, receiver: Receiver | None, is_believed: bool = True) -> None:
+        """Process an ESTIMATOR_STATUS. `receiver` is the best GPS receiver that has a fix (None: none has), which
+        `is_believed` unless matches prove it wrong."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
-        self._is_telling |= is_fusing
-        if now_s - self._sent_s < 1.0:
+        self._reports_fusion |= is_fusing
+        silent_s = now_s - self._sent_s
+        if silent_s < _SENDING_FOR_S:
             # A ratio above 1 is beyond the filter's gate.
-            is_used = bool(report.flags & self._ours) and not report.pos_horiz_ratio > 1
+            ours = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
+            is_used = bool(report.flags & ours) and not report.pos_horiz_ratio > 1
             self.used, self.unused = self.used + is_used, self.unused + (not is_used)
-        if now_s - self._sent_s <= _OUR_MARK_S or not self._is_telling:
+        if not self._reports_fusion:
             return
-        if is_fusing or not has_fix:
-            self._unused_since_s, self.uses_gps = None, self.uses_gps or is_fusing
+        takes_velocity = math.isfinite(report.vel_ratio) and report.vel_ratio > 0
+        if receiver is None:
+            self._unused_since_s = None
+            self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
+        elif silent_s > (_VISION_FOR_S if self._is_vision else _OURS_FOR_S) or (self._is_vision and is_fusing):
+            self._judge(is_fusing, now_s)
+        elif not self.uses_gps or silent_s < _SENDING_FOR_S:
+            is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _STEADY_S
+            self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_believed
+        elif not takes_velocity:
+            self._judge(False, now_s)  # it does not take what we have stopped for
+
+    def _judge(self, is_fusing: bool, now_s: float) -> None:
+        """Set whether GPS is used while nothing of ours is, by whether its position is fused."""
+        if is_fusing:
+            self._unused_since_s, self.uses_gps, self._pause_s = None, True, _FIRST_PAUSE_S
         elif self._unused_since_s is None:
             self._unused_since_s = now_s
-        elif now_s - self._unused_since_s >= _UNUSED_FOR_S:
+        elif now_s - self._unused_since_s >= _UNUSED_FOR_S and self.uses_gps:
             self.uses_gps = False
+            self._next_try_s = now_s + self._pause_s
+            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)

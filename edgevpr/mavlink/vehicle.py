@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.mavlink.messages import POSITION_FIX
+from edgevpr.mavlink.receivers import GPS_GONE_AFTER_S, GPS_REPORTS
 from edgevpr.mavlink.wire import Message, mavlink
 
 _KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
@@ -20,11 +21,9 @@ _BAD_SIGNAL = 1  # of DISTANCE_SENSOR.signal_quality; 0 is unknown, 100 the best
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
 _FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
-GPS_GONE_AFTER_S = 2.5  # GPS reports come at least once a second, and one may be lost
 _ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ASK_ORIGIN_AGAIN_S = 10.0
 
-GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 # ArduPilot: EKF_STATUS_REPORT. PX4: ESTIMATOR_STATUS. The flags have the same values. An ArduPilot that
 # dead-reckons reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
 FILTER_REPORTS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
@@ -111,17 +110,24 @@ class Certainty:
     def __init__(self) -> None:
         self._known: tuple[float, float] | None = None  # standard deviation, time
         self._own: tuple[float, float] | None = None  # standard deviation that the filter reports, time
+        self._ratio: tuple[float, float] | None = None  # innovation of measured positions over the filter's gate, time
 
     def hear(self, message: Message, now_s: float) -> None:
         """Process a report of the autopilot's position filter, one of the `FILTER_REPORTS`."""
+        is_px4 = message.get_type() == "ESTIMATOR_STATUS"
+        self._ratio = (message.pos_horiz_ratio if is_px4 else message.pos_horiz_variance), now_s
         # PX4 calls it constant too while it stands still with GPS.
-        is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and message.get_type() == "EKF_STATUS_REPORT"
+        is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and not is_px4
         if is_constant or not message.flags & _HAS_POSITION:
             self._known = self._own = None  # the position is still reported, but is an old one
-        elif message.get_type() == "ESTIMATOR_STATUS":
+        elif is_px4:
             # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.
             sd_m = message.pos_horiz_accuracy
             self._own = (sd_m, now_s) if 0 < sd_m < math.inf else None
+
+    def innovation_ratio(self, now_s: float) -> float | None:
+        """Return the newest ratio of the innovation of measured positions to the filter's gate; None if it is old."""
+        return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= _FILTER_FRESH_S else None
 
     def note_known(self, sd_m: float, now_s: float) -> None:
         """Note that at `now_s` the position is known this well, by GPS or by an accepted fix of ours."""

@@ -221,7 +221,7 @@ def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
             autopilot.px4_filter(2.0, flags)
         return autopilot.position().has_gps
 
-    assert has_gps_after(5, GLOBAL | FUSES)
+    assert has_gps_after(8, GLOBAL | FUSES)
     assert has_gps_after(1, GLOBAL), "it may just have begun"
     assert not has_gps_after(3, GLOBAL)
     assert has_gps_after(1, GLOBAL | FUSES), "it uses it again"

@@ -7,7 +7,7 @@ import pytest
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle
-from edgevpr.mavlink.peer import GPS_SD_M
+from edgevpr.mavlink.receivers import GPS_SD_M
 from edgevpr.mavlink.vehicle import DRIFT_M_S
 from edgevpr.mavlink.wire import mavlink
 

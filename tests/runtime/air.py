@@ -14,6 +14,7 @@ from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Rec
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
@@ -214,7 +215,9 @@ class Air:
         self.navigator.hear_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
 
     def _report(self, velocity: np.ndarray) -> None:
-        here, there = (moved(*HOME, *(self.at_m + off_m)) for off_m in (self.off_m, self.gps_off_m))
+        here = moved(*HOME, *(self.at_m + self.off_m))
+        measured_m = self.way[max(0, self.step - round(RECEIVER_LAG_S / _STEP_S))]
+        there = moved(*HOME, *(measured_m + self.gps_off_m))
         wrong = self.spoofed_m_s if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
         if self.has_gps:
             self.known = GPS_SD_M, self.t_s

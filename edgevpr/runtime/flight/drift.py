@@ -129,12 +129,16 @@ class DriftFilter:
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._upset = 0.0 if self._drift.is_of_attitude else 1.0
 
-    def hear_gps(self, off_m: Doubles, sd_m: float, off_m_s: Doubles, velocity_sd_m_s: float) -> None:
+    def hear_gps(
+        self, off_m: Doubles, sd_m: float, off_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
+    ) -> None:
         """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
-        that of the path by `off_m_s` (2,). The standard deviations are those of one axis."""
-        look = np.zeros((4, _SIZE))
-        look[:2, _C] = look[2:, _S] = _EYE
-        self._correct(look, np.concatenate([off_m, off_m_s]), np.diag([sd_m**2] * 2 + [velocity_sd_m_s**2] * 2))
+        that of the path by `off_m_s` (2,; None: unknown), as it was `age_s` seconds ago. The standard deviations are
+        those of one axis."""
+        look = self._seen_motion(age_s)
+        off = off_m if off_m_s is None else np.concatenate([off_m, off_m_s])
+        variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
+        self._correct(look[: off.size], off, np.diag(variances[: off.size]))
 
     def hear_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: Strode | None = None) -> bool:
         """Note a frame taken `age_s` ago. `sd_m` is the standard deviation, of each axis, by which its picture puts the
@@ -197,11 +201,16 @@ class DriftFilter:
         - error of velocity (2,), m/s
         - covariance (4, 4) of both.
         """
+        look = self._seen_motion(age_s)
+        off = look @ self._x
+        return off[:2], off[2:], look @ self._p @ look.T
+
+    def _seen_motion(self, age_s: float) -> Doubles:
+        """Return the matrix (4, 12) that gives offset and error of velocity of the path `age_s` seconds ago."""
         look = np.zeros((4, _SIZE))
         look[:2] = self._seen(age_s, 0.0)
         look[2:, _S], look[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
-        off = look @ self._x
-        return off[:2], off[2:], look @ self._p @ look.T
+        return look
 
     def _begin_frame(self) -> None:
         """Set `f` to where the aircraft was when the last frame was taken."""

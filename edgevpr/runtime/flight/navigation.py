@@ -7,10 +7,13 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
-from edgevpr.core.types import Position, Vehicle
+from edgevpr.core.types import Position, Receiver, Vehicle
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, HeardFrame, PositionedMatch, Weighed, worst_sd
-from edgevpr.runtime.flight.drift import INERTIAL, RECKONED, Drift, DriftFilter, Strode
+from edgevpr.runtime.flight.drift import INERTIAL, Drift, DriftFilter, Strode
+from edgevpr.runtime.flight.output import PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
+from edgevpr.runtime.recognise.locate import in_sd
 
 _GPS_EVERY_S = 1.0
 _GPS_NEW_S = 0.7  # positions of a receiver come five times a second; without new ones the autopilot dead-reckons
@@ -21,6 +24,10 @@ _UNKNOWN_M = 1e4
 _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 _FOLLOWED_S = 4.0  # after the frame of the last stride, and the longest time between two queries
 _MOST_ALIKE = 16.0  # fixes of the same ground that count as one
+_CONTRADICTS_SD = 5.0  # a receiver that is farther from our position is not used to correct it
+# A steady receiver that contradicts our position for so long is right, unless a match of the last seconds proves ours.
+_OVERRULES_S = 2.0
+_START_STEADY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +45,11 @@ class Whereabouts:
 class Navigation:
     """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
     up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard
-    deviation, of one axis, of the error that all fixes share. `has_gps`: the autopilot has a GPS that is believed."""
+    deviation, of one axis, of the error that all fixes share.
+
+    Beside accelerations, which go with positions that are sent all the time, the autopilot's estimate may be made of
+    those: GPS is then what its receiver reports itself. `has_gps`: there is a GPS that is believed. `is_in_doubt`: a
+    GPS contradicts our position, and no match proves ours."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -47,7 +58,14 @@ class Navigation:
         self._framed: Point | None = None  # of the path, when the last frame was taken
         self._fixed_m: Doubles | None = None  # the last fix, from the origin of the path
         self.has_gps, self._gps_s, self._fixed_s, self._strode_s = False, -math.inf, -math.inf, -math.inf
+        self.is_in_doubt = False
+        self._contradicted_since_s: float | None = None
         self._asked_s, self._asks_every_s = -math.inf, math.inf  # the last query's frame, and the time before it
+
+    @property
+    def fixed_s(self) -> float:
+        """Time of the last match that was believed; -inf if there was none."""
+        return self._fixed_s
 
     @property
     def known_s(self) -> float:
@@ -59,25 +77,30 @@ class Navigation:
         are so frequent that several can contradict it soon."""
         return max(t_s - self._strode_s, self._asks_every_s) <= _FOLLOWED_S
 
-    def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True) -> None:
+    def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True, is_estimate_ours: bool = False) -> None:
         """Process a report of the autopilot. A path of velocities (`RECKONED`) goes on with the reported velocity. If
-        the autopilot has GPS, and `believes_gps`, the reported position and velocity correct ours. A report without
+        there is GPS, and `believes_gps`, it corrects ours: as reported by the autopilot, or beside accelerations by the
+        receiver. `is_estimate_ours`: the reported position may be made of positions that we have sent. A report without
         velocity is ignored."""
         if vehicle.velocity_m_s is None:
             return
-        had_gps, self.has_gps = self.has_gps, reckons_by_gps(vehicle) and believes_gps
-        if self._drift is RECKONED and vehicle.position_sd_m is None:
+        has_gps = reckons_by_gps(vehicle) and believes_gps
+        if self._drift is INERTIAL:
+            self._hear_receiver(vehicle, vehicle.gps if has_gps else None, is_estimate_ours)
+        else:
+            self._hear_estimate(vehicle, has_gps)
+
+    def _hear_estimate(self, vehicle: Vehicle, has_gps: bool) -> None:
+        had_gps, self.has_gps = self.has_gps, has_gps
+        if vehicle.position_sd_m is None:
             self._path = None  # it has lost its position, so its velocity is even less reliable
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
         path = self._unbroken
         if path is None:
-            if vehicle.position_sd_m is not None:
-                here = Position(vehicle.lat_deg, vehicle.lon_deg)
-                self._start(here, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
+            self._start_at_estimate(vehicle)
             return
-        if self._drift is RECKONED:
-            self._filter.go_on(path.fly(t_s, velocity_m_s))
+        self._filter.go_on(path.fly(t_s, velocity_m_s))
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
         there = path.at(t_s)
@@ -86,6 +109,70 @@ class Navigation:
             off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
             self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
+
+    def _hear_receiver(self, vehicle: Vehicle, receiver: Receiver | None, is_estimate_ours: bool) -> None:
+        """Correct the path of accelerations by a receiver (None: there is no GPS that is believed)."""
+        path, had_gps = self._unbroken, self.has_gps
+        if path is None:
+            self.has_gps = receiver is not None and self._start_at_receiver(receiver, vehicle.t_heard_s)
+            if receiver is None and not is_estimate_ours:
+                self._start_at_estimate(vehicle)
+            return
+        off = None if receiver is None else self._beside_receiver(path, receiver)
+        if receiver is None or off is None:
+            self.has_gps = self.is_in_doubt = False
+            self._contradicted_since_s = None
+            if had_gps:
+                self._filter.lose_gps()
+            return
+        off_m, sd_m, off_m_s, age_s = off
+        expected_m, _, covariance = self._filter.errors(age_s)
+        if in_sd(off_m - expected_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _CONTRADICTS_SD:
+            self._contradict(receiver, vehicle.t_heard_s)
+            return
+        self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
+        if vehicle.t_heard_s - self._gps_s >= _GPS_EVERY_S:
+            self._gps_s = vehicle.t_heard_s
+            self._filter.hear_gps(off_m, sd_m, off_m_s, _GPS_VELOCITY_SD, age_s)
+
+    def _contradict(self, receiver: Receiver, now_s: float) -> None:
+        """Process a receiver that contradicts our position: where it goes on and no match proves ours, begin there."""
+        self.has_gps, self.is_in_doubt = False, now_s - self._fixed_s > PROOF_S
+        if self._contradicted_since_s is None:
+            self._contradicted_since_s = now_s
+        lasts_s = min(receiver.steady_for_s, now_s - self._contradicted_since_s)
+        if self.is_in_doubt and lasts_s >= _OVERRULES_S:
+            self.has_gps = self._start_at_receiver(receiver, now_s)
+
+    def _beside_receiver(self, path: Path, receiver: Receiver) -> tuple[Doubles, float, Doubles | None, float] | None:
+        """Return the offset (2,) from the path to a receiver's position, its standard deviation, by how much the
+        receiver's velocity exceeds the path's (2,; None: unknown), and its age; None if the path then is unknown."""
+        there = path.at(measured_s := receiver.t_s - RECEIVER_LAG_S)
+        if there is None:
+            return None
+        off_m = path.from_origin(receiver.lat_deg, receiver.lon_deg) - there.at_m
+        speed_m_s = float(np.hypot(*there.velocity_m_s))
+        sd_m = math.hypot(_GPS_ALIKE * receiver.sd_m, RECEIVER_LAG_SD_S * speed_m_s)
+        off_m_s = None if receiver.velocity_m_s is None else np.array(receiver.velocity_m_s) - there.velocity_m_s
+        return off_m, sd_m, off_m_s, path.now.t_s - measured_s
+
+    def _start_at_estimate(self, vehicle: Vehicle) -> None:
+        if vehicle.position_sd_m is not None:
+            here, velocity_m_s = Position(vehicle.lat_deg, vehicle.lon_deg), np.array(vehicle.velocity_m_s)
+            self._start(here, vehicle.position_sd_m, velocity_m_s, vehicle.t_heard_s, self._drift.velocity_sd)
+
+    def _start_at_receiver(self, receiver: Receiver, now_s: float) -> bool:
+        """Begin the path at a receiver's position, if that is steady; return True if it was begun."""
+        if receiver.steady_for_s < _START_STEADY_S:
+            return False
+        velocity_m_s, velocity_sd_m_s = np.zeros(2), _ANY_M_S
+        if receiver.velocity_m_s is not None:
+            velocity_m_s, velocity_sd_m_s = np.array(receiver.velocity_m_s), _GPS_VELOCITY_SD
+        flown_m = (now_s - receiver.t_s + RECEIVER_LAG_S) * velocity_m_s
+        here = Position(*moved(receiver.lat_deg, receiver.lon_deg, *flown_m.tolist()))
+        self._start(here, _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s)
+        self._gps_s, self.is_in_doubt, self._contradicted_since_s = now_s, False, None
+        return True
 
     def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""

@@ -13,10 +13,12 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
+from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, HeardFrame, positioned, worst_sd
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
+from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -31,6 +33,13 @@ _ALT_SD_M = 3.0
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE, _PX4_ALIKE, _LEAN_GOOD_FOR_S = math.sqrt(50), 1.5, 5.0
 _FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
+# A position that is farther behind jumps: a filter refuses it for seven to ten seconds, then begins there, which is
+# sooner than it is caught up with, and meanwhile nothing is sent that is far from what we know.
+_FARTHEST_BEHIND_M = 40.0
+_OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS may still be where that put it
+# A receiver that has been lost and is steady for so long is left to the autopilot; until the second time "no fix" is
+# sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
+_BACK_S, _TAKEN_BACK_S = 1.0, 3.0
 _ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
@@ -65,6 +74,8 @@ class Navigator(Listener):
         self._attitude: Attitude | None = None
         self._appeared_s = self._lean_s = -math.inf
         self._channel, self._believes_gps = Channel.COMMAND, True
+        self.output = Output.STARTING  # what a continuous channel carries
+        self._watch, self._given_s = OutputWatch(), -math.inf
 
     @property
     def has_gps(self) -> bool:
@@ -74,6 +85,9 @@ class Navigator(Listener):
     def believe_gps(self, believes: bool) -> None:
         """Set whether GPS is used for navigation."""
         self._believes_gps = believes
+
+    def believes_gps(self) -> bool:
+        return self._believes_gps
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
@@ -97,7 +111,11 @@ class Navigator(Listener):
         """Process a report of position and velocity."""
         with self._lock:
             self._vehicle = vehicle
-            self._navigation.hear_vehicle(vehicle, self._believes_gps)
+            if reckons_by_gps(vehicle) and vehicle.t_heard_s - self._given_s > _OURS_FOR_S:
+                self._given_s = -math.inf  # nothing of ours is left in its estimate
+            navigation = self._navigation
+            navigation.hear_vehicle(vehicle, self._believes_gps, self._given_s > -math.inf)
+            self._watch.update(vehicle, navigation.fixed_s, navigation.has_gps)
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
@@ -174,28 +192,55 @@ class Navigator(Listener):
             return None
         with self._lock:
             vehicle, estimate = self._vehicle, self._known(t_s)
-            is_apart = vehicle is not None and reckons_by_gps(vehicle) and not self._channel.is_beside_gps
-            if estimate is None or vehicle is None or is_apart:
+            self.output = self._next_output(vehicle, estimate)
+            if estimate is None or vehicle is None or self.output not in (Output.SENDING, Output.RESERVE):
                 self._slew.forget()
                 return None
+            self._given_s = t_s
+            self._watch.note_sent(t_s)
             lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
             east, north = estimate.velocity_m_s
             attitude, alike = self._attitude, self._alike(t_s)
+            is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
             return MotionState(
                 t_mono_s=t_s,
                 lat_deg=lat_deg,
                 lon_deg=lon_deg,
-                alt_m=vehicle.alt_m,
+                # The autopilot's own altitude may come from us: beside a receiver it is the receiver's.
+                alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
                 velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
                 accuracy_m=alike * math.hypot(self._claimed_m(estimate), behind_m),
                 alt_accuracy_m=_ALT_SD_M,
                 speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
                 attitude=None if attitude is None else _in_radians(attitude),
+                is_reserve=is_reserve,
             )
+
+    def _next_output(self, vehicle: Vehicle | None, estimate: Whereabouts | None) -> Output:
+        """Decide what is sent now."""
+        if vehicle is None or (estimate is None and self.output is Output.STARTING):
+            return Output.STARTING
+        uses_gps = reckons_by_gps(vehicle)
+        if uses_gps and not self._channel.is_beside_gps:
+            return Output.GPS_IN_USE
+        if estimate is None:
+            return Output.UNKNOWN
+        if self._navigation.is_in_doubt:
+            return Output.CONTRADICTS_GPS
+        if self._watch.withdrawn:
+            return self._watch.withdrawn
+        receiver = vehicle.gps if uses_gps and self._channel is Channel.GPS_INPUT else None
+        if receiver is None or receiver.sd_m > PLAUSIBLE_SD_M:
+            return Output.SENDING
+        was_lost = self.output in (Output.SENDING, Output.GPS_BACK)
+        if was_lost and receiver.steady_for_s < _TAKEN_BACK_S:
+            return Output.GPS_BACK if receiver.steady_for_s >= _BACK_S else Output.SENDING
+        return Output.RESERVE
 
     def _begin(self) -> None:
         drift = INERTIAL if self._channel.is_continuous else RECKONED
         self._navigation, self._consistency = Navigation(drift, self._map_sd_m), Consistency()
+        self._watch = OutputWatch()
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
@@ -270,8 +315,8 @@ class Navigator(Listener):
 
 
 class Slew:
-    """A position that never jumps, since autopilots do not follow jumps: it moves with the velocity of the estimates,
-    and its error against them shrinks by 2 m/s at most."""
+    """A position that does not jump, since autopilots do not follow jumps: it moves with the velocity of the estimates,
+    and its error against them shrinks by 2 m/s at most. One that is more than 40 m behind begins anew."""
 
     def __init__(self) -> None:
         self._said: Whereabouts | None = None
@@ -293,6 +338,9 @@ class Slew:
         carried = moved(*self._at, step_s * east_m_s, step_s * north_m_s)
         east_m, north_m = offset_m(*carried, here.lat_deg, here.lon_deg)
         behind_m = math.hypot(east_m, north_m)
+        if behind_m > _FARTHEST_BEHIND_M:
+            self.forget()
+            return self.followed(estimate)
         part = min(1.0, _FASTEST_M_S * step_s / behind_m) if behind_m > 0 else 1.0
         self._said, self._at = estimate, moved(*carried, part * float(east_m), part * float(north_m))
         return *self._at, (1 - part) * behind_m

@@ -15,6 +15,7 @@ from edgevpr.core.text import beside
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
 from edgevpr.runtime.flight.herald import Herald, Trouble
@@ -326,5 +327,5 @@ def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
     """Return the offset (2,) of the match from the receiver at the time of the frame, metres east and north."""
     here = seen.position
     off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
-    flown_m: Doubles = (seen.t_s - gps.t_s) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
+    flown_m: Doubles = (seen.t_s - gps.t_s + RECEIVER_LAG_S) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
     return off_m - flown_m

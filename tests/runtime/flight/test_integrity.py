@@ -11,6 +11,7 @@ from fakes import FakeClock, FakeLink, to_autopilot, vehicle_at
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver
 from edgevpr.frames.level import View
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Advice, Navigator
@@ -293,7 +294,7 @@ def test_the_time_between_receiver_and_frame_is_allowed_for():
     integrity, speed_m_s = Looks(0.1), 25.0
     for number in range(10):
         t_s = float(number)
-        gps = moved(*HOME, speed_m_s * (t_s - 0.8), 0.0)
+        gps = moved(*HOME, speed_m_s * (t_s - 0.8 - RECEIVER_LAG_S), 0.0)
         vehicle = vehicle_at(*gps, t_s, gps=Receiver(*gps, 0.1, t_s - 0.8), velocity_m_s=(speed_m_s, 0.0))
         seen = Position(*moved(*HOME, speed_m_s * t_s, 0.0))
         assert integrity.look(match_at(seen, t_s, vehicle, 0.1, (number,))) is None

@@ -1,0 +1,99 @@
+"""The GPS receivers of an autopilot, by their own messages: GPS_RAW_INT and GPS2_RAW.
+
+Nothing that edgevpr sends can be in them, but for the one receiver that it plays itself (GPS_INPUT), which is left out.
+The autopilot's estimate is another matter: it may be made of our own positions.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.types import Receiver
+from edgevpr.mavlink.wire import Message, mavlink
+
+GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
+GPS_GONE_AFTER_S = 2.5  # reports come at least once a second, and one may be lost
+GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
+PLAUSIBLE_SD_M = 15.0  # one that is worse is no reason to do without our own positions
+# From the moment that a receiver measures to the arrival of its report: 0.1 to 0.2 s in the receiver, and up to 0.2 s
+# until the autopilot sends the next report. What is left of it is the error of its time.
+RECEIVER_LAG_S = 0.2
+RECEIVER_LAG_SD_S = 0.1
+_ACCURACY_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
+_SPEED_UNKNOWN = 2**16 - 1
+_MAX_STEP_M = 8.0  # from one report to the next, beside what its own velocity explains: more is a jump
+_MAX_GAP_S = 1.5  # a receiver that was silent for longer has to be steady anew
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracked:
+    """A receiver with a 3D fix: its newest report, the autopilot's time stamp of it, and since when it is steady."""
+
+    report: Receiver
+    time_usec: int
+    steady_since_s: float
+
+
+class Receivers:
+    """The receivers that have a 3D fix. A receiver is steady while its fixes follow each other without a gap or jump,
+    by its own velocity, with a plausible accuracy."""
+
+    def __init__(self) -> None:
+        self._tracked: dict[str, _Tracked] = {}
+
+    def handle(self, message: Message, now_s: float) -> None:
+        """Process a GPS_RAW_INT or GPS2_RAW of the autopilot that arrived at `now_s`."""
+        name = message.get_type()
+        if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._tracked.pop(name, None)
+            return
+        before = self._tracked.get(name)
+        # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
+        if before and message.time_usec and message.time_usec == before.time_usec:
+            return
+        report = _report(message, now_s)
+        is_steady = before is not None and report.sd_m <= PLAUSIBLE_SD_M and _follows(before.report, report)
+        since_s = before.steady_since_s if before and is_steady else now_s
+        self._tracked[name] = _Tracked(report, message.time_usec, since_s)
+
+    def best(self, now_s: float, own: str | None = None) -> Receiver | None:
+        """Return the newest report of the most accurate receiver that had a fix in the last 2.5 s; None if there is
+        none. `own` is the name of the report of the receiver that edgevpr plays."""
+        real = [each for name, each in self._tracked.items() if name != own]
+        recent = [each for each in real if now_s - each.report.t_s <= GPS_GONE_AFTER_S]
+        if not recent:
+            return None
+        best = min(recent, key=lambda each: each.report.sd_m)
+        return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
+
+
+def _report(message: Message, now_s: float) -> Receiver:
+    return Receiver(
+        message.lat / 1e7,
+        message.lon / 1e7,
+        GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
+        now_s,
+        velocity_m_s=_velocity(message),
+        alt_m=message.alt / 1e3,
+    )
+
+
+def _velocity(message: Message) -> tuple[float, float] | None:
+    """Return the velocity of a report, m/s (east, north); None where it tells none."""
+    if _SPEED_UNKNOWN in (message.vel, message.cog):
+        return None
+    speed_m_s, course = message.vel / 100, math.radians(message.cog / 100)
+    return speed_m_s * math.sin(course), speed_m_s * math.cos(course)
+
+
+def _follows(before: Receiver, report: Receiver) -> bool:
+    """Tell whether a report follows the one before without a gap or a jump."""
+    step_s = report.t_s - before.t_s
+    if step_s > _MAX_GAP_S:
+        return False
+    speeds = [velocity for velocity in (before.velocity_m_s, report.velocity_m_s) if velocity]
+    if len(speeds) < 2:
+        return True
+    east_m, north_m = (step_s * (one + other) / 2 for one, other in zip(*speeds, strict=True))
+    expected = moved(before.lat_deg, before.lon_deg, east_m, north_m)
+    return math.hypot(*map(float, offset_m(*expected, report.lat_deg, report.lon_deg))) <= _MAX_STEP_M

@@ -1,0 +1,88 @@
+"""What a continuous channel carries at a moment, and the watch that withdraws it. The `navigator` uses both.
+
+An autopilot that flies by our positions is led by their errors. So they are withdrawn where they cannot be right, and
+come back with a match that proves them, or with GPS."""
+
+import math
+from enum import Enum
+
+from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.types import Vehicle
+from edgevpr.mavlink.messages import Severity
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
+
+PROOF_S = 5.0  # a match of the last seconds proves our position
+_REFUSED_RATIO = 1.0  # of an innovation to the filter's gate
+_REFUSED_S = 3.0
+_LED_AWAY_M = 15.0  # of the autopilot's estimate from a good receiver, and no less
+_LED_AWAY_SD = 4.0
+_LED_AWAY_S = 2.0
+_STEADY_S = 3.0
+_CAUSE_S = 10.0  # so long after our last position an error of the estimate may still be ours
+
+
+class Output(Enum):
+    """What is sent, with its severity and the text for the ground station, of 41 bytes at most."""
+
+    STARTING = Severity.INFO, "position not known yet"
+    SENDING = Severity.WARNING, "no GPS: positions are sent"
+    RESERVE = Severity.INFO, "GPS in use: positions are a reserve"
+    GPS_BACK = Severity.INFO, "GPS is back: no positions"
+    GPS_IN_USE = Severity.INFO, "GPS in use: no positions"
+    UNKNOWN = Severity.WARNING, "position unknown: none is sent"
+    CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: none is sent"
+    LEADS_AWAY = Severity.WARNING, "autopilot led off GPS: none is sent"
+    REFUSED = Severity.WARNING, "autopilot refuses positions: none is sent"
+
+    @property
+    def severity(self) -> Severity:
+        return self.value[0]
+
+    @property
+    def text(self) -> str:
+        return self.value[1]
+
+
+class OutputWatch:
+    """Watches what the autopilot makes of our positions: `withdrawn` says why none may be sent (None: they may).
+
+    They are withdrawn where its filter refuses them, and where its estimate leaves a good receiver while they are sent.
+    """
+
+    def __init__(self) -> None:
+        self.withdrawn: Output | None = None
+        self._withdrawn_s = -math.inf
+        self._sent_s = -math.inf
+        self._refused_since_s = self._led_away_since_s = math.inf
+
+    def note_sent(self, t_s: float) -> None:
+        """Note that a position was sent at `t_s`."""
+        self._sent_s = t_s
+
+    def update(self, vehicle: Vehicle, fixed_s: float, has_gps: bool) -> None:
+        """Process a report of the autopilot. `fixed_s` is the time of the last match that was believed; `has_gps`: a
+        receiver is believed."""
+        now_s = vehicle.t_heard_s
+        is_led_away = has_gps and _leaves_receiver(vehicle) and now_s - self._sent_s <= _CAUSE_S
+        is_refused = not has_gps and (vehicle.innovation_ratio or 0.0) > _REFUSED_RATIO and now_s - self._sent_s <= 1.0
+        self._led_away_since_s = min(self._led_away_since_s, now_s) if is_led_away else math.inf
+        self._refused_since_s = min(self._refused_since_s, now_s) if is_refused else math.inf
+        is_proven = now_s - fixed_s <= PROOF_S
+        if now_s - self._led_away_since_s >= _LED_AWAY_S and not is_proven:
+            self.withdrawn, self._withdrawn_s = Output.LEADS_AWAY, now_s
+        elif now_s - self._refused_since_s >= _REFUSED_S and not is_proven:
+            self.withdrawn, self._withdrawn_s = Output.REFUSED, now_s
+        elif fixed_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > _CAUSE_S):
+            self.withdrawn = None
+
+
+def _leaves_receiver(vehicle: Vehicle) -> bool:
+    """Tell whether the autopilot's estimate is farther from a steady receiver than both allow."""
+    receiver = vehicle.gps
+    if receiver is None or receiver.steady_for_s < _STEADY_S:
+        return False
+    since_s = vehicle.t_heard_s - receiver.t_s + RECEIVER_LAG_S
+    flown_m = (since_s * speed_m_s for speed_m_s in receiver.velocity_m_s or (0.0, 0.0))
+    there = moved(receiver.lat_deg, receiver.lon_deg, *flown_m)
+    off_m = float(distance_m(*there, vehicle.lat_deg, vehicle.lon_deg))
+    return off_m > max(_LED_AWAY_M, _LED_AWAY_SD * receiver.sd_m)
