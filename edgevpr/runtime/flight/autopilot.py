@@ -17,6 +17,7 @@ from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # While an autopilot is heard, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
@@ -45,6 +46,7 @@ class ToAutopilot:
         self._last: tuple[str, Sending] | None = None
         self._unanswered: list[tuple[str, Sending]] = []
         self._held, self._is_holding = 0, False
+        self._output = Output.STARTING  # as it was last reported
 
     @property
     def summary(self) -> str:
@@ -172,6 +174,7 @@ class ToAutopilot:
         with self._link.turn("report"):
             self._link.set_health(health)
             self._ask_for_sources()
+            self._report_output()
             self._link.send(
                 messages.computer_status(
                     self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
@@ -187,6 +190,13 @@ class ToAutopilot:
         if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own, answered_s):
             self._herald.say(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
             self._link.send(messages.source_set(number, stats.autopilot_system_id or 0))
+
+    def _report_output(self) -> None:
+        """Report what a continuous channel carries, where that has changed."""
+        output = self._navigator.output
+        if self._link.channel.is_continuous and output is not self._output:
+            self._output = output
+            self._herald.tell("output", output.severity, output.text, state=output.name)
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""

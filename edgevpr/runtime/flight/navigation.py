@@ -24,6 +24,12 @@ _UNKNOWN_M = 1e4
 _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 _FOLLOWED_S = 4.0  # after the frame of the last stride, and the longest time between two queries
 _MOST_ALIKE = 16.0  # fixes of the same ground that count as one
+# Between matches the ground under the strides may be higher or lower than taken for: what neighbouring pictures show of
+# that sums up. An attitude that is two degrees wrong shows as much as the first over 300 m, 100 m high. After a gap of
+# so many seconds nothing is known of it, and 0.3 is a valley of 30 m, seen from 100 m.
+_UNTOLD_ZOOM = 0.1
+_STRIDE_GAP_S = 5.0
+_UNSEEN_SCALE = 0.3
 _CONTRADICTS_SD = 5.0  # a receiver that is farther from our position is not used to correct it
 # A steady receiver that contradicts our position for so long is right, unless a match of the last seconds proves ours.
 _OVERRULES_S = 2.0
@@ -59,6 +65,7 @@ class Navigation:
         self._fixed_m: Doubles | None = None  # the last fix, from the origin of the path
         self.has_gps, self._gps_s, self._fixed_s, self._strode_s = False, -math.inf, -math.inf, -math.inf
         self.is_in_doubt = False
+        self._strides_since_fix = _StridesSinceFix()
         self._contradicted_since_s: float | None = None
         self._asked_s, self._asks_every_s = -math.inf, math.inf  # the last query's frame, and the time before it
 
@@ -105,7 +112,7 @@ class Navigation:
             self._filter.lose_gps()
         there = path.at(t_s)
         if there and self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
-            self._gps_s = t_s
+            self._note_gps(t_s)
             off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
             self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
@@ -132,7 +139,7 @@ class Navigation:
             return
         self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
         if vehicle.t_heard_s - self._gps_s >= _GPS_EVERY_S:
-            self._gps_s = vehicle.t_heard_s
+            self._note_gps(vehicle.t_heard_s)
             self._filter.hear_gps(off_m, sd_m, off_m_s, _GPS_VELOCITY_SD, age_s)
 
     def _contradict(self, receiver: Receiver, now_s: float) -> None:
@@ -171,8 +178,12 @@ class Navigation:
         flown_m = (now_s - receiver.t_s + RECEIVER_LAG_S) * velocity_m_s
         here = Position(*moved(receiver.lat_deg, receiver.lon_deg, *flown_m.tolist()))
         self._start(here, _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s)
-        self._gps_s, self.is_in_doubt, self._contradicted_since_s = now_s, False, None
+        self._note_gps(now_s)
+        self.is_in_doubt, self._contradicted_since_s = False, None
         return True
+
+    def _note_gps(self, now_s: float) -> None:
+        self._gps_s, self._strides_since_fix = now_s, _StridesSinceFix(now_s)
 
     def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
@@ -195,7 +206,8 @@ class Navigation:
             moved_m = np.array(stride.moved_m)
             strode = Strode(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
         is_used = self._filter.hear_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
-        if strode and is_used:
+        if stride and strode and is_used:
+            self._strides_since_fix.add(strode.moved_m, stride.zoom, frame.t_s)
             self._strode_s = frame.t_s
 
     def compared(self, seen: PositionedMatch) -> ComparedFix | None:
@@ -222,6 +234,7 @@ class Navigation:
             if fix.seen.frame.lean_s2 and (lean := fix.seen.lean):
                 self._filter.hear_lean(np.array(lean.over_height), lean.sd)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
+            self._strides_since_fix = _StridesSinceFix(self._fixed_s)
 
     def _repeats(self, fix: ComparedFix) -> float:
         """Return the factor of the covariance of a fix: the nearer it is to the last one, the more it repeats of its
@@ -255,7 +268,7 @@ class Navigation:
             t_s=t_s,
             position=Position(*moved(path.origin.lat_deg, path.origin.lon_deg, *at_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
-            accuracy_m=worst_sd(covariance[:2, :2]),
+            accuracy_m=math.hypot(worst_sd(covariance[:2, :2]), self._strides_since_fix.error_m),
             speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),
         )
 
@@ -273,6 +286,24 @@ class Navigation:
     @property
     def _unbroken(self) -> Path | None:
         return self._path if self._path and not self._path.is_broken else None
+
+
+class _StridesSinceFix:
+    """What strides have shown since the last fix or GPS, at `fixed_s`: how far they lead, and how the scale changes."""
+
+    def __init__(self, fixed_s: float = -math.inf) -> None:
+        self._moved_m, self._zoom, self._last_s, self._has_gap = np.zeros(2), 0.0, fixed_s, False
+
+    def add(self, moved_m: Doubles, zoom: float, t_s: float) -> None:
+        """Add a stride by `moved_m` (2,) metres to a frame of `t_s`."""
+        self._has_gap |= t_s - self._last_s > _STRIDE_GAP_S
+        self._moved_m, self._zoom, self._last_s = self._moved_m + moved_m, self._zoom + zoom, t_s
+
+    @property
+    def error_m(self) -> float:
+        """Standard deviation of one axis by which a changed height of the ground can have led us astray, metres."""
+        unseen = _UNSEEN_SCALE if self._has_gap else 0.0
+        return float(np.hypot(*self._moved_m)) * max(unseen, abs(self._zoom) - _UNTOLD_ZOOM, 0.0)
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:

@@ -23,18 +23,21 @@ _LONGEST_S = 30.0
 class Stride:
     """Motion from the frame of `from_s` to that of `to_s`: by `moved_m` (east, north), as far as height and heading are
     right that the pictures were levelled by. `sd_m` is the standard deviation of each axis, by the landmarks alone, of
-    which `inliers` agree."""
+    which `inliers` agree. `zoom` is the natural logarithm of how much more of the ground a picture shows than the one
+    before, beside what their heights explain: over flat ground 0, over ground that falls away above 0."""
 
     from_s: float
     to_s: float
     moved_m: tuple[float, float]
     sd_m: float
     inliers: int
+    zoom: float = 0.0
 
     def fields(self) -> dict[str, Any]:
         """Return this stride as fields of the flight log."""
         moved_m = [round(each, 2) for each in self.moved_m]
-        return {"from_s": self.from_s, "moved_m": moved_m, "sd_m": round(self.sd_m, 3), "inliers": self.inliers}
+        rest = {"sd_m": round(self.sd_m, 3), "inliers": self.inliers, "zoom": round(self.zoom, 4)}
+        return {"from_s": self.from_s, "moved_m": moved_m, **rest}
 
 
 class Strides:
@@ -69,4 +72,5 @@ class Strides:
         east_m, north_m = start.footprint_m * axes_of(start.up_deg) @ (step.real, -step.imag)
         sd_m = start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0])
         moved_m = float(east_m), float(north_m)
-        return Stride(from_s=from_s, to_s=t_s, moved_m=moved_m, sd_m=sd_m, inliers=found.inliers)
+        zoom = math.log(stretched)
+        return Stride(from_s=from_s, to_s=t_s, moved_m=moved_m, sd_m=sd_m, inliers=found.inliers, zoom=zoom)
