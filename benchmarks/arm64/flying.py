@@ -104,6 +104,7 @@ def _message(name: str) -> Message:
         "mavlink_version": 3,
         "lat": 470_000_000,
         "lon": 80_000_000,
+        "base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED,
         "relative_alt": _HEIGHT_MM,
         "fix_type": mavlink.GPS_FIX_TYPE_3D_FIX,
         "h_acc": 1000,

@@ -66,7 +66,7 @@ class Vehicle:
     wrong: an autopilot reports its estimate long after GPS is lost, and ignores a receiver that it does not trust.
     `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; together they change by
     `tilting_deg_s`. `height_m`: above the ground. `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed
-    downwards.
+    downwards. `height_doubt_m`: by how much `height_m` is in doubt, as its sources contradict each other.
     `position_sd_m`: standard deviation of one axis of the position; also None if the autopilot does not rely on it.
     `innovation_ratio`: of measured positions, those of edgevpr among them, to the filter's gate; above 1 it refuses
     them. `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
@@ -82,6 +82,7 @@ class Vehicle:
     pitch_deg: float | None = None
     tilting_deg_s: float = 0.0
     height_m: float | None = None
+    height_doubt_m: float = 0.0
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
     position_sd_m: float | None = None

@@ -194,7 +194,7 @@ class Conversation:
 
     def tell_of_answers(self) -> None:
         """Queue a text for the ground station about each change since the last call: the autopilot falls silent or is
-        heard again; fixes are answered in another way, or not in time (see `Fixes.news`)."""
+        heard again; fixes are answered in another way, or not in time (see `Fixes.news`); heights (see `Heights`)."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)
         if is_there and self._is_there is False:
@@ -204,7 +204,8 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_there or self._is_there is not None:
             self._is_there = is_there
-        for news in self.fixes.news(self.autopilot.readiness.why_silent(), now_s):
+        fixes_news = self.fixes.news(self.autopilot.readiness.why_silent(), now_s)
+        for news in (*fixes_news, *self.autopilot.heights.news()):
             self.announce(*news)
 
     def break_off(self, lost_fixes: int) -> None:

@@ -10,10 +10,11 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
+from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Use
 from edgevpr.mavlink.receivers import GPS_REPORTS, Receivers
-from edgevpr.mavlink.vehicle import Attitude, Attitudes, Certainty, Heights, Readiness
+from edgevpr.mavlink.vehicle import Attitude, Attitudes, Certainty, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
@@ -134,7 +135,7 @@ class Autopilot:
         self.interview, self.readiness = Interview(), Readiness()
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
-        self.attitudes, self._heights, self.certainty = Attitudes(), Heights(), Certainty()
+        self.attitudes, self.heights, self.certainty = Attitudes(), Heights(), Certainty()
         self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
         self.px4 = Px4Use()
         self.receivers = Receivers()
@@ -199,7 +200,7 @@ class Autopilot:
                 self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
                 self.acks[answer] += 1
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
-                self._heights.hear(message, now_s, self.attitudes.at(now_s))
+                self.heights.hear(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
                 self.receivers.handle(message, now_s)
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
@@ -226,10 +227,14 @@ class Autopilot:
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.certainty.note_known(gps.sd_m, now_s)
-        if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
+        is_nowhere = (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7
+        east_m_s, north_m_s = message.vy / 100, message.vx / 100
+        above_sea_m = None if is_nowhere else message.alt / 1e3
+        altitudes = Altitudes(now_s, above_sea_m, message.relative_alt / 1e3, -message.vz / 100)
+        self.heights.hear_altitudes(altitudes, bool(self.readiness.is_armed), math.hypot(east_m_s, north_m_s))
+        if is_nowhere:
             self.vehicle = None
             return
-        east_m_s, north_m_s = message.vy / 100, message.vx / 100
         self.vehicle = Vehicle(
             lat_deg=lat_deg,
             lon_deg=lon_deg,
@@ -240,7 +245,8 @@ class Autopilot:
             t_heard_s=now_s,
             has_gps=has_gps,
             gps=gps,
-            height_m=self._heights.now(message.relative_alt / 1e3, now_s),
+            height_m=self.heights.now(now_s),
+            height_doubt_m=self.heights.doubt_m,
             position_sd_m=self.certainty.now(now_s),
             innovation_ratio=self.certainty.innovation_ratio(now_s),
         )

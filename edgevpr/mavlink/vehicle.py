@@ -1,4 +1,4 @@
-"""The state of the vehicle (attitude, height and position accuracy) from the autopilot's messages of the last seconds,
+"""The state of the vehicle (attitude and position accuracy) from the autopilot's messages of the last seconds,
 and the autopilot's readiness to accept a fix, with the likely reasons for its answers. These were read in the source
 code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
@@ -14,9 +14,6 @@ from edgevpr.mavlink.wire import Message, mavlink
 _KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
 _MOST_KEPT = 200
 _NEAR_S = 0.3  # an attitude that is farther from the time of a frame is not used for it
-_RANGE_FRESH_S = 1.0
-_TERRAIN_FRESH_S = 2.5
-_BAD_SIGNAL = 1  # of DISTANCE_SENSOR.signal_quality; 0 is unknown, 100 the best
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
@@ -72,35 +69,6 @@ class Attitudes:
             one + share * change for one, change in zip(before[1:4], changed_deg, strict=True)
         )
         return Attitude(t_s, roll_deg, pitch_deg, yaw_deg, math.hypot(*changed_deg[:2]) / step_s)
-
-
-class Heights:
-    """The height above the ground, from the best source that is recent: a range finder that looks down, else the
-    autopilot's model of the terrain, else the height over the take-off point."""
-
-    def __init__(self) -> None:
-        self._range: tuple[float, float] | None = None  # metres, time
-        self._terrain: tuple[float, float] | None = None
-
-    def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
-        if message.get_type() == "TERRAIN_REPORT":
-            # A spacing of 0 says that the autopilot has no terrain of this place.
-            self._terrain = (message.current_height, now_s) if message.spacing else None
-        elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
-            in_range = message.min_distance < message.current_distance < message.max_distance
-            is_good = in_range and message.signal_quality != _BAD_SIGNAL
-            lean = 1.0
-            if attitude:
-                lean = math.cos(math.radians(attitude.roll_deg)) * math.cos(math.radians(attitude.pitch_deg))
-            self._range = (message.current_distance / 100 * max(0.0, lean), now_s) if is_good else None
-
-    def now(self, over_takeoff_m: float, now_s: float) -> float:
-        """Return the height above the ground in metres, by the best recent source; without one, `over_takeoff_m`."""
-        for measured, good_for_s in ((self._range, _RANGE_FRESH_S), (self._terrain, _TERRAIN_FRESH_S)):
-            if measured and now_s - measured[1] <= good_for_s and math.isfinite(measured[0]):
-                return measured[0]
-        return over_takeoff_m
 
 
 class Certainty:

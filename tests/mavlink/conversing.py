@@ -9,7 +9,15 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ABS = mavlink.EKF_POS_HORIZ_ABS
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
+
+
+def located(at_deg, alt_m, relative_m, velocity_cm_s=(0, 0, 0), hdg=9050):
+    """A GLOBAL_POSITION_INT."""
+    where = (round(degrees * 1e7) for degrees in at_deg)
+    fields = (*where, round(alt_m * 1e3), round(relative_m * 1e3), *velocity_cm_s, hdg)
+    return mavlink.MAVLink_global_position_int_message(0, *fields)
 
 
 class Autopilot:
@@ -25,13 +33,12 @@ class Autopilot:
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
         self.conversation.hear(message.pack(packer), self.clock.now_s, address)
 
-    def beat(self, base_mode=0, **sender):
+    def beat(self, base_mode=ARMED, **sender):
         beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)
         self.say(beat, **sender)
 
     def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):
-        at = round(lat_deg * 1e7), round(lon_deg * 1e7), 312_500, 80_000
-        self.say(mavlink.MAVLink_global_position_int_message(0, *at, vx, vy, 0, hdg), **sender)
+        self.say(located((lat_deg, lon_deg), 312.5, 80.0, velocity_cm_s=(vx, vy, 0), hdg=hdg), **sender)
         return self.vehicle
 
     def gps(self, fix_type=FIX_3D, h_acc=0, message=mavlink.MAVLink_gps_raw_int_message, lat_deg=50.0):
