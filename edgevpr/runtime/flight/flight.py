@@ -29,6 +29,7 @@ from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governor import Governing
+from edgevpr.runtime.flight.heightwatch import HeightWatch
 from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
@@ -78,6 +79,7 @@ class Flight:
             Sight(herald).tell,
             ScaleWatch(herald).tell,
             TurnWatch(herald, config.source).tell,
+            HeightWatch(herald).tell,
             gps.tell,
             self._surveyor.tell,
             self._log_event,

@@ -1,0 +1,67 @@
+"""Watch over the height above the ground that is reported, by the scale of the pictures. A wrong height makes each
+picture's footprint, the motion between two pictures and the correction of tilt wrong."""
+
+import statistics
+from collections import deque
+
+from edgevpr.mavlink.messages import Severity
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.recognise.recognition import Recognition
+
+CONTRADICTION_RATIO = 1.25
+MATCHES_IN_A_ROW = 5
+LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
+
+
+class HeightWatch:
+    """Compares the height that accepted matches give with the reported one, and reports once when they contradict each
+    other in five matches in a row, and once when five agree again. A match gives a height only if the lens is known.
+
+    `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
+
+    def __init__(self, herald: Herald) -> None:
+        self.by_pictures_m: float | None = None
+        self.by_autopilot_m: float | None = None
+        self._herald = herald
+        self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # by pictures, by the autopilot
+        self._last_s: float | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Height by the pictures over that by the autopilot; 1.0 while they agree, or nothing is known."""
+        if self.by_pictures_m is None or self.by_autopilot_m is None:
+            return 1.0
+        return self.by_pictures_m / self.by_autopilot_m
+
+    def tell(self, event: Recognition) -> None:
+        """Compare the height of an event's match, if it has one, with the reported height."""
+        frame, vehicle, where = event.frame, event.vehicle, event.located
+        if frame is None or vehicle is None or where is None or not event.accepted or event.view.reason:
+            return
+        is_known = where.height_m and where.height_ratio and vehicle.height_m is not None
+        if not is_known or frame.t_mono_s == self._last_s or not vehicle.is_fresh_at(frame.t_mono_s):
+            return
+        self._last_s = frame.t_mono_s
+        self._heights_m.append((max(LOWEST_M, where.height_m or 0.0), max(LOWEST_M, vehicle.height_m or 0.0)))
+        self._judge()
+
+    def _judge(self) -> None:
+        ratios = [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
+        if len(ratios) < MATCHES_IN_A_ROW:
+            return
+        was_so = self.by_pictures_m is not None
+        if all(1 / CONTRADICTION_RATIO <= ratio <= CONTRADICTION_RATIO for ratio in ratios):
+            self.by_pictures_m = self.by_autopilot_m = None
+        elif was_so or min(ratios) > CONTRADICTION_RATIO or max(ratios) < 1 / CONTRADICTION_RATIO:
+            self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
+        if was_so != (self.by_pictures_m is not None):
+            self._report()
+
+    def _report(self) -> None:
+        if self.by_pictures_m is None or self.by_autopilot_m is None:
+            said = "height by the autopilot agrees with the pictures again"
+            self._herald.tell("height", Severity.INFO, said, ground="height agrees with pictures again", said=said)
+            return
+        said = f"height: {self.by_autopilot_m:.0f} m by the autopilot, {self.by_pictures_m:.0f} m by the pictures"
+        ground = f"height {self.by_autopilot_m:.0f} m, by pictures {self.by_pictures_m:.0f} m"
+        self._herald.tell("height", Severity.WARNING, said, ground=ground, said=said, ratio=round(self.ratio, 2))

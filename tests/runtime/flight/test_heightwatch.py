@@ -1,0 +1,81 @@
+"""The reported height against that of the pictures."""
+
+from types import SimpleNamespace
+
+import pytest
+from fakes import FakeClock, FakeLink
+
+from edgevpr.core.types import Vehicle
+from edgevpr.frames.level import View
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.heightwatch import HeightWatch
+from edgevpr.runtime.flight.herald import Herald
+
+
+class Watch:
+    def __init__(self, folder) -> None:
+        self.clock, self.log = FakeClock(), folder / "log"
+        self.link = FakeLink(self.clock)
+        self.watch = HeightWatch(Herald(FlightLog(self.log, clock=self.clock), self.link))
+
+    def see(self, *heights_m, reported_m=100.0, accepted=True, ratio=1.0, every_s=1.0, age_s=0.0):
+        """Let matches of these heights be seen; return the texts so far."""
+        for height_m in heights_m:
+            self.clock.now_s += every_s
+            now_s = self.clock.now_s
+            where = {"lat_deg": 50.0, "lon_deg": 8.0, "alt_m": 600.0, "heading_deg": None}
+            vehicle = Vehicle(**where, t_heard_s=now_s - age_s, has_gps=False, height_m=reported_m)
+            self.watch.tell(
+                SimpleNamespace(
+                    frame=SimpleNamespace(t_mono_s=now_s),
+                    vehicle=vehicle,
+                    accepted=accepted,
+                    view=View(),
+                    located=SimpleNamespace(height_m=height_m, height_ratio=ratio),
+                )
+            )
+        return [text.removeprefix("edgevpr: ") for _, text in self.link.texts()]
+
+
+@pytest.fixture
+def watch(tmp_path):
+    return Watch(tmp_path)
+
+
+def test_heightwatch_reports_a_contradiction_once_and_its_end(watch):
+    assert watch.see(150, 160, 158, 162) == []
+    assert watch.watch.ratio == 1.0
+    assert watch.see(155) == ["height 100 m, by pictures 158 m"]
+    assert watch.watch.ratio == pytest.approx(1.58)
+    watch.see(*[200] * 5, 100, 100, 100, 100)
+    assert len(watch.link.texts()) == 1
+    assert watch.see(100)[1:] == ["height agrees with pictures again"]
+    assert watch.watch.ratio == 1.0
+    assert [(line["kind"], line["said"]) for line in read_log(watch.log)] == [
+        ("height", "height: 100 m by the autopilot, 158 m by the pictures"),
+        ("height", "height by the autopilot agrees with the pictures again"),
+    ]
+
+
+def test_heightwatch_bears_a_reported_height_of_zero(watch):
+    assert watch.see(*[100] * 5, reported_m=0.0) == ["height 1 m, by pictures 100 m"]
+    assert watch.watch.ratio == 100.0
+
+
+@pytest.mark.parametrize(
+    ("heights_m", "how"),
+    [
+        ([120] * 9, {}),
+        ([150, 150, 150, 150, 100] * 3, {}),
+        ([150, 60] * 9, {}),
+        ([150] * 9, {"accepted": False}),
+        ([150] * 9, {"ratio": None}),
+        ([150] * 9, {"every_s": 0.0}),
+        ([150] * 9, {"age_s": 2.0}),
+        ([None] * 9, {}),
+        ([150] * 9, {"reported_m": None}),
+    ],
+)
+def test_heightwatch_reports_nothing_without_five_matches_that_contradict(watch, heights_m, how):
+    assert watch.see(*heights_m, **how) == []
+    assert watch.watch.ratio == 1.0
