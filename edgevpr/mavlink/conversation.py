@@ -20,6 +20,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.ground import PAUSED, Requests, Texts, Wish, Wished
 from edgevpr.mavlink.messages import Fix, Health, Severity
+from edgevpr.mavlink.origin import OriginAltitude
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
@@ -44,7 +45,8 @@ class LinkSettings:
     - `max_fix_age_s`: a fix that has waited longer is never sent; `clock`: the monotonic clock of all time stamps.
     - `listener`: hears the reports of the vehicle, and gives the positions of a continuous channel.
     - `tap`: gets each packet written or received; `tape`: records, or plays back, all that is received and sent.
-    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never)."""
+    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never). Its altitude is that of the
+      ground; None: unknown, that of the autopilot's air pressure is sent."""
 
     component_id: int = 197
     system_id: int | None = None
@@ -82,6 +84,7 @@ class Conversation:
         self._told_channel = self.channel  # the channel that the listener knows
         self._odometry_since_s = math.inf
         self._origin = settings.origin
+        self._origin_altitude = OriginAltitude(self.announce)
         self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
 
     @property
@@ -265,8 +268,10 @@ class Conversation:
             return autopilot.px4.told(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
         if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
             log.warning("the autopilot has no origin: it is set to the first place of the map")
-            here, self._origin = self._origin, None
-            return messages.origin(system_id, here.lat_deg, here.lon_deg, here.alt_m or 0.0)
+            here, self._odometry_since_s = self._origin, now_s
+            message = self._origin_altitude.place(here, system_id, autopilot.pressure_alt_m)
+            self._origin = None if message.get_type() == "SET_GPS_GLOBAL_ORIGIN" else here
+            return message
         if state and state.attitude and autopilot.origin:
             return messages.odometry(state, state.attitude, autopilot.origin)
         return None

@@ -20,6 +20,7 @@ from edgevpr.mavlink.wire import Message, mavlink
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
+_LEAST_HPA, _MOST_HPA = 300.0, 1100.0  # of the air where anything flies
 _MILLI_G_M_S2 = 9.80665e-3
 
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
@@ -134,6 +135,7 @@ class Autopilot:
     def _forget(self) -> None:
         self.interview, self.readiness = Interview(), Readiness()
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
+        self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self.heights, self.certainty = Attitudes(), Heights(), Certainty()
         self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
@@ -216,6 +218,8 @@ class Autopilot:
                 self._listener.hear_force(now_s, (nose, right, down), attitude)
             case "SYSTEM_TIME" if message.time_unix_usec:
                 self.utc_ahead_s = message.time_unix_usec / 1e6 - now_s
+            case "SCALED_PRESSURE" if _LEAST_HPA < message.press_abs < _MOST_HPA:
+                self.pressure_alt_m = 44330.8 * (1 - (message.press_abs / 1013.25) ** 0.190263)
             case "GPS_GLOBAL_ORIGIN":
                 self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conversing import Autopilot
+from conversing import Autopilot, located
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
@@ -137,6 +137,35 @@ def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
     autopilot.beat()
     assert len(sent(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 1
+
+
+def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
+    autopilot, ear = interviewed(parameters={"VISO_TYPE": (1.0, INT8)}, seconds=6, origin=Position(46.5, 7.5))
+    asked = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
+    for _ in range(4):
+        autopilot.beat()
+        requests = [message for message in sent(autopilot, "COMMAND_LONG", 4.0) if message.param1 == asked]
+    assert requests
+    assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
+    autopilot.say(mavlink.MAVLink_scaled_pressure_message(0, 945.0, 0, 2000))
+    origins, texts = [], []
+    for _ in range(12):
+        autopilot.beat()
+        autopilot.wait(1.0)
+        told = autopilot.told()
+        origins += [message.altitude / 1e3 for message in told if message.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
+        texts += [message.text for message in told if message.get_type() == "STATUSTEXT"]
+    assert origins == pytest.approx([584.0], abs=2.0)
+    assert texts == ["edgevpr: origin altitude unknown: about 584 m"]
+    # Whatever that altitude is: positions and heights of ours are the same.
+    ear.state = replace(STATE, alt_m=700.0)
+    for off_m in (0.0, 500.0):
+        autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, round(1e3 * (584 + off_m))))
+        autopilot.say(located((46.5, 7.5), 700.0 + off_m, 116.0))
+        assert autopilot.vehicle.height_m == 116.0
+        ear.state = replace(STATE, alt_m=autopilot.vehicle.alt_m)
+        autopilot.beat()
+        assert sent(autopilot, "ODOMETRY")[-1].z == pytest.approx(-116.0, abs=0.01)
 
 
 def test_what_the_accelerometers_feel_is_heard_with_the_attitude():

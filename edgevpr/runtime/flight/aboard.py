@@ -2,20 +2,23 @@
 flight depends on. `flight` does this before it opens the links and the source of frames."""
 
 import logging
+import math
 import platform
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, astuple, replace
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from edgevpr import __version__
-from edgevpr.core.config import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Config
+from edgevpr.core.config import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Config, SourceConfig
 from edgevpr.core.contract import TechniqueSpec
-from edgevpr.core.errors import MapError
-from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.types import FIX_MAX_AGE_S, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, identity_of
 from edgevpr.places.readmap import ReadMap
@@ -26,10 +29,12 @@ from edgevpr.runtime.flight.world import World
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique
 from edgevpr.runtime.recognise.learn import Learner
+from edgevpr.runtime.recognise.levelling import lens_of
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 _NEW_MAP_PLACES = 1000  # places that a technique chosen for an empty map must be fast enough for
+_ORIGIN_PLACES = 15  # the first places of the map, by which the altitude of the ground is found
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
 _log = logging.getLogger(__name__)
@@ -108,6 +113,22 @@ def at_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
     usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
     usual_hz = min(max(usual_hz, LOWEST_RATE_HZ), HIGHEST_RATE_HZ)
     return replace(config, source=replace(config.source, rate_hz=usual_hz))
+
+
+def find_origin(place_map: ReadMap, source: SourceConfig) -> Position | None:
+    """Return the first position of a map (None: it has none), with the altitude of the ground: the median, over the
+    first places, of the altitude of the camera less its height. The height follows from the footprint and the lens,
+    which is taken to be that of the map. The altitude is None if altitudes, footprints or the lens are unknown."""
+    first, altitudes_m, lens = None, [], lens_of(source)
+    has_lens_of_map = place_map.lens is None or place_map.lens == (source.lens and Path(source.lens).name)
+    with suppress(PlaceError):  # a damaged place ends the search
+        for place in islice((place for place in place_map.places() if place.position), _ORIGIN_PLACES):
+            position, pose = place.position, place.pose
+            first = first or position
+            if position and position.alt_m is not None and pose and not pose.is_surveyed and lens and has_lens_of_map:
+                height_m = pose.footprint_m / (2 * math.tan(math.radians(lens.fov_deg) / 2))
+                altitudes_m.append(position.alt_m - height_m)
+    return first and Position(first.lat_deg, first.lon_deg, median(altitudes_m) if altitudes_m else None)
 
 
 def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:

@@ -14,16 +14,15 @@ from typing import Any
 
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
-from edgevpr.core.types import Frame
+from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Mount
 from edgevpr.frames.source import recorded_steps
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
-from edgevpr.places.readmap import ReadMap
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import at_recorded_rate, look_ahead, open_map, rate_hz, say_start
+from edgevpr.runtime.flight.aboard import at_recorded_rate, find_origin, look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
@@ -103,7 +102,8 @@ class Flight:
             step_s = 1 / rate_hz(config, recogniser)
             is_muted, is_level = not config.mavlink.send_fixes, config.source.gimbal
             navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted, is_level)
-            link, ground = open_links(config.mavlink, world, navigator, recogniser.place_map, stack)
+            origin = find_origin(recogniser.place_map, config.source) if config.mavlink.set_origin else None
+            link, ground = open_links(config.mavlink, world, navigator, origin, stack)
             source, source_uri = world.open_source(step_s), config.source.uri
             stack.callback(source.close)
             if link and not source.is_live and (learner or config.mavlink.send_fixes):
@@ -316,15 +316,13 @@ def _open_log(world: World) -> FlightLog:
 
 
 def open_links(
-    settings: MavlinkConfig, world: World, navigator: Navigator, place_map: ReadMap, stack: ExitStack
+    settings: MavlinkConfig, world: World, navigator: Navigator, origin: Position | None, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
-    """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
+    """Open the links to flight controller and ground station (None: not configured), which `stack` closes. `origin`: as
+    in `LinkSettings`."""
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None
-    origin = None
-    if settings.set_origin:
-        origin = next((place.position for place in place_map.places() if place.position), None)
     link_settings = LinkSettings(
         component_id=settings.component_id,
         system_id=settings.system_id,
