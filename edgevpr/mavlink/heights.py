@@ -80,7 +80,7 @@ class Heights:
     def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
         """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
         if message.get_type() == "TERRAIN_REPORT":
-            self._hear_terrain(message, now_s)
+            self._handle_terrain(message, now_s)
         elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
             in_range = message.min_distance < message.current_distance < message.max_distance
             is_good = in_range and message.signal_quality != BAD_SIGNAL_QUALITY
@@ -89,7 +89,7 @@ class Heights:
                 lean = math.cos(math.radians(attitude.roll_deg)) * math.cos(math.radians(attitude.pitch_deg))
             self._range = (message.current_distance / 100 * max(0.0, lean), now_s) if is_good else None
 
-    def hear_altitudes(self, altitudes: Altitudes, is_armed: bool, speed_m_s: float) -> None:
+    def handle_altitudes(self, altitudes: Altitudes, is_armed: bool, speed_m_s: float) -> None:
         """Process the altitudes of a GLOBAL_POSITION_INT; `speed_m_s` is its speed over the ground."""
         # PX4 without a home reports the altitude above sea level as that above home.
         was_without_home, self._has_home = (
@@ -108,8 +108,8 @@ class Heights:
         else:
             self.takeoff_m += self._change_m(self._last, altitudes)
         self._last = altitudes
-        self._look_at_home(self.takeoff_m - altitudes.above_home_m)
-        self._look_at_range(altitudes.t_s)
+        self._check_home(self.takeoff_m - altitudes.above_home_m)
+        self._check_range(altitudes.t_s)
 
     def now(self, now_s: float) -> float:
         """Return the height above the ground in metres, by the best recent source."""
@@ -152,7 +152,7 @@ class Heights:
         self._report(f"altitude jumped {jump_m:+.0f} m", "the height leaves it out", "altitude")
         return climbed_m
 
-    def _look_at_home(self, home_m: float) -> None:
+    def _check_home(self, home_m: float) -> None:
         if not self._has_home:
             return
         moved_m, was_m, self.home_m = home_m - self._reported_home_m, self.home_m, home_m
@@ -166,7 +166,7 @@ class Heights:
                 text = f"home is {abs(home_m):.0f} m {'above' if home_m > 0 else 'below'} take-off"
             self._report(text, "heights stay those above the take-off", "home")
 
-    def _look_at_range(self, now_s: float) -> None:
+    def _check_range(self, now_s: float) -> None:
         """Compare the range finder with the other heights; it must differ, or agree, for some seconds."""
         by_range_m, by_autopilot_m = self._recent(self._range, now_s, RANGE_MAX_AGE_S), self._by_autopilot_m(now_s)
         if by_range_m is None:
@@ -194,7 +194,7 @@ class Heights:
         _log.warning("%s: %s", text, consequence)
         self._news.append((Severity.WARNING, text, topic))
 
-    def _hear_terrain(self, report: Message, now_s: float) -> None:
+    def _handle_terrain(self, report: Message, now_s: float) -> None:
         # A spacing of 0 says that the autopilot has no terrain data of this place.
         is_known = report.spacing and math.isfinite(report.terrain_height + report.current_height)
         self._terrain = (report.terrain_height, now_s) if is_known else None
