@@ -8,7 +8,7 @@ behaviour of a copter without GPS was observed in ArduPilot's own simulator.
 
 import math
 
-from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, SD_GROWS_M_S, Firmware
+from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D, Origin, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
@@ -49,17 +49,18 @@ class ArduPilot(Firmware):
         if self._is_aiding and self.kind == "copter" and self.now_s - self._passed_s > _AIDING_LOST_S:
             self._is_aiding, self._good_since_s, self._frozen = False, math.inf, self.place
         measured, before, self._used = self._measured(), self._used, self._measured()
+        self.estimator.predict(dt_s)
         if not self._is_aiding:
             self._wait_for_aiding(measured)
-        elif measured is not None and measured != before:
-            self._fuse(measured, wind_m_s, _POSITION_LOST_WITH_VELOCITY_S)
-        if self._is_aiding and measured is not None and self.now_s - measured.t_s < _DEAD_RECKONING_S:
-            self.drift_m_s = 0j
-        elif self._is_aiding:
+        elif measured is not None and measured != before and self._fuse(measured, _POSITION_LOST_WITH_VELOCITY_S):
+            self._learn_wind(wind_m_s)
+        is_aided = measured is not None and self.now_s - measured.t_s < _DEAD_RECKONING_S
+        if self._is_aiding and not is_aided:
             self._go_wrong(wind_m_s, dt_s, _UNNOTICED_SHARE)
-            self._reckon(dt_s, SD_GROWS_M_S[self.kind])
-        elif self._frozen:
-            self._reset_to(*self._frozen, self.sd_m)
+        elif not self._is_aiding:
+            self.estimator.velocity_error_m_s = -self.truth.velocity_m_s  # it takes itself for standing still
+            if self._frozen:
+                self._reset_to(*self._frozen, self.sd_m)
 
     def flags(self) -> int:
         flags: int = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
@@ -117,4 +118,4 @@ class ArduPilot(Firmware):
         self._is_aiding, self._passed_s, self._aligned_after_s = True, passed_s, _AGAIN_AFTER_S
         self.set_origin(at)
         self._reset_to(at[0], at[1], _POSITION_NOISE_M)
-        self.drift_m_s = 0j
+        self.estimator.velocity_error_m_s = 0j

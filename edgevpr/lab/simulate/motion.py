@@ -1,6 +1,7 @@
-"""The motion of a simulated vehicle: along a recorded track, or at an unknown place. Used by the simulated autopilots.
-East and north are one complex number, east + 1j * north."""
+"""The motion of a simulated vehicle: along a recorded track, at an unknown place, or where its autopilot's estimate
+leads it. Used by the simulated autopilots. East and north are one complex number, east + 1j * north."""
 
+import cmath
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -9,14 +10,21 @@ from pathlib import Path
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m, shorter_deg
+from edgevpr.core.types import Position
 from edgevpr.frames.positions import read_positions
+
+GRAVITY_M_S2 = 9.80665
+_MAX_ACCELERATION_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(30.0))
+_MAX_SPEED_M_S = 5.0  # of a correction
+_SPEED_FOR_M, _ACCELERATION_FOR_M_S = 0.5, 1.5  # gains of the position controller: 1/s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrueState:
     """The true state of the vehicle: position in degrees, `alt_m` above sea level, `height_m` above the ground,
     velocity over the ground (east + 1j * north) and climb rate upwards. Angles and height are NaN where unknown. On a
-    track, `t_s` are the seconds from its start."""
+    track, `t_s` are the seconds from its start. `acceleration_m_s2` is horizontal (east + 1j * north); a recorded track
+    has none."""
 
     lat_deg: float
     lon_deg: float
@@ -28,6 +36,7 @@ class TrueState:
     pitch_deg: float = math.nan
     heading_deg: float = math.nan
     t_s: float = 0.0
+    acceleration_m_s2: complex = 0j
 
 
 FlownTrack = Sequence[TrueState]  # the path of a vehicle, in the order of time
@@ -35,17 +44,65 @@ FlownTrack = Sequence[TrueState]  # the path of a vehicle, in the order of time
 
 class Motion:
     """A vehicle at an unknown place that obeys no command. `is_flying`: it is between take-off and landing; `is_known`:
-    its position is known, and reported."""
+    its position is known, and reported; `obeys_estimate`: the errors of its autopilot's estimate move it."""
 
     is_flying = True
     is_known = False
+    obeys_estimate = False
 
     def begin(self, now_s: float) -> None:
         """Note that at `now_s` an onboard computer in flight was heard."""
 
+    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
+        """Steer by an estimate with these errors (see `Estimator`), if the vehicle obeys it."""
+
     def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move for `dt_s` seconds, up to `now_s`, and return the state then."""
         return TrueState(lat_deg=0.0, lon_deg=0.0, alt_m=0.0)
+
+
+class Hover(Motion):
+    """A vehicle in the air that holds its *estimated* position at a target, by the tilt that its *estimated* attitude
+    shows. The target is `home` or, with a velocity, moves from there in a straight line. `away_m` is the true distance
+    from the target."""
+
+    is_known = True
+    obeys_estimate = True
+
+    def __init__(self, home: Position, height_m: float, velocity_m_s: complex = 0j) -> None:
+        self._home, self._height_m, self._cruise_m_s = home, height_m, velocity_m_s
+        self._target_m = self._at_m = self._acceleration_m_s2 = 0j
+        self._velocity_m_s = velocity_m_s
+        self._heading_deg = 90 - math.degrees(cmath.phase(velocity_m_s)) if velocity_m_s else 0.0
+
+    @property
+    def away_m(self) -> float:
+        return abs(self._at_m - self._target_m)
+
+    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
+        seen_m, seen_m_s = self._at_m + error_m, self._velocity_m_s + velocity_error_m_s
+        wanted_m_s = self._cruise_m_s + _limited(_SPEED_FOR_M * (self._target_m - seen_m), _MAX_SPEED_M_S)
+        wanted_m_s2 = _limited(_ACCELERATION_FOR_M_S * (wanted_m_s - seen_m_s), _MAX_ACCELERATION_M_S2)
+        self._acceleration_m_s2 = wanted_m_s2 - GRAVITY_M_S2 * tilt
+
+    def step(self, now_s: float, dt_s: float) -> TrueState:
+        self._target_m += self._cruise_m_s * dt_s
+        self._at_m += self._velocity_m_s * dt_s + self._acceleration_m_s2 * dt_s**2 / 2
+        self._velocity_m_s += self._acceleration_m_s2 * dt_s
+        lat_deg, lon_deg = beside(self._home.lat_deg, self._home.lon_deg, self._at_m)
+        roll_deg, pitch_deg = tilt_for(self._acceleration_m_s2, self._heading_deg)
+        return TrueState(
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            alt_m=(self._home.alt_m or 0.0) + self._height_m,
+            height_m=self._height_m,
+            velocity_m_s=self._velocity_m_s,
+            acceleration_m_s2=self._acceleration_m_s2,
+            roll_deg=roll_deg,
+            pitch_deg=pitch_deg,
+            heading_deg=self._heading_deg,
+            t_s=now_s,
+        )
 
 
 class AlongTrack(Motion):
@@ -115,6 +172,19 @@ def truth_at(track: FlownTrack, t_s: float) -> TrueState:
         **{name: _between(angle, shorter_deg(getattr(ahead, name) - angle), share) for name, angle in angles.items()},
         t_s=t_s,
     )
+
+
+def tilt_for(acceleration_m_s2: complex, heading_deg: float) -> tuple[float, float]:
+    """Return the roll and pitch in degrees of a vehicle that only thrusts along its vertical axis, and accelerates
+    horizontally by this much (east + 1j * north) at constant height."""
+    ahead = acceleration_m_s2 * cmath.rect(1.0, math.radians(heading_deg))  # 1j * forward + right
+    thrust_m_s2 = math.hypot(GRAVITY_M_S2, abs(acceleration_m_s2))
+    roll = math.asin(ahead.real / thrust_m_s2)
+    return math.degrees(roll), -math.degrees(math.atan2(ahead.imag, GRAVITY_M_S2))
+
+
+def _limited(value: complex, most: float) -> complex:
+    return value * min(1.0, most / max(abs(value), 1e-9))
 
 
 def _between(value: float, change: float, share: float) -> float:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 
 from edgevpr.lab.simulate.firmware import Firmware
-from edgevpr.lab.simulate.motion import TrueState
-from edgevpr.lab.simulate.sensors import FIX_3D, NO_FIX, NOTHING, PositionMeasurement
+from edgevpr.lab.simulate.motion import GRAVITY_M_S2, TrueState, tilt_for
+from edgevpr.lab.simulate.sensors import NO_FIX, NOTHING, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 Report = Callable[[Firmware], Message | None]
@@ -51,10 +51,21 @@ def _position(brain: Firmware) -> Message | None:
 
 
 def _attitude(brain: Firmware) -> Message | None:
-    roll, pitch = math.radians(brain.truth.roll_deg), math.radians(brain.truth.pitch_deg)
-    if math.isnan(roll + pitch):  # the track does not say
+    """The estimated attitude: the true one and, of a vehicle that obeys its estimate, the error of that."""
+    truth = brain.truth
+    roll_deg, pitch_deg = truth.roll_deg, truth.pitch_deg
+    if brain.tilt:
+        roll_deg, pitch_deg = tilt_for(truth.acceleration_m_s2 + GRAVITY_M_S2 * brain.tilt, truth.heading_deg)
+    if math.isnan(roll_deg + pitch_deg):  # the track does not say
         return None
-    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, yaw_of(brain.truth), 0, 0, 0)
+    roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
+    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, yaw_of(truth), 0, 0, 0)
+
+
+def _felt(brain: Firmware) -> Message:
+    """The specific force, in milli-g: a vehicle without drag feels its thrust, along its vertical axis."""
+    felt_g = math.hypot(1.0, abs(brain.truth.acceleration_m_s2) / GRAVITY_M_S2)
+    return mavlink.MAVLink_scaled_imu_message(_boot_ms(brain), 0, 0, -round(1000 * felt_g), *[0] * 6)
 
 
 def _second_gps(brain: Firmware) -> Message | None:
@@ -67,7 +78,7 @@ def _gps(last: PositionMeasurement, brain: Firmware) -> dict[str, int]:
     if last is NOTHING or not brain.motion.is_known:  # a second GPS that is silent
         lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
         return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
-    east_m_s, north_m_s = last.velocity_m_s.real, last.velocity_m_s.imag
+    velocity_m_s = last.velocity_m_s or 0j
     return {
         "time_usec": round(last.t_s * 1e6),
         "fix_type": last.fix_type,
@@ -76,11 +87,12 @@ def _gps(last: PositionMeasurement, brain: Firmware) -> dict[str, int]:
         "alt": round(last.alt_m * 1e3),
         "eph": 121,
         "epv": 200,
-        "vel": min(_UNKNOWN_16 - 1, round(abs(last.velocity_m_s) * 100)),
-        "cog": round(math.degrees(math.atan2(east_m_s, north_m_s)) % 360 * 100) % 36_000,
-        "satellites_visible": 10 if last.fix_type >= FIX_3D else 3,
+        "vel": min(_UNKNOWN_16 - 1, round(abs(velocity_m_s) * 100)),
+        "cog": round(math.degrees(math.atan2(velocity_m_s.real, velocity_m_s.imag)) % 360 * 100) % 36_000,
+        "satellites_visible": last.satellites,
         "h_acc": round(last.sd_m * 1e3),
         "v_acc": round(last.sd_m * 1e3),
+        "vel_acc": round(last.speed_sd_m_s * 1e3),
     }
 
 
@@ -112,13 +124,7 @@ REPORTS: dict[int, Report] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: lambda brain: mavlink.MAVLink_gps_raw_int_message(
         **_gps(brain.receivers.first, brain)
     ),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda brain: mavlink.MAVLink_scaled_imu_message(
-        _boot_ms(brain),
-        0,
-        0,
-        -1000,
-        *[0] * 6,  # milli-g: it hangs still
-    ),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: _felt,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _position,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,

@@ -7,10 +7,11 @@ from freeflight import Piloted
 
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
-from edgevpr.lab.simulate.motion import Motion
+from edgevpr.lab.simulate.motion import GRAVITY_M_S2, Hover, Motion, TrueState, tilt_for
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.flight.path import over_ground
 
 ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
 NOT_NOW, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
@@ -147,6 +148,116 @@ def test_without_any_aid_ardupilot_loses_the_position_after_seven_seconds_and_ai
     assert "GLOBAL_POSITION_INT" not in {each.get_type() for each in flown.said}, "nobody has asked for it"
 
 
+def gps_input(place: TrueState, north_m: float = 0.0, satellites: int = 6, fix_type: int = 3, accuracy_m: float = 1.0):
+    velocity_m_s = place.velocity_m_s
+    return mavlink.MAVLink_gps_input_message(
+        time_usec=0,
+        gps_id=1,
+        ignore_flags=0,
+        time_week_ms=0,
+        time_week=0,
+        fix_type=fix_type,
+        lat=round((place.lat_deg + north_m / 111_195) * 1e7),
+        lon=round(place.lon_deg * 1e7),
+        alt=place.alt_m,
+        hdop=1,
+        vdop=1,
+        vn=velocity_m_s.imag,
+        ve=velocity_m_s.real,
+        vd=0,
+        speed_accuracy=0.3,
+        horiz_accuracy=accuracy_m,
+        vert_accuracy=1,
+        satellites_visible=satellites,
+    )
+
+
+def beside_own(seconds: float = 25.0, north_m: float = 1.0, told=None, **parameters: float) -> Flown:
+    """Fly a copter for so long beside our positions, which are `north_m` off, with a plain 3D fix of its receiver."""
+    flown = Flown("arducopter", SIM_GPS1_TYPE=5, GPS2_TYPE=14, **parameters).in_air()
+    for _ in range(round(seconds * 10)):
+        flown.tell(gps_input(flown.truth, north_m, **(told or {})))
+        flown.wait(0.1)
+    return flown
+
+
+@pytest.mark.parametrize(
+    ("switch", "satellites", "seconds", "is_ours"),
+    [
+        (1, 7, 25, False),
+        (1, 6, 25, False),
+        (1, 5, 17, False),
+        (1, 5, 25, True),
+        (1, 4, 4, True),
+        (0, 0, 25, False),
+        (4, 0, 25, False),
+    ],
+)
+def test_primary_receiver_is_that_with_more_satellites(switch, satellites, seconds, is_ours):
+    flown = beside_own(1, GPS_AUTO_SWITCH=switch)
+    flown.controller.brain.receivers._switched_s = flown.now_s
+    flown.controller.set("SIM_GPS1_NUMSATS", satellites)
+    for _ in range(round(seconds * 10) + 15):
+        flown.tell(gps_input(flown.truth, 1.0))
+        flown.wait(0.1)
+    uses_ours = flown.controller.brain.receivers.primary is flown.controller.brain.receivers.second
+    assert uses_ours == is_ours
+
+
+def test_primary_receiver_with_better_fix_wins_at_once():
+    flown = beside_own(1, told={"fix_type": 4})
+    assert flown.controller.brain.receivers.primary.fix_type == 4
+    assert flown.wait(5).controller.brain.receivers.primary.fix_type == 3, "ours is silent"
+
+
+@pytest.mark.parametrize(("primary", "switch"), [(1, 0), (1, 4)])
+def test_gps_primary_chooses_receiver(primary, switch):
+    assert beside_own(20, GPS_PRIMARY=primary, GPS_AUTO_SWITCH=switch).error_m == pytest.approx(1.0, abs=0.1)
+    assert beside_own(20, GPS_PRIMARY=0, GPS_AUTO_SWITCH=switch).error_m < 0.1
+
+
+def test_receivers_are_blended_by_their_accuracies():
+    assert beside_own(20, told={"accuracy_m": 0.3}, GPS_AUTO_SWITCH=2).error_m == pytest.approx(0.5, abs=0.1)
+    assert beside_own(20, told={"accuracy_m": 3.0}, GPS_AUTO_SWITCH=2).error_m == pytest.approx(0.25, abs=0.1)
+    assert beside_own(20, told={"fix_type": 1}, GPS_AUTO_SWITCH=2).error_m < 0.1
+
+
+def hovering(steps: int, told, **parameters: float) -> tuple[FlightController, Hover]:
+    """Let a copter that obeys its estimate hover for so many tenths of a second, and be `told` a message in each."""
+    motion = Hover(ORIGIN, 60.0)
+    controller = FlightController("arducopter", motion, gps=True)
+    for name, value in parameters.items():
+        controller.set(name, value)
+    for number in range(steps):
+        controller.advance(number / 10)
+        if message := told(controller):
+            controller.hear(message)
+    return controller, motion
+
+
+def test_vehicle_that_obeys_its_estimate_is_flown_away_by_wrong_positions():
+    setup = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}
+    controller, motion = hovering(600, lambda controller: gps_input(controller.brain.truth, 10.0), **setup)
+    assert (motion.away_m, controller.error_m) == pytest.approx((10.0, 10.0), abs=0.5)
+    controller, motion = hovering(600, lambda controller: None, **setup)
+    assert motion.away_m < 0.5
+
+
+def test_vehicle_that_is_told_its_own_estimate_runs_away_with_a_tilt():
+    def own(controller):
+        brain = controller.brain
+        message = gps_input(brain.truth, accuracy_m=5.0)
+        velocity_m_s = brain.velocity_m_s
+        message.lat, message.lon = (round(each * 1e7) for each in brain.place)
+        message.ve, message.vn = velocity_m_s.real, velocity_m_s.imag
+        return message if brain.now_s > 20 else None
+
+    controller, motion = hovering(950, own, GPS2_TYPE=14, GPS_PRIMARY=1, GPS_AUTO_SWITCH=4)
+    assert 100 < motion.away_m < 500
+    assert controller.error_m == pytest.approx(motion.away_m, rel=0.1)
+    assert 0.3 < math.degrees(abs(controller.brain.tilt)) < 5
+
+
 def odometry(north_m: float, frame: int = 20, quality: int = 0):
     return mavlink.MAVLink_odometry_message(
         0, frame, 12, north_m, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.01] * 21, [0.01] * 21, quality=quality
@@ -268,3 +379,21 @@ def test_what_is_for_another_is_not_answered():
     flown = Flown("arducopter")
     assert flown.tell(mavlink.MAVLink_command_long_message(2, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []
     assert flown.tell(mavlink.MAVLink_command_long_message(1, 197, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []
+
+
+@pytest.mark.parametrize("acceleration_m_s2", [3 + 1j, -2j, 0j])
+def test_accelerometers_and_attitude_show_the_acceleration_and_the_tilt(acceleration_m_s2):
+    controller = FlightController("px4-copter", Hover(ORIGIN, 60.0), gps=True)
+    brain, tilt = controller.brain, 0.02 + 0.01j
+    roll_deg, pitch_deg = tilt_for(acceleration_m_s2, 30.0)
+    brain.truth = TrueState(
+        lat_deg=47.0, lon_deg=8.0, alt_m=0.0, roll_deg=roll_deg, pitch_deg=pitch_deg, heading_deg=30.0,
+        acceleration_m_s2=acceleration_m_s2,
+    )  # fmt: skip
+    for error in (0j, tilt):
+        brain.estimator._state[2] = error
+        imu, attitude = (controller.reports[number](brain) for number in (26, 30))
+        force_m_s2 = (imu.xacc * GRAVITY_M_S2 / 1000, imu.yacc * GRAVITY_M_S2 / 1000, imu.zacc * GRAVITY_M_S2 / 1000)
+        angles_deg = (math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw))
+        felt = complex(*over_ground(force_m_s2, *angles_deg))
+        assert felt == pytest.approx(acceleration_m_s2 + GRAVITY_M_S2 * error, abs=0.05)
