@@ -1,0 +1,170 @@
+"""A closed loop without sockets, threads and real time: a simulated autopilot whose vehicle obeys its estimate, and the
+conversation and the navigator of edgevpr beside it, in steps of 20 ms. The same flight without edgevpr is its control.
+"""
+
+import numpy as np
+from air import match_at
+from fakes import FakeClock
+
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Frame, Position
+from edgevpr.frames.level import Levelled, View
+from edgevpr.lab.simulate.controller import STEP_S, FlightController
+from edgevpr.lab.simulate.generated import ORIGIN
+from edgevpr.lab.simulate.motion import Hover, from_to
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.messages import Health
+from edgevpr.mavlink.wire import PacketReader, mavlink
+from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.stride import Stride
+
+HEIGHT_M = 60.0
+_FRAME_S, _LATE_S = 1.0, 0.5  # from frame to frame, and from a frame to its recognition
+_MATCH_SD_M, _STRIDE_SD_M = 1.0, 0.2
+_VIEW = View(up_deg=0.0, footprint_m=60.0, aside=(0.0, 0.0))
+_PICTURE = np.zeros((8, 8), np.uint8)
+
+
+class ClosedLoop:
+    """A flight of a `vehicle` of the flight controller with its `parameters`, that hovers or cruises by a velocity.
+    While it `matches`, every frame is recognised, `map_off_m` (east + 1j * north) beside the truth. `stride_scale` is
+    by what strides are too long. `away_m` and `error_m` are, step by step, the true distance from the target, and that
+    of the autopilot's estimate from the truth; `sent` is all that edgevpr sends, with the times."""
+
+    def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, **parameters):
+        self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
+        self.controller = FlightController(vehicle, self.motion, gps=True)
+        self.controller.brain.is_armed = True
+        for name, value in parameters.items():
+            self.controller.set(name, value)
+        self.matches, self.map_off_m, self.stride_scale = matches, 0j, 1.0
+        self.away_m, self.error_m, self.sent = [], [], []
+        self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
+        self.navigator = Navigator(1.0, _FRAME_S)
+        settings = LinkSettings(clock=self._clock, listener=self.navigator)
+        self.conversation = Conversation(settings, self._clock) if edgevpr else None
+        if self.conversation:
+            self.conversation.want_position()
+            self.conversation.offer(tuple(Wish))
+        self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
+        self._waiting, self._last_frame = [], None
+
+    @property
+    def now_s(self) -> float:
+        return self._steps * STEP_S
+
+    @property
+    def brain(self):
+        return self.controller.brain
+
+    def set(self, name, value):
+        self.controller.set(name, value)
+        return self
+
+    def fly(self, seconds):
+        for _ in range(round(seconds / STEP_S)):
+            self._steps += 1
+            self._clock.now_s = 1000.0 + self.now_s
+            said = self.controller.advance(self.now_s + STEP_S / 2)
+            self.away_m.append(self.motion.away_m)
+            self.error_m.append(self.controller.error_m)
+            if self.conversation:
+                self._exchange(said)
+                if self._steps % round(_FRAME_S / STEP_S) == 0:
+                    self._take_frame()
+                if self._waiting and self._waiting[0].frame.t_mono_s <= self._clock.now_s - _LATE_S:
+                    self._recognise(self._waiting.pop(0))
+        return self
+
+    def worst_m(self, since_s):
+        """Return the largest distance from the target, and of the estimate from the truth, since a time."""
+        first = round(since_s / STEP_S)
+        return max(self.away_m[first:]), max(self.error_m[first:])
+
+    def command(self, number, *values):
+        """Send a command to the autopilot."""
+        padded = [*values, *[0] * (7 - len(values))]
+        self._exchange(self.controller.hear(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded)))
+
+    def ask(self, number, *values):
+        """Let the ground station send a command to edgevpr; return the result."""
+        padded = [*values, *[0] * (7 - len(values))]
+        command = mavlink.MAVLink_command_long_message(1, 197, number, 0, *padded)
+        self.conversation.hear(command.pack(mavlink.MAVLink(None, 255, 190)), self._clock.now_s, None)
+        first = len(self.sent)
+        self._exchange([])
+        return next(each.result for _, each in self.sent[first:] if each.get_type() == "COMMAND_ACK")
+
+    def positions_sent(self, since_s):
+        """Return the times of all positions sent since a time, of every channel."""
+        return [t_s for t_s, message in self.sent if t_s > since_s and _is_position(message)]
+
+    def _exchange(self, said):
+        """Let edgevpr hear messages, and the autopilot what it sends, until neither has more to say."""
+        conversation, now_s = self.conversation, self._clock.now_s
+        if not conversation:
+            return
+        while True:
+            if said:
+                conversation.hear(b"".join(map(self._pack, said)), now_s, None)
+            said, sending = [], []
+            while packet := conversation.next_packet():
+                sending += [packet[1]] if packet[1] else []
+                for message in self._reader.feed(packet[0]):
+                    self.sent.append((self.now_s, message))
+                    said += self.controller.hear(message)
+            conversation.note_departed(sending)
+            if not said:
+                break
+        if self._steps % round(1 / STEP_S) == 0:
+            conversation.set_health(Health.ACTIVE)
+            conversation.tell_of_answers()
+
+    def _pack(self, message):
+        packet = message.pack(self._packer)
+        self._packer.seq = (self._packer.seq + 1) % 256
+        return packet
+
+    def _take_frame(self):
+        truth, t_s = self.brain.truth, self._clock.now_s
+        vehicle = self.conversation.vehicle_at(t_s)
+        if self.matches:
+            # A camera that is levelled by an attitude that is wrong puts the place beside the true one.
+            off_m = self.map_off_m + HEIGHT_M * self.brain.tilt + complex(*self._rng.normal(0, _MATCH_SD_M, 2))
+            place = Position(*moved(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
+            event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW)
+        else:
+            frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
+            event = Recognition(frame=frame, vehicle=vehicle, picture=Levelled(_PICTURE, None, _VIEW))
+        event.stride = self._stride(truth, t_s)
+        self._waiting.append(event)
+
+    def _stride(self, truth, t_s):
+        before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)
+        if before is None:
+            return None
+        was, from_s, tilt = before
+        moved_m = self.stride_scale * from_to(was.lat_deg, was.lon_deg, truth.lat_deg, truth.lon_deg)
+        moved_m += HEIGHT_M * (self.brain.tilt - tilt) + complex(*self._rng.normal(0, _STRIDE_SD_M, 2))
+        return Stride(from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100)
+
+    def _recognise(self, event):
+        if not event.accepted:
+            self.navigator.hear_frame(event)
+            return
+        fix = self.navigator.advise(event, self._clock.now_s).fix
+        if fix:
+            self.conversation.send_fix(fix)
+
+
+def _is_position(message):
+    match message.get_type():
+        case "GPS_INPUT":
+            return message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
+        case "ODOMETRY" | "GLOBAL_POSITION_SENSOR":
+            return True
+        case "COMMAND_INT":
+            return message.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+    return False
