@@ -8,7 +8,16 @@ behaviour of a copter without GPS was observed in ArduPilot's own simulator.
 
 import math
 
-from edgevpr.lab.simulate.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, Firmware
+from edgevpr.lab.simulate.firmware import (
+    ARDUPILOT,
+    ARDUPILOT_PLANE,
+    DENIED,
+    FAILED,
+    GATE_SD,
+    OK,
+    POSITION_NOISE_M,
+    Firmware,
+)
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.sensors import FIX_3D, Origin, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
@@ -17,7 +26,6 @@ _DEAD_RECKONING_S = 1.0
 _POSITION_LOST_S, _POSITION_LOST_WITH_VELOCITY_S = 7.0, 10.0
 _AIDING_LOST_S = 15.0
 _OLDEST_FIX_S = 5.0
-_POSITION_NOISE_M = 0.5  # EK3_POSNE_M_NSE
 _ALIGNED_AFTER_S, _AGAIN_AFTER_S = 5.0, 0.5  # of GPS, at the start and later; a real one needs half a minute
 # The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
@@ -37,6 +45,8 @@ class ArduPilot(Firmware):
         super().__init__(kind, motion, {**ARDUPILOT, **(ARDUPILOT_PLANE if kind == "plane" else {})})
         self._source_set = 1
         self._is_aiding = False
+        self._passed_s = -math.inf  # when a measured position was last within the gate
+        self._used: PositionMeasurement | None = None
         self._good_since_s, self._aligned_after_s = math.inf, _ALIGNED_AFTER_S
         self._frozen: tuple[float, float] | None = None  # the position that is reported after aiding
 
@@ -52,7 +62,7 @@ class ArduPilot(Firmware):
         self.estimator.predict(dt_s)
         if not self._is_aiding:
             self._wait_for_aiding(measured)
-        elif measured is not None and measured != before and self._fuse(measured, _POSITION_LOST_WITH_VELOCITY_S):
+        elif measured is not None and measured != before and self._fuse(measured):
             self._learn_wind(wind_m_s)
         is_aided = measured is not None and self.now_s - measured.t_s < _DEAD_RECKONING_S
         if self._is_aiding and not is_aided:
@@ -83,7 +93,7 @@ class ArduPilot(Firmware):
         # A processing time that is not finite counts as 0, as ArduPilot casts it.
         age_s = min(max(command.param2, 0.0), _OLDEST_FIX_S) if math.isfinite(command.param2) else 0.0
         sd_m = 0.0 if math.isnan(command.param3) else command.param3
-        self._reset_to(command.x / 1e7, command.y / 1e7, max(sd_m, _POSITION_NOISE_M), age_s)
+        self._reset_to(command.x / 1e7, command.y / 1e7, max(sd_m, POSITION_NOISE_M), age_s)
         return OK
 
     def set_origin(self, at: Origin) -> bool:
@@ -106,6 +116,23 @@ class ArduPilot(Firmware):
         primary = self.receivers.primary
         return primary if self._source == _GPS and primary.fix_type >= FIX_3D else None
 
+    def _fuse(self, measured: PositionMeasurement) -> bool:
+        """Fuse a measured position that is within the gate, `GATE_SD` standard deviations of the estimate, and its
+        velocity. Reset the estimate to one outside of the gate if none was within it for ten seconds. Returns True in
+        both cases."""
+        sd_m = max(POSITION_NOISE_M, measured.sd_m) * measured.noise_scale
+        innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg) + self.velocity_m_s * measured.age_s
+        self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, sd_m))
+        if self.test_ratio <= 1:
+            self.estimator.correct(0, innovation_m, sd_m)
+        elif self.now_s - self._passed_s > _POSITION_LOST_WITH_VELOCITY_S:
+            self._reset_to(measured.lat_deg, measured.lon_deg, sd_m, measured.age_s)
+        else:
+            return False
+        self._fuse_velocity(measured)
+        self._passed_s = self.now_s
+        return True
+
     def _wait_for_aiding(self, measured: PositionMeasurement | None) -> None:
         if measured is None:
             self._good_since_s = math.inf
@@ -117,5 +144,5 @@ class ArduPilot(Firmware):
     def _start_aiding(self, at: Origin, passed_s: float) -> None:
         self._is_aiding, self._passed_s, self._aligned_after_s = True, passed_s, _AGAIN_AFTER_S
         self.set_origin(at)
-        self._reset_to(at[0], at[1], _POSITION_NOISE_M)
+        self._reset_to(at[0], at[1], POSITION_NOISE_M)
         self.estimator.velocity_error_m_s = 0j

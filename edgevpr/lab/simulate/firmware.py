@@ -14,7 +14,8 @@ from edgevpr.lab.simulate.motion import Motion, beside, from_to
 from edgevpr.lab.simulate.sensors import ExternalNavigation, Origin, PositionMeasurement, Receivers
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
-GATE_SD = 5.0  # standard deviations that an innovation may have; ArduPilot: EK3_POS_I_GATE, EK3_VEL_I_GATE
+# Standard deviations that an innovation may have: EK3_POS_I_GATE, EK3_VEL_I_GATE, EKF2_GPS_P_GATE
+GATE_SD = 5.0
 OK: int = mavlink.MAV_RESULT_ACCEPTED
 FAILED: int = mavlink.MAV_RESULT_FAILED
 DENIED: int = mavlink.MAV_RESULT_DENIED
@@ -22,7 +23,7 @@ NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0}
 # EK3_POSNE_M_NSE and EK3_VELNE_M_NSE, EKF2_GPS_P_NOISE and EKF2_GPS_V_NOISE: no measurement counts for better.
-_POSITION_NOISE_M, _VELOCITY_NOISE_M_S = 0.5, 0.3
+POSITION_NOISE_M, _VELOCITY_NOISE_M_S = 0.5, 0.3
 # Of a vehicle that obeys its estimate. With it an unaided copter is 120 m away after 55 s and 330 m after 75 s, as real
 # ones that were told their own estimate.
 _GYRO_ERROR_RAD_S = math.radians(0.02)
@@ -55,8 +56,6 @@ class Firmware(ABC):
         self.test_ratio = 0.0
         self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
-        self._passed_s = -math.inf  # when a measured position was last within the gate
-        self._used: PositionMeasurement | None = None
         self._wind_m_s = 0j  # as the filter has learnt it
 
     def step(self, dt_s: float) -> None:
@@ -133,23 +132,6 @@ class Firmware(ABC):
         """Set the estimate to a point that was measured `age_s` seconds ago, plus the distance flown since."""
         error_m = self.error_m + self._innovation_m(lat_deg, lon_deg) + self.velocity_m_s * age_s
         self.estimator.reset_position(error_m, sd_m)
-
-    def _fuse(self, measured: PositionMeasurement, reset_after_s: float) -> bool:
-        """Fuse a measured position that is within the gate, `GATE_SD` standard deviations of the estimate, and its
-        velocity. Reset the estimate to one outside of the gate if none was within it for `reset_after_s` seconds.
-        Returns True in both cases."""
-        sd_m = max(_POSITION_NOISE_M, measured.sd_m) * measured.noise_scale
-        innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg) + self.velocity_m_s * measured.age_s
-        self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, sd_m))
-        if self.test_ratio <= 1:
-            self.estimator.correct(0, innovation_m, sd_m)
-        elif self.now_s - self._passed_s > reset_after_s:
-            self._reset_to(measured.lat_deg, measured.lon_deg, sd_m, measured.age_s)
-        else:
-            return False
-        self._fuse_velocity(measured)
-        self._passed_s = self.now_s
-        return True
 
     def _fuse_velocity(self, measured: PositionMeasurement, gate_sd: float = GATE_SD) -> None:
         """Fuse a measured velocity, if there is one within the gate."""

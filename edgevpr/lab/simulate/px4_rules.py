@@ -11,7 +11,7 @@ other is not active: a GPS that comes back while ours is active is refused.
 import math
 from dataclasses import dataclass
 
-from edgevpr.lab.simulate.firmware import FAILED, NOT_NOW, OK, PX4, Firmware
+from edgevpr.lab.simulate.firmware import FAILED, GATE_SD, NOT_NOW, OK, POSITION_NOISE_M, PX4, Firmware
 from edgevpr.lab.simulate.motion import Motion, beside
 from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
@@ -21,7 +21,6 @@ _RESET_AFTER_S = 7.0  # reset_timeout_max
 _SILENT_AFTER_S, _VISION_SILENT_AFTER_S = 5.0, 0.4  # of message 296, and of ODOMETRY
 _CHECKS_PASS_AFTER_S = 1.0  # since the last GPS check that failed, in flight
 _VISION_RESETS = 5  # _nb_ev_pos_reset_available
-_GPS_NOISE_M, _GPS_GATE_SD = 0.5, 5.0  # EKF2_GPS_P_NOISE, EKF2_GPS_P_GATE
 _GPS_POSITION, _GPS_VELOCITY = 1, 4  # bits of EKF2_GPS_CTRL
 _BIAS_FOLLOWS_S = 10.0
 _OLDEST_FIX_S = 15.0
@@ -97,9 +96,9 @@ class Px4(Firmware):
         self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)
         if control & _GPS_VELOCITY and not self._is_gps_faulty:
             self._fuse_velocity(measured, math.inf)  # nothing else measures it, so one that contradicts resets it
-        sd_m = max(_GPS_NOISE_M, measured.sd_m)
+        sd_m = max(POSITION_NOISE_M, measured.sd_m)
         innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg)
-        self.test_ratio = abs(innovation_m) / (_GPS_GATE_SD * math.hypot(self.sd_m, sd_m))
+        self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, sd_m))
         if not control & _GPS_POSITION:
             return False
         if self.test_ratio <= 1:

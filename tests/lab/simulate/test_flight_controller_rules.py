@@ -364,6 +364,47 @@ def test_px4_follows_a_jump_of_message_296_after_seven_seconds():
     assert flown.error_m == pytest.approx(300, abs=30)
 
 
+def sends(flown: Flown, seconds: float, north_m: float, **how) -> Flown:
+    for _ in range(round(seconds * 10)):
+        flown.tell(sensed(flown, north_m, **how))
+        flown.wait(0.1)
+    return flown
+
+
+def test_px4_refuses_gps_that_contradicts_while_ours_is_active_and_resets_to_it_when_ours_is_silent():
+    flown = sends(lost("px4-copter", wind_m_s=0).wait(10), 10, north_m=100.0, eph_m=1.0)
+    assert flown.error_m == pytest.approx(100, abs=10)
+    flown.controller.set("SIM_GPS1_ENABLE", 1)
+    sends(flown, 40, north_m=100.0, eph_m=1.0)
+    assert flown.error_m == pytest.approx(100, abs=10)
+    assert flown.flags & mavlink.ESTIMATOR_GPS_GLITCH
+    assert flown.wait(4).error_m > 50, "it waits five seconds for ours"
+    assert flown.wait(3).error_m < 1
+    assert not flown.flags & mavlink.ESTIMATOR_GPS_GLITCH
+
+
+def test_px4_beside_good_gps_refuses_ours_that_contradict_and_fuses_those_within_the_gate():
+    flown = sends(Flown("px4-copter").in_air(), 20, north_m=100.0, eph_m=1.0)
+    assert flown.error_m < 0.1
+    assert 0.05 < sends(flown, 20, north_m=2.0, eph_m=1.0).error_m < 1
+
+
+def test_px4_stops_to_fuse_a_receiver_that_is_flagged_as_spoofed_after_seven_seconds():
+    flown, fused = Flown("px4-copter").in_air(), mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+    flown.controller.set("SIM_GPS_SPOOF", 1)
+    assert flown.wait(6).flags & fused
+    assert not flown.wait(3).flags & fused
+    flown.controller.set("SIM_GPS_SPOOF", 0)
+    assert flown.wait(2).flags & fused
+
+
+def test_px4_takes_no_position_from_gps_while_its_parameter_forbids_it():
+    flown, fused = Flown("px4-copter").in_air(), mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+    for control, is_fused in ((0, False), (7, True), (4, False)):
+        flown.controller.set("EKF2_GPS_CTRL", control)
+        assert bool(flown.wait(2).flags & fused) == is_fused
+
+
 def test_px4_says_integers_byte_by_byte():
     flown = Flown("px4-copter")
     read = mavlink.MAVLink_param_request_read_message(1, 1, b"SER_TEL2_BAUD", -1)

@@ -3,25 +3,36 @@
 import pytest
 from closed_loop import ClosedLoop
 
+from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.wire import mavlink
+
 pytestmark = pytest.mark.slow
 
 WATCHED_S, SETTLED_S = 120.0, 40.0
 NO_WORSE_M = 3.0
+GPS_AGAIN_S = 10.0
 GPS_INPUT = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a plain 3D one, as ours is
+ODOMETRY = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}
+SENSOR = {"EKF2_AGP0_CTRL": 1}
+VISION = {"EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 1}
 
+px4_channels = pytest.mark.parametrize("parameters", [SENSOR, VISION], ids=["message 296", "ODOMETRY"])
 with_and_without_matches = pytest.mark.parametrize("matches", [True, False], ids=["matches", "no matches"])
 
 
-def assert_no_worse(vehicle, event, *, matches=True, **parameters):
-    """Fly twice, with and without edgevpr, and let an `event` happen to the autopilot in each flight."""
+def assert_no_worse(vehicle, event, *, watched_s=WATCHED_S, **setup):
+    """Fly twice, with and without edgevpr, let an `event` happen to the autopilot in each flight, and compare them from
+    its end. Returns the flight with edgevpr."""
     worst = []
     for edgevpr in (False, True):
-        flight = ClosedLoop(vehicle, edgevpr=edgevpr, matches=matches, **parameters).fly(SETTLED_S)
+        flight = ClosedLoop(vehicle, edgevpr=edgevpr, **setup).fly(SETTLED_S)
         event(flight)
-        worst.append(flight.fly(WATCHED_S).worst_m(SETTLED_S))
+        since_s = flight.now_s
+        worst.append(flight.fly(watched_s).worst_m(since_s))
     (alone_away_m, alone_error_m), (away_m, error_m) = worst
     worse_m = {"away": round(away_m - alone_away_m, 1), "estimate": round(error_m - alone_error_m, 1)}
     assert max(worse_m.values()) <= NO_WORSE_M, worse_m
+    return flight
 
 
 @with_and_without_matches
@@ -31,3 +42,88 @@ def test_receiver_with_few_satellites_is_not_outbid(satellites, matches):
         flight.set("SIM_GPS1_NUMSATS", satellites)
 
     assert_no_worse("arducopter", lose_satellites, matches=matches, **GPS_INPUT)
+
+
+@with_and_without_matches
+def test_source_set_with_odometry_does_not_run_away_beside_gps(matches):
+    def choose_second_set(flight):
+        if flight.conversation:
+            flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2)
+
+    assert_no_worse("arducopter", choose_second_set, matches=matches, **ODOMETRY)
+
+
+@with_and_without_matches
+@pytest.mark.parametrize(
+    "parameters", [{"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, {"GPS_AUTO_SWITCH": 2}], ids=["primary", "blended"]
+)
+def test_receiver_of_ours_in_use_beside_gps_does_not_run_away(parameters, matches):
+    assert_no_worse("arducopter", lambda flight: None, matches=matches, **GPS_INPUT, **parameters)
+
+
+@px4_channels
+def test_px4_is_on_gps_again_after_flight_over_lower_ground(parameters):
+    """Over ground that falls away, where strides are 1.4 times short: the position that is sent is 140 m off."""
+    flight = ClosedLoop("px4-copter", matches=False, velocity_m_s=10j, **parameters).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0)
+    for second in range(50):
+        flight.stride_scale = 1 / (1 + 0.4 * min(1.0, second / 20))
+        flight.fly(1)
+    back_s = flight.set("SIM_GPS1_ENABLE", 1).fly(GPS_AGAIN_S).now_s
+    _, error_m = flight.fly(20).worst_m(back_s)
+    assert error_m <= NO_WORSE_M
+    assert not flight.positions_sent(back_s)
+
+
+@px4_channels
+@pytest.mark.parametrize("map_off_m", [8, 20])
+def test_px4_is_on_gps_again_after_a_test_without(map_off_m, parameters):
+    def fly_without(flight):
+        flight.map_off_m = map_off_m
+        flight.set("EKF2_GPS_CTRL", 0).fly(20)
+        flight.set("EKF2_GPS_CTRL", 7).fly(GPS_AGAIN_S)
+
+    assert_no_worse("px4-copter", fly_without, watched_s=60.0, **parameters)
+
+
+@px4_channels
+@with_and_without_matches
+def test_px4_is_on_gps_again_after_receiver_is_flagged_as_spoofed(matches, parameters):
+    def flag(flight):
+        flight.set("SIM_GPS_SPOOF", 1).fly(20)
+        flight.set("SIM_GPS_SPOOF", 0).fly(GPS_AGAIN_S)
+
+    flight = assert_no_worse("px4-copter", flag, matches=matches, watched_s=60.0, velocity_m_s=10j, **parameters)
+    assert not flight.positions_sent(SETTLED_S + 20 + GPS_AGAIN_S)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "parameters"),
+    [
+        ("px4-copter", SENSOR),
+        ("px4-copter", VISION),
+        ("arducopter", GPS_INPUT),
+        ("arducopter", ODOMETRY),
+        ("arduplane", {"SIM_WIND_SPD": 6}),
+    ],
+)
+def test_paused_flight_sends_no_position_on_any_channel(vehicle, parameters):
+    flight = ClosedLoop(vehicle, **parameters).fly(20)
+    flight.set("SIM_GPS1_ENABLE", 0).set("SIM_WIND_SPD", 0)
+    if parameters == ODOMETRY:
+        flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2)
+    paused_s = flight.fly(20).now_s
+    assert flight.positions_sent(paused_s - 10)
+    assert flight.ask(mavlink.MAV_CMD_USER_1, Wish.PAUSE) == mavlink.MAV_RESULT_ACCEPTED
+    flight.fly(10)
+    assert not flight.positions_sent(paused_s)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "parameters"), [("px4-copter", SENSOR), ("px4-copter", VISION), ("arducopter", GPS_INPUT)]
+)
+def test_map_that_is_off_moves_no_aircraft_with_good_gps(vehicle, parameters):
+    def shift_map(flight):
+        flight.map_off_m = 8
+
+    assert_no_worse(vehicle, shift_map, watched_s=60.0, **parameters)
