@@ -24,8 +24,8 @@ UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0}
 # EK3_POSNE_M_NSE and EK3_VELNE_M_NSE, EKF2_GPS_P_NOISE and EKF2_GPS_V_NOISE: no measurement counts for better.
 POSITION_NOISE_M, _VELOCITY_NOISE_M_S = 0.5, 0.3
-# Of a vehicle that obeys its estimate. With it an unaided copter is 120 m away after 55 s and 330 m after 75 s, as real
-# ones that were told their own estimate.
+# Of a vehicle that obeys its estimate. With it a copter whose autopilot is sent its own estimate is 119 m away after
+# 55 s and 285 m after 75 s; real ones were 120 m and 330 m away.
 _GYRO_ERROR_RAD_S = math.radians(0.02)
 _INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter dead-reckons
 _WIND_LEARNT_IN_S = 5.0
