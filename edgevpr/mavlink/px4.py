@@ -35,6 +35,7 @@ class Px4Use:
         self._sent_s, self._is_vision = -math.inf, False
         self._unused_since_s: float | None = None
         self._reports_fusion = False  # before 1.16 the flag is that of a position, of whatever source
+        self._takes_velocity = False
         self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
 
     @property
@@ -66,7 +67,10 @@ class Px4Use:
             self.used, self.unused = self.used + is_used, self.unused + (not is_used)
         if not self._reports_fusion:
             return
-        takes_velocity = math.isfinite(report.vel_ratio) and report.vel_ratio > 0
+        took_velocity = self._takes_velocity
+        self._takes_velocity = takes_velocity = math.isfinite(report.vel_ratio) and report.vel_ratio > 0
+        if takes_velocity and not took_velocity:
+            self._next_try_s = -math.inf
         if receiver is None:
             self._unused_since_s = None
             self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S

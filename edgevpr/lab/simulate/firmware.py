@@ -75,6 +75,11 @@ class Firmware(ABC):
     def flags(self) -> int:
         """Return the flags of the filter's report (EKF_STATUS_REPORT or ESTIMATOR_STATUS)."""
 
+    @property
+    def velocity_ratio(self) -> float:
+        """Innovation of measured velocities to their gate."""
+        return 0.1
+
     @abstractmethod
     def take_fix(self, command: Message) -> int:
         """Process command 43003: correct the position if it is accepted. Returns a MAV_RESULT."""

@@ -17,6 +17,7 @@ from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 _AIDING_GONE_S = 1.0  # no_aid_timeout_max
+_GOOD_RATIO = 0.1
 _RESET_AFTER_S = 7.0  # reset_timeout_max
 _SILENT_AFTER_S, _VISION_SILENT_AFTER_S = 5.0, 0.4  # of message 296, and of ODOMETRY
 _CHECKS_PASS_AFTER_S = 1.0  # since the last GPS check that failed, in flight
@@ -53,6 +54,7 @@ class Px4(Firmware):
 
     def __init__(self, kind: str, motion: Motion) -> None:
         super().__init__(kind, motion, PX4)
+        self._velocity_s = -math.inf  # when the velocity of GPS was last fused
         self._gps, self._ours = _Aid(), _Aid()
         self._is_vision, self._vision_resets = False, _VISION_RESETS  # ours is ODOMETRY
         self._vision_bias_m: complex | None = None  # of ODOMETRY beside GPS
@@ -95,6 +97,7 @@ class Px4(Firmware):
         self._checks_passed_s = self.now_s
         self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)
         if control & _GPS_VELOCITY and not self._is_gps_faulty:
+            self._velocity_s = self.now_s
             self._fuse_velocity(measured, math.inf)  # nothing else measures it, so one that contradicts resets it
         sd_m = max(POSITION_NOISE_M, measured.sd_m)
         innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg)
@@ -115,6 +118,11 @@ class Px4(Firmware):
             self._vision_bias_m = None  # the next ODOMETRY sets it
         gps.is_active, gps.fused_s, self._is_gps_faulty = True, self.now_s, False
         return True
+
+    @property
+    def velocity_ratio(self) -> float:
+        """Innovation of the velocity of GPS to its gate; NaN while none is fused."""
+        return _GOOD_RATIO if self.now_s - self._velocity_s < _AIDING_GONE_S else math.nan
 
     def flags(self) -> int:
         flags: int = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS

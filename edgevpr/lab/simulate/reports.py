@@ -112,7 +112,7 @@ def _version(brain: Firmware) -> Message:
 def _estimator_status(brain: Firmware) -> Message:
     both_m = math.sqrt(2) * brain.sd_m if brain.origin else 0.0
     return mavlink.MAVLink_estimator_status_message(
-        round(brain.now_s * 1e6), brain.flags(), 0.1, brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
+        round(brain.now_s * 1e6), brain.flags(), brain.velocity_ratio, brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
     )
 
 

@@ -193,7 +193,7 @@ class Navigator(Listener):
         with self._lock:
             vehicle, estimate = self._vehicle, self._known(t_s)
             self.output = self._next_output(vehicle, estimate)
-            if estimate is None or vehicle is None or self.output not in (Output.SENDING, Output.RESERVE):
+            if estimate is None or vehicle is None or not self.output.is_sent:
                 self._slew.forget()
                 return None
             self._given_s = t_s
@@ -229,9 +229,11 @@ class Navigator(Listener):
             return Output.CONTRADICTS_GPS
         if self._watch.withdrawn:
             return self._watch.withdrawn
-        receiver = vehicle.gps if uses_gps and self._channel is Channel.GPS_INPUT else None
+        receiver = vehicle.gps if uses_gps else None
         if receiver is None or receiver.sd_m > PLAUSIBLE_SD_M:
             return Output.SENDING
+        if self._channel is not Channel.GPS_INPUT:
+            return Output.BESIDE_GPS
         was_lost = self.output in (Output.SENDING, Output.GPS_BACK)
         if was_lost and receiver.steady_for_s < _TAKEN_BACK_S:
             return Output.GPS_BACK if receiver.steady_for_s >= _BACK_S else Output.SENDING

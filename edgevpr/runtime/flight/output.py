@@ -26,6 +26,7 @@ class Output(Enum):
 
     STARTING = Severity.INFO, "position not known yet"
     SENDING = Severity.WARNING, "no GPS: positions are sent"
+    BESIDE_GPS = Severity.INFO, "positions are sent beside GPS"
     RESERVE = Severity.INFO, "GPS in use: positions are a reserve"
     GPS_BACK = Severity.INFO, "GPS is back: no positions"
     GPS_IN_USE = Severity.INFO, "GPS in use: no positions"
@@ -33,6 +34,10 @@ class Output(Enum):
     CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: none is sent"
     LEADS_AWAY = Severity.WARNING, "autopilot led off GPS: none is sent"
     REFUSED = Severity.WARNING, "autopilot refuses positions: none is sent"
+
+    @property
+    def is_sent(self) -> bool:
+        return self in (Output.SENDING, Output.BESIDE_GPS, Output.RESERVE)
 
     @property
     def severity(self) -> Severity:

@@ -81,7 +81,7 @@ def test_px4_is_on_gps_again_after_a_test_without(map_off_m, parameters):
     def fly_without(flight):
         flight.map_off_m = map_off_m
         flight.set("EKF2_GPS_CTRL", 0).fly(20)
-        flight.set("EKF2_GPS_CTRL", 7).fly(GPS_AGAIN_S)
+        flight.set("EKF2_GPS_CTRL", 7).fly(GPS_AGAIN_S + 5)  # it has to fly back
 
     assert_no_worse("px4-copter", fly_without, watched_s=60.0, **parameters)
 
