@@ -13,13 +13,6 @@ ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
-def located(at_deg, alt_m, relative_m, velocity_cm_s=(0, 0, 0), hdg=9050):
-    """A GLOBAL_POSITION_INT."""
-    where = (round(degrees * 1e7) for degrees in at_deg)
-    fields = (*where, round(alt_m * 1e3), round(relative_m * 1e3), *velocity_cm_s, hdg)
-    return mavlink.MAVLink_global_position_int_message(0, *fields)
-
-
 class Autopilot:
     """Autopilot 7, at 50, 8 unless it says another place; it says what it is told to."""
 
@@ -38,8 +31,12 @@ class Autopilot:
         self.say(beat, **sender)
 
     def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):
-        self.say(located((lat_deg, lon_deg), 312.5, 80.0, velocity_cm_s=(vx, vy, 0), hdg=hdg), **sender)
+        self.locate((lat_deg, lon_deg), 312.5, 80.0, (vx, vy, 0), hdg, **sender)
         return self.vehicle
+
+    def locate(self, at_deg, alt_m, relative_m, velocity_cm_s=(0, 0, 0), hdg=9050, **sender):
+        where = *(round(degrees * 1e7) for degrees in at_deg), round(alt_m * 1e3), round(relative_m * 1e3)
+        self.say(mavlink.MAVLink_global_position_int_message(0, *where, *velocity_cm_s, hdg), **sender)
 
     def gps(self, fix_type=FIX_3D, h_acc=0, message=mavlink.MAVLink_gps_raw_int_message, lat_deg=50.0):
         second = () if message is mavlink.MAVLink_gps_raw_int_message else (0, 0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conversing import Autopilot, located
+from conversing import Autopilot
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
@@ -161,7 +161,7 @@ def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
     ear.state = replace(STATE, alt_m=700.0)
     for off_m in (0.0, 500.0):
         autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, round(1e3 * (584 + off_m))))
-        autopilot.say(located((46.5, 7.5), 700.0 + off_m, 116.0))
+        autopilot.locate((46.5, 7.5), 700.0 + off_m, 116.0)
         assert autopilot.vehicle.height_m == 116.0
         ear.state = replace(STATE, alt_m=autopilot.vehicle.alt_m)
         autopilot.beat()

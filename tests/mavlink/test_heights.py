@@ -1,7 +1,7 @@
 """The height above the ground, of a vehicle that flies over level ground at 584 m above sea level."""
 
 import pytest
-from conversing import ARMED, Autopilot, located
+from conversing import ARMED, Autopilot
 
 from edgevpr.mavlink.wire import mavlink
 
@@ -35,7 +35,7 @@ class Vehicle:
     def report(self, climb_m_s=0.0, vz_cm_s=None):
         alt_m = GROUND_M + self.height_m + self.origin_m
         velocity = 0, 0, round(-100 * climb_m_s) if vz_cm_s is None else vz_cm_s
-        self.autopilot.say(located(self.at_deg, alt_m if any(self.at_deg) else 0.0, alt_m - self.home_m, velocity))
+        self.autopilot.locate(self.at_deg, alt_m if any(self.at_deg) else 0.0, alt_m - self.home_m, velocity)
 
     def _report_terrain(self):
         """As ArduPilot 4.6 does: the height follows home."""
