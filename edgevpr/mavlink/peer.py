@@ -235,7 +235,8 @@ class Autopilot:
         east_m_s, north_m_s = message.vy / 100, message.vx / 100
         above_sea_m = None if is_nowhere else message.alt / 1e3
         altitudes = Altitudes(now_s, above_sea_m, message.relative_alt / 1e3, -message.vz / 100)
-        self.heights.handle_altitudes(altitudes, bool(self.readiness.is_armed), math.hypot(east_m_s, north_m_s))
+        may_fly = self.readiness.is_armed is not False  # None: no heartbeat yet
+        self.heights.handle_altitudes(altitudes, may_fly, math.hypot(east_m_s, north_m_s))
         if is_nowhere:
             self.vehicle = None
             return
