@@ -63,7 +63,8 @@ def _no_flight(file: str) -> tuple[str, str]:
 
 def lines_of(status: dict[str, Any]) -> list[str]:
     """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
-    latency, throttled = _known(", {:.2f} s old", status["latency_s"]), ", the board slows itself down"
+    latency, heat = _known(", {:.2f} s old", status["latency_s"]), _known("{:.0f} °C", status["temperature_c"])
+    hot, throttled = ", hot" * bool(status["hot"]), ", the board slows itself down" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
         ("edgevpr", f"{status['version']}, {status['elapsed_s']:.0f} s of flight, {status['health'].lower()}"),
@@ -72,10 +73,8 @@ def lines_of(status: dict[str, Any]) -> list[str]:
         ("queries", f"{status['queries']}, {status['accepted']} accepted, {status['failed']} failed"),
         ("CPU", f"{status['machine_cpu_share']:.0%} by all programs"),
         ("RAM", f"{status['rss_mb']:.0f} MB, {ram}"),
-        (
-            "heat",
-            (_known("{:.0f} °C", status["temperature_c"]) or "unknown") + (throttled if status["throttled"] else ""),
-        ),
+        ("heat", f"{heat or 'unknown'}{hot}{throttled}"),
+        ("supply", {None: "unknown", False: "fine", True: "under-voltage"}[status["under_voltage"]]),
         ("charge", f"{status['used_mah']:.2f} mAh"),
         ("match", _seen(status["match"], status["t_mono_s"])),
         ("newest", _seen(status["newest"], status["t_mono_s"])),

@@ -1,4 +1,4 @@
-"""Temperature and CPU frequency of the machine, and signs that it slows itself down, for the flight.
+"""Temperature, CPU frequency and supply of the machine, and signs that it slows itself down, for the flight.
 
 A reading opens some files of /sys.
 """
@@ -14,32 +14,41 @@ _UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from h
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
 # Bits of the firmware's answer that tell the present state. 16 places higher they tell it for any time since start.
 _BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
-_SLOWS = 2 | 4 | 8
+_UNDER_VOLTAGE, _SLOWS, _HOT = 1, 2 | 4 | 8, 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalState:
     """State at one reading: `temperature_c` of the hottest CPU sensor, `frequency_mhz` of the fastest cluster of cores
     (None: unknown), `throttled`, True if the machine slows itself down now (None: it cannot tell), and `why`, the signs
-    that it does or did, as text ("": none)."""
+    that it does or did, as text ("": none). `under_voltage`: the supply is too low, or was since the reading before.
+    `hot`: the temperature at which it begins to slow down is reached (None each: it cannot tell)."""
 
     temperature_c: float | None
     frequency_mhz: float | None
     throttled: bool | None
     why: str
+    under_voltage: bool | None = None
+    hot: bool | None = None
 
 
 class ThermalWatch:
-    """Reader of the temperature and frequency sensors, which are searched for once, when it is created."""
+    """Reader of the sensors of temperature, frequency and supply, which are searched for once, when it is created.
+    `hot_c` is the temperature in degrees Celsius that counts as hot (None: `limit_c` of the machine)."""
 
-    def __init__(self, root: Path = Path("/")) -> None:
+    def __init__(self, root: Path = Path("/"), hot_c: float | None = None) -> None:
         self._temperatures = [zone / "temp" for zone in _cpu_zones(root)]
         self._limit_c = limit_c(root)
+        self._hot_c = self._limit_c if hot_c is None else hot_c
         policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
         self._policy = max(policies, key=lambda policy: _number(policy / "cpuinfo_max_freq") or 0, default=None)
         self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0
         self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
+        # Driver of the Raspberry Pi. Its alarm holds for 2 s, so that a dip between two readings is not missed.
+        volts = (name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.text(name) == "rpi_volt")
+        self._alarm = next((folder / "in0_lcrit_alarm" for folder in volts), None)
+        self._bits_before: int | None = None
 
     def look(self) -> ThermalState:
         """Read the sensors. Never raises: a value that cannot be read, or is impossible, becomes None."""
@@ -51,7 +60,28 @@ class ThermalWatch:
         reasons = list(self._reasons(bits or 0, temperature_c, khz))
         can_tell = bits is not None or self._top_khz > 0
         throttled = any(slows for slows, _ in reasons) if can_tell else None
-        return ThermalState(temperature_c, frequency_mhz, throttled, "; ".join(why for _, why in reasons))
+        return ThermalState(
+            temperature_c=temperature_c,
+            frequency_mhz=frequency_mhz,
+            throttled=throttled,
+            why="; ".join(why for _, why in reasons),
+            under_voltage=self._is_under_voltage(bits),
+            hot=self._is_hot(bits, temperature_c),
+        )
+
+    def _is_hot(self, bits: int | None, temperature_c: float | None) -> bool | None:
+        is_above = temperature_c is not None and temperature_c >= self._hot_c
+        return None if temperature_c is None and bits is None else is_above or bool((bits or 0) & _HOT)
+
+    def _is_under_voltage(self, bits: int | None) -> bool | None:
+        """Return True if the supply is too low by the `bits` of the firmware or the driver's alarm, or if the firmware
+        has noted since the last call that it was (None: nobody can tell)."""
+        alarm = _number(self._alarm) if self._alarm else None
+        if bits is None:
+            return None if alarm is None else alarm > 0
+        known = bits if self._bits_before is None else self._bits_before
+        self._bits_before = bits
+        return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE or (bits & ~known) >> 16 & _UNDER_VOLTAGE)
 
     def _reasons(self, bits: int, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
         """Yield a pair for each sign that the machine slows down: True if it does so now (False: it is only a warning,

@@ -2,7 +2,7 @@
 `governor` use it."""
 
 from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 
 from edgevpr.core.config import BatteryConfig
 from edgevpr.core.types import NO_TAPE, Tape
@@ -30,7 +30,7 @@ class LoadReading:
 
 class FlightMeter:
     """Meter of the charge, CPU time, memory and heat of a flight; it starts when it is made. `energy` sums up the costs
-    of queries, `load` the time for which the loop is busy. `thermal` is the newest measurement of the board's heat,
+    of queries, `load` the time for which the loop is busy. `thermal` is the newest measurement of its heat and supply,
     `limit_c` the temperature at which the board slows itself down. All measurements are recorded on the `tape`."""
 
     def __init__(
@@ -46,7 +46,7 @@ class FlightMeter:
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self.energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
         self.load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
-        self._watch = watch or ThermalWatch()
+        self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)
         self.look_at_heat()
         self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
@@ -83,7 +83,9 @@ class FlightMeter:
 
     def look_at_heat(self) -> None:
         """Measure the heat of the board. Call it about once a second."""
-        self.thermal = ThermalState(*self._tape.read("heat", lambda: astuple(self._watch.look())))
+        names = [field.name for field in fields(ThermalState)]
+        values = self._tape.read("heat", lambda: astuple(self._watch.look()))
+        self.thermal = ThermalState(**dict(zip(names, values, strict=False)))  # an older tape has fewer values
 
     def machine_load(self) -> MachineLoad:
         """Return the load of the whole machine since the last call. Call it once a second."""

@@ -15,6 +15,7 @@ from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import confidence_of
 from edgevpr.runtime.flight.clock import Pace
+from edgevpr.runtime.flight.companionwatch import CompanionWatch
 from edgevpr.runtime.flight.herald import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
@@ -30,8 +31,8 @@ class Vitals:
     """Pings the watchdog of systemd, and reports once a second how the flight goes to systemd and to the status file,
     and the state of this computer to the autopilot; once a minute also to the terminal, if it was started on one. It
     reports once, through the herald, when the camera is lost, frozen, damaged or shows nothing, when nothing can be
-    recognised any more, and when each of these is over. `remarks` returns sentences for the status; those that are None
-    are left out."""
+    recognised any more, when this computer is hot, throttled or short of voltage, and when each of these is over.
+    `remarks` returns sentences for the status; those that are None are left out."""
 
     def __init__(
         self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Callable[[], Sequence[str | None]]
@@ -45,6 +46,7 @@ class Vitals:
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
         self._failing = Trouble(crew.herald, "failing", failing, "frames are recognised again")
         self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
+        self._companion = CompanionWatch(crew.herald)
         self._newest: dict[str, Any] | None = None
         self._match: dict[str, Any] | None = None
 
@@ -70,6 +72,7 @@ class Vitals:
     def _report(self) -> None:
         crew = self._crew
         crew.meter.look_at_heat()
+        self._companion.take(crew.clock.mono_s(), crew.meter.thermal)
         self._look_at_source()
         self._failing.note(self._tally.failed_in_a_row >= FAILURES_IN_A_ROW)
         self._look_at_log()
@@ -125,7 +128,7 @@ class Vitals:
         - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)
         - `remarks`: sentences on what else people should know; `summary`: the most important values in one line.
         """
-        crew, tally = self._crew, self._tally
+        crew, tally, thermal = self._crew, self._tally, self._crew.meter.thermal
         totals, now_s = crew.meter.totals(), crew.clock.mono_s()
         utc = datetime.fromtimestamp(crew.clock.utc_s(), timezone.utc)
         status: dict[str, Any] = {
@@ -146,12 +149,14 @@ class Vitals:
             "machine_ram_mb": load.ram_used_bytes / 1e6,
             "machine_ram_total_mb": load.ram_total_bytes / 1e6,
             "used_mah": totals["used_mah"],
-            "temperature_c": crew.meter.thermal.temperature_c,
-            "throttled": crew.meter.thermal.throttled,
+            "temperature_c": thermal.temperature_c,
+            "hot": thermal.hot,
+            "throttled": thermal.throttled,
+            "under_voltage": thermal.under_voltage,
             "newest": self._newest,
             "match": self._match,
             "link": crew.autopilot.state() if crew.autopilot else None,
-            "remarks": [remark for remark in self._remarks() if remark],
+            "remarks": [remark for remark in (*self._companion.remarks, *self._remarks()) if remark],
         }
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []

@@ -1,6 +1,7 @@
 """What a flight says of its own cost: by the closed form, by the process's own clock, and with the board's heat."""
 
 import random
+from dataclasses import asdict
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
@@ -76,14 +77,14 @@ class Watch:
 
 
 def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recording, tmp_path):
-    cool, hot = ThermalState(61.0, 1800.0, False, ""), ThermalState(84.0, 600.0, True, "throttled now")
+    cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
+    hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     clock = FakeClock()
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
     meter = flight_meter(flight, watch=Watch([cool] * 3 + [hot]))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in of_kind(lines, "query")]
-    assert boards[0] == {"temperature_c": 61.0, "frequency_mhz": 1800.0, "throttled": False, "why": ""}
-    assert boards[-1] == {"temperature_c": 84.0, "frequency_mhz": 600.0, "throttled": True, "why": "throttled now"}
+    assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
     told = [each.temperature_core[0] for each in flight.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     throttled = [board["throttled"] for board in boards]
     assert flight.end["queries_throttled"] == sum(throttled) > 0

@@ -1,0 +1,105 @@
+"""CompanionWatch: what a pilot learns of the companion's supply and heat, from a tree that stands for /sys."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource
+from flights import Flight, flight_meter, of_kind
+from pictures import textured
+
+from edgevpr.cli.top import lines_of
+from edgevpr.mavlink.messages import TEXT_BYTES, Severity
+from edgevpr.power.thermal import ThermalState, ThermalWatch
+from edgevpr.runtime.flight.companionwatch import CompanionWatch
+from edgevpr.runtime.flight.herald import Herald
+
+FINE = ThermalState(temperature_c=60.0, frequency_mhz=1800.0, throttled=False, why="", under_voltage=False, hot=False)
+LOW = replace(FINE, why="under-voltage now", under_voltage=True)
+UNKNOWN = ThermalState(temperature_c=None, frequency_mhz=None, throttled=None, why="")
+
+
+class Log:
+    """Flight log and link in one, that keep what they are given."""
+
+    def __init__(self):
+        self.lines, self.texts = [], []
+
+    def write(self, kind, **fields):
+        self.lines.append((kind, fields))
+
+    def announce(self, severity, text, topic):
+        assert len(f"edgevpr: {text}") <= TEXT_BYTES
+        self.texts.append((severity, text))
+
+
+def watched(states, every_s=1.0):
+    """(severity, text) of all that is sent to the ground station for a reading each second, and when."""
+    log, found = Log(), []
+    watch = CompanionWatch(Herald(log, log))
+    for number, state in enumerate(states):
+        watch.take(every_s * number, state)
+        found += [(number, *text) for text in log.texts[len(found) :]]
+    return found
+
+
+def test_take_reports_a_problem_when_it_begins_and_when_it_is_over():
+    assert watched([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
+        (5, Severity.WARNING, "companion under-voltage: check 5 V supply"),
+        (134, Severity.INFO, "companion supply is fine again"),
+    ]
+
+
+@pytest.mark.parametrize("apart", [2, 7, 29, 31, 45])
+def test_take_reports_a_problem_that_blinks_at_most_once_in_30_seconds(apart):
+    found = watched(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
+    times = [time for time, *_ in found]
+    assert all(later - earlier >= 30 for earlier, later in pairwise(times))
+    assert len(found) == 1 or apart > 30
+
+
+def test_take_reports_nothing_of_a_value_that_is_unknown():
+    assert watched([UNKNOWN] * 100) == []
+    assert [severity for _, severity, _ in watched([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
+
+
+def test_each_problem_has_a_text_that_fits():
+    hot = replace(FINE, temperature_c=102.4, throttled=True, hot=True)
+    assert watched([hot] * 5 + [FINE] * 50) == [
+        (0, Severity.WARNING, "companion throttled at 102 C: runs slower"),
+        (0, Severity.WARNING, "companion hot at 102 C: give it cool air"),
+        (34, Severity.INFO, "companion runs at full speed again"),
+        (34, Severity.INFO, "companion is cool again at 60 C"),
+    ]
+
+
+def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(recording, tmp_path, caplog):
+    firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
+    firmware.parent.mkdir(parents=True)
+    firmware.write_text("0\n")
+    clock, statuses = FakeClock(), []
+    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+
+    class Status:
+        def tell(self, status):
+            statuses.append(status)
+            firmware.write_text({1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n"))
+
+    meter = flight_meter(flight, watch=ThermalWatch(tmp_path))
+    lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
+    said = [(line["problem"], line["holds"], line["why"], line["said"]) for line in of_kind(lines, "companion")]
+    begun, slow = "companion under-voltage: check 5 V supply", "companion throttled: runs slower"
+    assert said[:2] == [
+        ("under_voltage", True, "under-voltage, throttled now", begun),
+        ("throttled", True, "under-voltage, throttled now", slow),
+    ]
+    assert [holds for _, holds, _, _ in said[2:]] == [False, False]
+    texts = flight.link.texts()
+    assert (4, f"edgevpr: {begun}") in texts
+    assert (6, "edgevpr: companion supply is fine again") in texts
+    assert [record.levelname for record in caplog.records if record.message == begun] == ["WARNING"]
+    assert statuses[2]["under_voltage"] is False
+    assert (statuses[3]["under_voltage"], statuses[3]["throttled"]) == (True, True)
+    assert "supply      under-voltage" in lines_of(statuses[3])
+    assert f"remark      {begun}" in lines_of(statuses[5]), "it is still shown when it has blinked"
+    assert begun not in statuses[-1]["remarks"]
