@@ -93,15 +93,6 @@ def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, c
     assert f" {PLACES} places added" in capsys.readouterr().out
 
 
-def test_a_technique_without_a_confidence_is_built_in_silence(flight, tmp_path, capsys):
-    assert main(["map", "build", str(tmp_path / "m.gpkg"), "--images", str(flight / "ref"), "--technique", "hog"]) == 0
-    assert "calibrat" not in capsys.readouterr().err
-    assert main(["map", "info", str(tmp_path / "m.gpkg")]) == 0
-    assert "confidence" not in capsys.readouterr().out
-    assert main(["map", "calibrate", str(tmp_path / "m.gpkg"), "--images", str(flight / "ref")]) == 2
-    assert "margin" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
@@ -109,14 +100,6 @@ def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
     assert found.described() in capsys.readouterr().out
     assert main(["map", "info", str(bare), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
-
-
-@pytest.mark.slow
-def test_a_map_of_a_video_is_calibrated_with_its_frames(flight, tmp_path):
-    path = tmp_path / "m.gpkg"
-    assert built(path, flight / "film.avi", "--no-calibrate") == 0
-    assert main(["map", "calibrate", str(path), "--images", str(flight / "film.avi")]) == 0
-    assert sorted(calibration_in(path).recognisable) == list(range(1, PLACES + 1))
 
 
 @pytest.mark.parametrize(
@@ -145,21 +128,3 @@ def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, b
     assert calibration_in(merged) is None
     assert main(["map", "merge", str(tmp_path / "both.gpkg"), str(bare_map), str(bare_map)]) == 0
     assert "calibrate" not in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_check_before_the_flight_says_what_to_expect(mapped, bare_map, flight, tmp_path, capsys):
-    for path, said in ((mapped, calibration_in(mapped).described()), (bare_map, "not calibrated (8 places")):
-        config = tmp_path / "c.yaml"
-        config.write_text(f"map: {path}\nsource: {{uri: {flight / 'ref'}}}\nlog: {{path: null}}\n")
-        main(["check", "--config", str(config)])
-        assert said in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_damaged_calibration_is_a_warning_and_no_more(mapped, capsys, caplog):
-    with PlaceMap.open_for_adding(mapped) as place_map:
-        place_map.record_calibration(place_map.calibration.replace("models", "moduls"))
-    assert main(["map", "info", str(mapped)]) == 0
-    assert "checksum" in caplog.text
-    assert "not calibrated" in capsys.readouterr().out

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,9 +15,6 @@ from pictures import textured
 
 from edgevpr.cli.examples import EXAMPLES
 from edgevpr.cli.main import EXIT_CODES, command_line, main
-from edgevpr.core.types import StageCost
-from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.preflight import pick
 
 
 @pytest.fixture(scope="module")
@@ -126,23 +122,6 @@ def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, t
     (said,) = (message for message in caplog.messages if message.startswith("technique cohog: recall@1 "))
     assert "accepted, 0 wrong" in said
     assert "6 places take" in said
-
-
-@pytest.mark.slow
-def test_a_machine_too_slow_for_the_best_technique_makes_the_map_of_the_readme_all_the_same(
-    capsys, caplog, flight, tmp_path, monkeypatch
-):
-    def slow(technique):
-        return replace(probe(technique), encode=StageCost(9.0, 9.0))
-
-    probe = pick.probe
-    monkeypatch.setattr(pick, "probe", slow)
-    path = tmp_path / "m.gpkg"
-    built = run_json(capsys, "map", "build", path, "--images", flight / "ref", "--camera", "nadir", "--json")
-    assert (built["technique"], built["added"]) == ("cohog", 6)
-    assert any("cohog" in message for message in caplog.messages)
-    with PlaceMap.open(path) as place_map:
-        assert place_map.spec.parameters["camera"] == "nadir"
 
 
 def test_a_broken_off_map_is_continued(capsys, flight, tmp_path):

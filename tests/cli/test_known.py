@@ -66,14 +66,6 @@ def test_a_heading_rules_out_other_rotations_of_each_query_by_itself(capsys, tmp
     assert (told["known"], told["accepted"], told["accepted_wrong"]) == ("heading", 3, 0)
 
 
-def test_a_height_is_that_of_the_table_else_that_of_the_map(capsys, tmp_path):
-    low = make(tmp_path / "low", height_ratio=0.5)
-    assert evaluated(capsys, low)["accepted"] == PLACES
-    assert evaluated(capsys, low, "--known", "height")["accepted"] == 0
-    tagged = make(tmp_path / "tagged", height_ratio=0.5, height_m=(50, 50, 50, 100, 100, None))
-    assert evaluated(capsys, tagged, "--known", "height")["accepted"] == 4, "of one query no height is known"
-
-
 def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
     folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
     path = tmp_path / "m.gpkg"
@@ -103,19 +95,3 @@ def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
 def test_what_cannot_be_known_gets_a_sentence(capsys, tmp_path, known, places_known, more, said):
     folder = make(tmp_path / "set", places_known=places_known)
     assert said in refused(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)
-
-
-@pytest.mark.process
-def test_a_plan_says_of_each_row_what_is_known_and_a_set_that_lacks_it_stops_no_other(capsys, tmp_path):
-    make(tmp_path / "set")
-    (tmp_path / "plan.yaml").write_text(
-        "sets: {set: {folder: set, camera: nadir}}\n"
-        "rows: {low: {technique: cohog, known: height}, turned: {technique: cohog, known: heading}}\n"
-    )
-    words = ["eval", "--sets", tmp_path / "plan.yaml", "--out", tmp_path / "out", "--workers", "1"]
-    assert "of each row" in refused(capsys, *words, "--known", "reach")
-    assert main([str(word) for word in words]) == 1
-    assert "set, turned was not measured: No query has what `heading` needs" in capsys.readouterr().err
-    (row,) = json.loads((tmp_path / "out" / "results.json").read_text())["results"]
-    assert (row["row"], row["known"]) == ("low", "height")
-    assert "Known of each query of low: height." in (tmp_path / "out" / "index.html").read_text()

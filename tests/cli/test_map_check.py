@@ -3,10 +3,7 @@
 import contextlib
 import json
 import shutil
-import signal
 import sqlite3
-import subprocess
-import sys
 
 import cv2
 import pytest
@@ -128,14 +125,6 @@ def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
     assert main(["map", "check", str(valley)]) == 0
 
 
-def test_a_damaged_map_is_matched_in_with_the_rest(valley, flight, capsys):
-    damage(valley, "UPDATE places SET geom = 'text' WHERE place_id = 2")
-    assert main(["match", str(valley), "--images", str(flight / "images"), "--json"]) == 0
-    accepted = [row["place"]["number"] for row in json.loads(capsys.readouterr().out) if row["accepted"]]
-    assert len(accepted) >= 4
-    assert 2 not in accepted
-
-
 @pytest.mark.parametrize("command", ["info", "check", "repair"])
 def test_a_name_that_no_file_can_have_is_exit_code_2(command, capsys):
     assert main(["map", command, ""]) == 2
@@ -170,33 +159,3 @@ def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path, capsy
         assert [entry.name for entry in tmp_path.glob("valley*")] == [valley.name]
     assert main(["map", "merge", str(out), str(valley)]) == 1, "it is damaged"
     assert not list(out.parent.iterdir())
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_a_second_builder_is_refused_while_the_first_one_works(flight, tmp_path, capsys):
-    path = tmp_path / "m.gpkg"
-    assert main(built(path, flight)) == 0
-    with PlaceMap.open_for_adding(path):
-        assert main(built(path, flight, "--append")) == 1
-        assert "another program" in capsys.readouterr().err
-    assert main(built(path, flight, "--append")) == 0
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_a_builder_that_is_killed_leaves_no_lock(flight, tmp_path):
-    path = tmp_path / "m.gpkg"
-    code = f"""
-import time
-from edgevpr.places.mapfile import PlaceMap
-from edgevpr.techniques import create
-PlaceMap.create({str(path)!r}, create("cohog", {{"w1": 208}}).spec)
-print("made", flush=True)
-time.sleep(600)
-"""
-    builder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert builder.stdout.readline() == "made\n"
-    builder.send_signal(signal.SIGKILL)
-    builder.communicate()
-    assert main(built(path, flight, "--append")) == 0

@@ -44,13 +44,6 @@ def built(flight, *flags):
     return path
 
 
-def evaluated(capsys, flight, *flags):
-    data = ["--query", flight / "query", "--ref", flight / "ref", "--ground-truth", flight / "truth.csv"]
-    code = main(["eval", *map(str, data), *flags, "--json"])
-    said = capsys.readouterr()
-    return code, json.loads(said.out)["techniques"] if said.out else None, said.err
-
-
 def test_the_forms_have_the_same_names_everywhere():
     assert create("hog").spec.forms == FORMS == vectors.FORMS
 
@@ -101,47 +94,6 @@ def test_a_map_of_a_network_that_is_not_here_says_how_to_get_it(models, flight, 
     said = capsys.readouterr().err
     assert "with `tiny`" in said
     assert "models add" in said
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("models")
-def test_eval_measures_each_form_in_a_row_of_its_own(capsys, flight):
-    flags = ["--techniques", "tiny,hog,cohog", "--form", "float,1bit", "--param", "hog.w1=64"]
-    code, found, _ = evaluated(capsys, flight, *flags)
-    assert code == 0
-    assert list(found) == ["tiny", "tiny 1bit", "hog", "hog 1bit", "cohog"]
-    beside = 26  # bytes of a place's number, position and heading
-    assert found["tiny"]["descriptor_bytes"] == 32 + beside
-    assert found["tiny 1bit"]["descriptor_bytes"] == 8 + beside
-    assert found["tiny"]["weights"] == found["tiny 1bit"]["weights"] == "tiny: A tiny network (MIT; made by a test)"
-    assert found["hog"]["weights"] is None
-
-
-@pytest.mark.slow
-def test_eval_goes_on_without_a_network_that_cannot_be_used(models, capsys, flight):
-    write_network(models, "wrong", fault="nan")
-    code, found, said = evaluated(capsys, flight, "--techniques", "wrong,cohog", "--form", "float,8bit")
-    assert code == 1
-    assert list(found) == ["cohog"]
-    assert said.count("edgevpr: wrong was not measured:") == 1
-    code, found, said = evaluated(capsys, flight, "--techniques", "wrong")
-    assert (code, found) == (1, None)
-    assert "not finite" in said
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_profile_lists_every_form_and_says_in_a_sentence_what_cannot_be_used(models, capsys, monkeypatch):
-    wanted = ("cohog", "seqslam", "tiny", "calc", "rmac")
-    monkeypatch.setattr("edgevpr.techniques.names", lambda: wanted)
-    write_network(models, "calc", fault="nan")  # found before the shipped one
-    assert main(["profile", "--places", "100", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    labels = [row["option"]["label"] for row in said["techniques"]]
-    fewer = ["cohog, 20 candidates", "cohog, 10 candidates"]
-    assert labels == ["cohog", *fewer, "seqslam", "tiny", "tiny 8bit", "tiny 1bit"]
-    assert set(said["unusable"]) == {"calc", "rmac"}
-    assert said["notes"][0] == "Weights of tiny: A tiny network (MIT; made by a test)."
 
 
 @pytest.mark.usefixtures("models")

@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-import rasterio
-from rasters import HOME, textured_raster, write_raster
+from rasters import HOME, textured_raster
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, moved
@@ -69,29 +68,6 @@ def test_a_map_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, 
     assert sum(query["accepted"] for query in found) >= 6
     assert np.median(off_m) < 25
     assert max(off_m) < 50
-
-    # The rest of the grid is added to it, under the same names.
-    assert run("map", "build", place_map, *cut, "--append", "--no-calibrate", "--json") == 0
-    rest = json.loads(capsys.readouterr().out)
-    assert rest["already_here"] == built["places"]
-    assert rest["places"] == rest["added"] + built["places"]
-
-
-@pytest.mark.slow
-def test_water_and_what_is_not_known_are_left_out_and_said(tmp_path, capsys, caplog):
-    with rasterio.open(textured_raster(tmp_path / "land.tif")) as data:
-        land, to_crs = data.read(), data.transform
-    land[:, :, :280] = 70
-    land[:, :, 500:] = 0
-    path = write_raster(tmp_path / "coast.tif", land, "EPSG:32632", to_crs, nodata=0)
-    cut = ("--orthophoto", path, "--footprint-m", 80, "--spacing-m", 40)
-    with caplog.at_level("INFO"):
-        assert run("map", "build", tmp_path / "m.gpkg", *cut, "--no-calibrate", "--json") == 0
-        assert run("map", "calibrate", tmp_path / "m.gpkg", *cut) == 2  # too few places, but of the same camera
-    assert "fov_deg" not in caplog.text, "no camera has taken them"
-    built = json.loads(capsys.readouterr().out)
-    assert built["without_position"] == 0
-    assert min(built["without_data"], built["says_nothing"]) >= 5
 
 
 @pytest.mark.parametrize(
@@ -177,21 +153,3 @@ def test_a_map_of_an_orthophoto_is_calibrated_with_what_is_cut_again(tmp_path, g
     assert run("map", "calibrate", path, *cut, "--json") == 0
     found = json.loads(capsys.readouterr().out)["calibration"]
     assert 0 < found["places_asked"] <= found["asked"] <= 6  # where pictures may overlap, nobody knows
-
-
-@pytest.mark.slow
-def test_a_map_cut_at_two_footprints_says_both(tmp_path, ground, capsys, caplog):
-    place_map = tmp_path / "m.gpkg"
-    cut = ("--orthophoto", ground, "--footprint-m", "120,80", "--spacing-m", 50, "--no-calibrate", "--json")
-    with caplog.at_level("INFO"):
-        assert run("map", "build", place_map, *cut) == 0
-    assert "the map extends" in caplog.text
-    assert "the track" not in caplog.text, "nobody has flown it"
-    capsys.readouterr()
-    assert run("map", "info", place_map, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["footprints_m"] == [80, 120]
-    assert run("map", "info", place_map) == 0
-    assert "a picture shows 80 or 120 m of ground" in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        run("map", "build", tmp_path / "n.gpkg", "--orthophoto", ground, "--footprint-m", "80;120", "--spacing-m", 50)
-    assert "`80;120` is no length in metres, nor several with commas" in capsys.readouterr().err

@@ -126,36 +126,3 @@ def test_a_criterion_without_its_network_is_off_and_says_so(tmp_path, capsys, ca
     assert main(["salience", str(picture), "--config", config(tmp_path, memorability=0.5, staticity=0.6)]) == 0
     assert "`salience.network`" in caplog.text
     assert "`salience.detector`" in caplog.text
-
-
-@pytest.mark.slow
-def test_a_map_shrinks_to_its_best_places(recording, tmp_path, capsys):
-    place_map, smaller = tmp_path / "m.gpkg", tmp_path / "s.gpkg"
-    command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
-    assert main([*command, "--config", config(tmp_path)]) == 0
-    capsys.readouterr()
-    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["kept"] == 12
-    with PlaceMap.open(smaller) as opened:
-        kept = list(opened.places())
-        assert len(kept) == 12
-        assert all(place.salience is not None for place in kept)
-    assert smaller.stat().st_size < place_map.stat().st_size / 2
-    assert main(["map", "shrink", str(place_map), str(smaller), "--places", "12"]) != 0  # it is there already
-
-
-@pytest.mark.slow
-def test_eval_counts_what_the_gate_discards_as_missed(recording, tmp_path, capsys):
-    names = [path.name for path in sorted(recording.iterdir())]
-    truth = tmp_path / "truth.csv"
-    truth.write_text("query_file,ref_files\n" + "".join(f"{name},{name}\n" for name in names[:40]))
-    command = ["eval", "--query", recording, "--ref", recording, "--ground-truth", truth, "--techniques", "hog,calc"]
-    command = [*map(str, command), "--salience", "--config", config(tmp_path)]
-    assert main([*command, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["techniques"]
-    for each in found.values():
-        assert each["discarded"] == 25  # of forty queries those of one colour, whichever technique was asked before
-        assert each["recall_at_1"] == pytest.approx(15 / 40)
-    assert main(command) == 0
-    said = capsys.readouterr().out
-    assert "hog: 25 queries" in said

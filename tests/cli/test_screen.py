@@ -100,24 +100,6 @@ def test_a_wrong_flag_is_repeated_without_its_escapes():
     assert b"\x1b" not in refused.stderr
 
 
-@pytest.mark.slow
-def test_names_that_are_not_utf_8_are_mapped_and_matched(tmp_path):
-    (tmp_path / "ref").mkdir()
-    path = os.path.join(os.fsencode(tmp_path / "ref"), b"caf\xe9.jpg")
-    with open(path, "wb") as file:
-        file.write(cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes())
-    built = said(["map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"])
-    assert built.returncode == 0
-    for flags in ([], ["--json"]):
-        matched = said(["match", tmp_path / "m.gpkg", "--images", tmp_path / "ref", *flags])
-        assert matched.returncode == 0
-        assert b"caf\\" in matched.stdout
-    in_ascii = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    missing = said(["match", os.path.join(os.fsencode(tmp_path), b"\xc3\xa9\xff.gpkg"), "--images", "x"], env=in_ascii)
-    assert (missing.returncode, b"Traceback" in missing.stderr) == (1, False)
-    assert b"\\xe9\\xff.gpkg" in missing.stderr
-
-
 def test_a_form_that_does_not_exist_is_refused(capsys):
     data = ["--query", "q", "--ref", "r", "--ground-truth", "t.csv"]
     for form in ("x", "float,", "8bit,9bit"):
