@@ -1,6 +1,5 @@
 """The whole measurement on a small generated set, and the tables."""
 
-import io
 import json
 from dataclasses import asdict
 
@@ -9,7 +8,6 @@ import pytest
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
-from edgevpr.core.text import markdown, progress
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import compare, evaluate, from_json
 from edgevpr.lab.evaluate.tables import results_text
@@ -86,33 +84,7 @@ def test_a_broken_image_stops_the_measurement(folder):
         evaluate("hog", dataset, HOG)
 
 
-def test_progress_is_shown_for_references_and_queries(folder):
-    out = io.StringIO()
-    evaluate("hog", load(folder), HOG, progress=lambda items, total, label: progress(items, total, label, out))
-    assert "hog: references  8/8  100 %" in out.getvalue()
-    assert "hog: queries  8/8  100 %" in out.getvalue()
-
-
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir"})])
 def test_a_place_takes_as_many_bytes_as_profile_says(folder, name, settings):
     result, costs = evaluate(name, load(folder), settings), probe(create(name, settings))
     assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)
-
-
-def test_the_text_tables_line_up_and_name_what_their_figures_rest_on(folder):
-    printed = results_text(compare([evaluate("hog", load(folder), HOG)]))
-    *tables, notes = printed.split("\n\n")
-    assert len(tables) == 3
-    for table in tables:
-        head, row = table.splitlines()
-        assert len(head) == len(row) <= 120
-    found, _, paid = tables
-    assert found.splitlines()[1].split()[:2] == ["hog", "0.875"]
-    assert "3554" in paid  # 7 x 7 blocks of 36 values, 2 bytes each, and 26 for number, position and heading
-    assert "8 references" in notes
-    assert "t_e,max" in notes
-
-
-def test_a_markdown_table_has_a_cell_for_every_heading():
-    lines = markdown(("set", "recall"), [["corridor", "0.66"], ["park", "0.2"]]).splitlines()
-    assert lines == ["| set | recall |", "| --- | ---: |", "| corridor | 0.66 |", "| park | 0.2 |"]

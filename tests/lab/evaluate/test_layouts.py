@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
 from edgevpr.lab.evaluate.evaluate import quietly
@@ -137,23 +136,3 @@ def test_positions_by_distance_and_heading(tmp_path):
     assert right(within_m=100) == {*rows}
     with pytest.raises(UsageError, match="--within-m"):
         right(within_m=0.1)
-
-
-def test_what_is_no_data_set_is_told_what_is_one(tmp_path, capsys):
-    with pytest.raises(UsageError, match=r"ground_truth\.csv"):
-        open_folder(tmp_path, RULE)
-    assert main(["eval", "--data", str(tmp_path / "no")]) == 2
-    assert str(tmp_path / "no") in capsys.readouterr().err
-    pictures(tmp_path / "query", ["0.jpg"])
-    pictures(tmp_path / "ref", ["0.jpg"])
-    assert main(["eval", "--data", str(tmp_path)]) == 2
-    assert "positions.csv" in capsys.readouterr().err
-
-
-def test_a_folder_is_measured(tmp_path, capsys):
-    names = [f"{number}.jpg" for number in range(4)]
-    for each in ("query", "ref"):
-        pictures(tmp_path / each, names)
-        positions(tmp_path / each, [(name, *moved(47.0, 8.0, 100 * at, 0), 0, 50) for at, name in enumerate(names)])
-    assert main(["eval", "--data", str(tmp_path), "--techniques", "hog", "--param", "hog.w1=64"]) == 0
-    assert "4 references" in capsys.readouterr().out

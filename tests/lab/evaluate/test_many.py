@@ -83,19 +83,6 @@ def test_several_workers_find_the_same(measured, meadow, tmp_path):
     assert {row.made["workers"] for row in again.rows} == {3}
 
 
-def test_progress_counts_the_pictures_of_all_workers(meadow, tmp_path):
-    told = []
-
-    def counted(items, total, label):
-        told.append((label, len(list(items)), total))
-        return ()
-
-    measure(plan_of(meadow, rows=ONLY_HOG), tmp_path, 1, counted)
-    (label, seen, total) = told[-1]
-    assert label == "1 rows: pictures"
-    assert seen == total >= 11, "the references and the queries"
-
-
 def test_what_is_there_is_not_measured_now(measured, meadow):
     outcome, folder = measured
     before = results_in(folder)

@@ -1,16 +1,12 @@
 """The figures against literal transcriptions of the equations, and against published similarity matrices."""
 
 import math
-import os
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edgevpr.lab.evaluate import metrics
-
-_DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
 
 
 def literal_curve(scores, correct):
@@ -64,19 +60,6 @@ def test_the_curve_and_its_figures_agree_with_a_literal_transcription(distinct, 
         assert metrics.extended_precision(precision, recall) == (highest + certain) / 2
         expected = literal_roc_auc(scores.tolist(), correct.tolist())
         assert metrics.roc_auc(scores, correct) == (expected if expected is None else pytest.approx(expected))
-
-
-def test_a_worked_example_by_hand():
-    scores = np.array([0.9, 0.8, 0.8, 0.4])
-    correct = np.array([True, True, False, True])
-    precision, recall = metrics.precision_recall(scores, correct)
-    assert precision.tolist() == [1, 2 / 3, 3 / 4]  # the two queries at 0.8 are accepted together
-    assert recall.tolist() == [1 / 3, 2 / 3, 1]
-    assert metrics.auc(precision, recall) == pytest.approx((1 + 2 / 3) / 2 / 3 + (2 / 3 + 3 / 4) / 2 / 3)
-    assert metrics.recall_at_100_precision(precision, recall) == 1 / 3
-    assert metrics.precision_at_100_recall(precision, recall) == 3 / 4
-    assert metrics.extended_precision(precision, recall) == (1 + 1 / 3) / 2
-    assert metrics.roc_auc(scores, correct) == pytest.approx((1 + 0.5 + 0) / 3)
 
 
 def test_recall_at_k_counts_queries_with_a_right_reference_among_the_first_k():

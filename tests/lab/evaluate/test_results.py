@@ -2,10 +2,8 @@
 
 import json
 import re
-import shutil
 
 import pytest
-from browser import show
 from generated_sets import make_set
 
 from edgevpr.cli.main import main
@@ -68,41 +66,6 @@ def test_the_page_shows_curves_costs_and_matches(out):
     assert "<script" not in page
 
 
-def test_a_second_run_measures_nothing(out, tmp_path, capsys):
-    shutil.copytree(out.parent, tmp_path / "copy")
-    folder = tmp_path / "copy"
-    assert run("--sets", folder / "plan.yaml", "--out", folder / "out", "--workers", "2") == 0
-    assert "index.html" in capsys.readouterr().out
-    before, now = (json.loads((each / "results.json").read_text())["results"] for each in (out, folder / "out"))
-    assert now == before
-
-
-def test_a_browser_asks_for_nothing_and_complains_of_nothing(out):
-    shown = show(out / "index.html")
-    assert "Recall@K" in shown.content
-    assert (shown.console, shown.requests) == ([], [])
-
-
-def test_the_page_fits_a_phone(out, tmp_path):
-    content = re.sub(r"<meta http-equiv[^>]*>", "", (out / "index.html").read_text("utf-8"))
-    measure = "`${document.documentElement.scrollWidth} ${innerWidth}`"
-    content = content.replace("</body>", f"<script>document.title = {measure}</script></body>")
-    (tmp_path / "measured.html").write_text(content, "utf-8")
-    wide, room = map(int, re.search("<title>([^<]*)<", show(tmp_path / "measured.html", 390).content)[1].split())
-    assert wide <= room <= 500
-
-
-def test_sets_by_flags_print_json(out, tmp_path, capsys):
-    meadow, other = out.parent / "meadow", make_set(tmp_path / "other", first=6)
-    flags = ["--techniques", "hog", "--param", "hog.w1=64", "--form", "float,8bit", "--json", "--workers", "1"]
-    assert run("--data", meadow, other, "--out", tmp_path / "out", *flags) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert [(each["set"], each["row"]) for each in content["results"]] == [
-        (name, row) for name in ("meadow", "other") for row in ("hog", "hog 8bit")
-    ]
-    assert content["results"] == json.loads((tmp_path / "out" / "results.json").read_text())["results"]
-
-
 def test_what_could_not_be_measured_is_said_everywhere(tmp_path, capsys):
     broken = make_set(tmp_path / "broken")
     (broken / "ref" / "r1.png").write_bytes(b"")
@@ -134,13 +97,3 @@ def test_a_wrong_request_gets_one_sentence(out, tmp_path, monkeypatch, capsys, a
     err = capsys.readouterr().err
     assert said in err
     assert "Traceback" not in err
-
-
-def test_a_camera_that_nobody_has_named_is_said_to_look_ahead(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    make_set(tmp_path / "meadow")
-    said = []
-    for more in ([], ["--out", "results"], ["--camera", "nadir"], ["--param", "cohog.camera=forward"]):
-        assert run("--data", "meadow", "--techniques", "cohog", "--param", "cohog.w1=208", *more) == 0
-        said.append("look ahead" in capsys.readouterr().err)
-    assert said == [True, True, False, False]

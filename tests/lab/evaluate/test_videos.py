@@ -11,25 +11,16 @@ from pathlib import Path
 import cv2
 import pytest
 from films import cut_in_half, film_of, overwrite_in_the_middle
-from full_disk import no_file_larger_than
-from generated_sets import without_costs
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import moved
-from edgevpr.lab.evaluate.layouts import Nearness, of_positions
 from edgevpr.lab.evaluate.videos import pictures_of
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
 
 PLACES, RATE_HZ, APART_M = 6, 2, 30
 HOG = ("--techniques", "hog", "--param", "hog.w1=64")
-RULES = [
-    Nearness(within_m=20),
-    Nearness(within_m=50),
-    Nearness(within_m=50, within_deg=15),
-]
 
 
 def taken(kept):
@@ -89,15 +80,6 @@ def quality(found):
     return {key: value for key, value in row.items() if not key.startswith(("t_", "u_", "ah_", "pcu"))}
 
 
-def numbers(dataset):
-    """Which references are right for which queries, by the numbers of the pictures."""
-    names = [path.name for path in sorted(dataset.queries[0].path.parent.glob("*.png"))]
-    return {
-        names.index(query.path.name): {dataset.references.index(each) for each in query.right}
-        for query in dataset.queries
-    }
-
-
 def test_videos_give_the_figures_of_the_folders_of_their_pictures(films, mapping, later, capsys):
     flags = "--within-m", "20"
     of_folders = measured(capsys, "--query", later.places, "--ref", mapping.places, *flags)
@@ -106,49 +88,6 @@ def test_videos_give_the_figures_of_the_folders_of_their_pictures(films, mapping
     assert quality(of_videos)["queries"] == PLACES - 1, "one lies beyond the map"
     mixed = measured(capsys, "--query", films[0], "--ref", mapping.places, *flags)
     assert quality(mixed) == quality(of_folders)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_what_is_right_is_the_same_by_distance_and_heading(rule, films, mapping, later, tmp_path):
-    of_videos = numbers(of_positions(*films, rule, taken(tmp_path / "kept")))
-    assert of_videos == numbers(of_positions(later.places, mapping.places, rule))
-    assert of_videos
-
-
-def test_many_sets_take_the_pictures_once_and_whatever_decides_them_takes_them_anew(films, tmp_path, capsys):
-    out = tmp_path / "out"
-
-    def run(*more):
-        found = measured(
-            capsys, "--query", films[0], "--ref", films[1], "--within-m", "20", "--out", out, "--workers", "2", *more
-        )
-        assert found["failed"] == []
-        return found
-
-    def pictures():
-        return {path: path.stat().st_mtime_ns for path in (out / "videos").rglob("*.png")}
-
-    first = run()
-    assert list(first["sets"]) == ["later.mkv on mapping.mkv"]
-    before = pictures()
-    assert len(before) == 2 * PLACES
-    assert without_costs(run()) == without_costs(first)
-    assert pictures() == before
-
-    assert run("--rate-hz", "1")["results"][0]["references"] == 3
-    assert len(pictures()) == 2 * PLACES + 2 * 3
-    table = films[1].with_suffix(".csv")
-    table.write_text(table.read_text().replace("\n0.0,47.0,", "\n0.0,46.0,"))
-    assert run()["results"][0]["references"] == PLACES
-    assert len(pictures()) == 3 * PLACES + 2 * 3
-
-
-def test_frames_without_a_position_are_left_out(films, capsys):
-    table = films[0].with_suffix(".csv")
-    header, _, *rest = table.read_text().splitlines()
-    table.write_text("\n".join([header, *rest]))
-    assert main(["eval", *HOG, "--query", str(films[0]), "--ref", str(films[1])]) == 0
-    assert "4 queries" in capsys.readouterr().out
 
 
 def bad_bytes(video):
@@ -182,14 +121,6 @@ def test_what_cannot_be_used_is_said_in_one_sentence(harm, code, said, films, ca
     assert said in lines[0]
 
 
-def test_a_full_disk_is_said_and_leaves_nothing_half_taken(films, tmp_path):
-    pictures = taken(tmp_path / "kept")
-    with no_file_larger_than(2000), pytest.raises(EdgevprError, match=r"later\.mkv"):
-        pictures(films[0])
-    assert list((tmp_path / "kept").iterdir()) == []
-    assert len(list(pictures(films[0]).glob("*.png"))) == PLACES
-
-
 def test_killed_while_pictures_are_taken_it_goes_on_with_the_next_run(films, tmp_path):
     """As after a power cut: what is half taken is never believed."""
     kept = tmp_path / "kept"
@@ -207,11 +138,3 @@ def test_killed_while_pictures_are_taken_it_goes_on_with_the_next_run(films, tmp
     assert done.returncode == -signal.SIGKILL
     assert list(kept.glob("[!.]*")) == []
     assert len(list(taken(kept)(films[0]).glob("*.png"))) == PLACES
-
-
-def test_as_a_camera_films_it_the_places_are_still_found(tmp_path, mapping, later, capsys):
-    """With losses, as MPEG-4 in an MP4 file."""
-    coding = "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"
-    videos = [each.film(tmp_path / f"{each.name}.mp4", *coding) for each in (later, mapping)]
-    found = measured(capsys, "--query", videos[0], "--ref", videos[1], "--within-m", "20")
-    assert quality(found)["recall_at_1"] >= 5 / 6
