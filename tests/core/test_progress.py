@@ -2,12 +2,10 @@
 
 import io
 import os
-import time
 
 from fakes import FakeClock
 
-from edgevpr.core import text
-from edgevpr.core.text import at_work, progress, waiting
+from edgevpr.core.text import progress, waiting
 
 
 def test_a_file_gets_a_line_for_every_tenth():
@@ -31,27 +29,6 @@ def test_a_terminal_sees_one_line_redrawn():
     assert drawn.count("\n") == 1
 
 
-def test_nothing_to_do_writes_nothing():
-    out = io.StringIO()
-    assert list(progress([], 0, "map", out)) == []
-    assert out.getvalue() == ""
-
-
-def test_without_a_total_a_file_gets_a_line_for_every_hundred():
-    out = io.StringIO()
-    assert len(list(progress(range(250), 0, "video", out))) == 250
-    assert out.getvalue().splitlines() == ["video  1", "video  100", "video  200"]
-
-
-def test_long_work_says_that_it_goes_on(monkeypatch):
-    monkeypatch.setattr(text, "_SILENT_S", 0.001)
-    out = io.StringIO()
-    with at_work("solving", out):
-        while out.getvalue().count("\n") < 2:
-            time.sleep(0.001)
-    assert out.getvalue().splitlines()[0].startswith("solving, ")
-
-
 def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
     reader, writer = os.openpty()
     with os.fdopen(writer, "w") as terminal:
@@ -63,12 +40,6 @@ def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
     os.close(reader)
     assert [line.rstrip() for line in drawn.split("\r")] == ["waiting for the source", "for the link", "", ""]
     assert {len(line) for line in drawn.split("\r")[:3]} == {79}
-
-
-def test_a_file_is_not_told_what_is_waited_for():
-    out = io.StringIO()
-    waiting("waiting for the source", out)
-    assert out.getvalue() == ""
 
 
 def test_the_time_that_is_left_is_told_once_it_can_be_known():

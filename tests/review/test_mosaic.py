@@ -5,18 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from films import film_of
-from ground import METRE_PX, ORIGIN, flown_over, landscape, places_in, write_positions
-from logs import write_log
+from ground import METRE_PX, ORIGIN, landscape, places_in, write_positions
 from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
-from edgevpr.review import steps
-from edgevpr.review.album import Album, album_of, album_of_map, small_pictures
-from edgevpr.review.logged import read_flight
+from edgevpr.review.album import Album, album_of_map, small_pictures
 from edgevpr.review.mosaic import Mosaic, mosaic_of
-from edgevpr.review.page import page_of
 
 
 def assert_is_the_ground(found):
@@ -90,27 +85,3 @@ def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
         assert bool(left_out) == (len(found) < len(keys))
         sizes.append(len(found))
     assert sizes[0] == sizes[1] == len(keys) > sizes[2] > 0
-
-
-@pytest.mark.slow
-def test_a_page_of_many_queries_stays_below_its_limit(tmp_path, monkeypatch):
-    (tmp_path / "ref").mkdir()
-    places = places_in(tmp_path / "ref")
-    flight = read_flight(write_log(tmp_path / "log", *flown_over(places, 2000)))
-    monkeypatch.setattr(steps, "_MOST_TOLD_BYTES", 300_000)
-    monkeypatch.setattr(steps, "MOST_PAGE_BYTES", 1_500_000)
-    album = Album([tmp_path / "ref"])
-    made = page_of(flight, places, album, album)
-    assert len(made.encode()) <= 1_500_000
-    assert "shown is one query in" in made
-
-
-def test_the_pictures_of_a_film_are_found_by_the_names_of_its_frames(tmp_path):
-    greys = [40, 90, 140]
-    film_of(tmp_path / "f.mkv", [np.full((48, 64, 3), grey, np.uint8) for grey in greys], 1)
-    album = album_of([tmp_path / "f.mkv"])
-    for number in (1, 0, 2, 0):
-        image = album.image(f"frame {number:06d} t={number}.000 s")
-        assert image.mean() == pytest.approx(greys[number], abs=1)
-    assert album.image("frame 000009 t=9.000 s") is None
-    assert album.image("photo.jpg") is None

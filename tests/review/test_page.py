@@ -124,16 +124,6 @@ def test_the_worst_moments_are_those_that_could_be_dangerous(tmp_path):
     assert "20 queries" in why[2][0]
 
 
-def test_why_a_fix_was_not_sent_is_said_once(tmp_path):
-    whys = "not sent: paused by the ground", "not sent yet: nothing is heard of the vehicle", "dry run: no fix is sent"
-    fixes = [query(why)["fix"] | {"sent": False, "why": why} for why in whys]
-    content = page(write_log(tmp_path / "log", *(("query", query(each["why"], fix=each)) for each in fixes)))
-    said = re.findall(r"<td>(fix not sent[^<]*)<", content)
-    assert sorted(said) == [
-        f"fix not sent: {why.removeprefix('not sent: ').removeprefix('not sent yet: ')}" for why in sorted(whys)
-    ]
-
-
 def test_positions_that_cross_the_date_line_stay_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
     lines = [("query", query("a", **each)) for each in at]
@@ -194,29 +184,3 @@ def test_the_page_judges_a_real_flight_as_it_was_judged(made, browser):
         said = page.inner_text("#would")
     assert said.startswith("0 more accepted, 0 fewer, of ")
     assert "of 0 that" not in said
-
-
-def measured(made, folder, measure, width_px):
-    """What a script measures in the page, which itself lets no script run."""
-    content = re.sub(r"<meta http-equiv[^>]*>", "", made.read_text("utf-8"))
-    script = f"<script>document.title = {measure}</script></body>"
-    (folder / "measured.html").write_text(content.replace("</body>", script), "utf-8")
-    return re.search("<title>([^<]*)<", show(folder / "measured.html", width_px).content)[1]
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_a_page_fits_a_phone(made, tmp_path):
-    measure = "`${document.documentElement.scrollWidth} ${innerWidth}`"
-    wide, room = map(int, measured(made, tmp_path, measure, 360).split())
-    assert wide <= room <= 500
-
-
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.parametrize("width_px", [360, 1200])
-def test_the_view_of_the_ground_has_the_shape_of_its_drawing(made, tmp_path, width_px):
-    of = "document.querySelector('.view')"
-    measure = f"`${{{of}.clientWidth}} ${{{of}.clientHeight}} ${{{of}.firstChild.getAttribute('viewBox')}}`"
-    wide, high, _, _, drawn_wide, drawn_high = map(float, measured(made, tmp_path, measure, width_px).split())
-    assert wide / high == pytest.approx(drawn_wide / drawn_high, rel=0.01), "else its labels lie beside the points"

@@ -75,13 +75,6 @@ def test_the_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
     assert "missed" in steps[2]["at"], "a refused query is shown where GPS says it was"
 
 
-def test_play_steps_on(page):
-    page.click("#play")
-    page.locator("#which", has_text="3 of 30").wait_for()
-    page.click("#play")
-    assert page.get_attribute("#play", "aria-label") == "play"
-
-
 def test_only_chosen_reasons_stay_on_ground_lanes_and_slider(page):
     page.click("summary:has-text('Show only some')")
     label = page.locator("label:has([data-group])", has_text="score … is below …")
@@ -119,22 +112,6 @@ def test_the_precision_slider_counts_what_the_judge_would_accept(page, made, pre
         assert page.inner_text(".now h3").endswith("refused")
 
 
-def test_keys_zoom_and_move_the_ground(page):
-    whole = box_of(page)
-    page.focus(".view")
-    for _ in range(4):
-        page.keyboard.press("+")
-    closer = box_of(page)
-    assert closer[2] == pytest.approx(whole[2] / 1.5**4, rel=1e-3)
-    page.keyboard.press("ArrowRight")
-    assert box_of(page)[0] > closer[0]
-    assert page.inner_text(".ruler") != ""
-    page.keyboard.press("0")
-    assert box_of(page) == whole
-    page.click("[data-zoom='2']")
-    assert box_of(page)[2] == pytest.approx(whole[2] / 2, rel=1e-3)
-
-
 def test_wheel_and_drag_move_the_ground_and_a_click_chooses_a_query(page):
     frame = page.locator(".view").bounding_box()
     middle = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
@@ -160,31 +137,6 @@ def test_wheel_and_drag_move_the_ground_and_a_click_chooses_a_query(page):
     _, _, wide, high = box_of(page)
     page.mouse.click(frame["x"] + x / wide * frame["width"], frame["y"] + y / high * frame["height"])
     assert "place found: 03.png" in page.inner_text(".now"), "the nearest query"
-
-
-def test_a_lane_chooses_a_query(page):
-    lane = page.locator("svg:has([data-lane='1'])")
-    lane.click(position={"x": lane.bounding_box()["width"] - 1, "y": 10})
-    assert page.inner_text(".now h3").endswith("refused")
-    assert page.locator("svg .cursor").count() > 3, "a line at its time in lanes and charts"
-
-
-def test_the_ground_is_in_the_page_and_the_page_fits_a_phone(page):
-    width = page.eval_on_selector("image", "each => each.getBBox().width")
-    assert width > 300
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    page.uncheck("#show-ground")
-    assert page.eval_on_selector("image", "each => getComputedStyle(each).display") == "none"
-
-
-def test_without_script_the_ground_stays_and_no_control_is_shown(browser, made):
-    context = browser.new_context(java_script_enabled=False)
-    page = context.new_page()
-    page.goto(made.as_uri())
-    assert page.is_visible(".dots.layer-accepted")
-    assert not page.is_visible("#step")
-    assert not page.is_visible(".zoom")
-    context.close()
 
 
 def test_no_name_of_a_log_becomes_code(browser, tmp_path):
