@@ -96,27 +96,6 @@ def test_this_machine_is_recognised_by_its_device_tree(tmp_path):
     assert board.cores == os.cpu_count()
 
 
-@pytest.mark.parametrize(
-    ("model", "name"),
-    [
-        ("Raspberry Pi Zero 2 W Rev 1.0", "rpi-zero-2w"),
-        ("Raspberry Pi 3 Model A Plus Rev 1.0", "rpi-3a-plus"),
-        ("Raspberry Pi 3 Model B Rev 1.2", "rpi-3b"),
-        ("Raspberry Pi 3 Model B Plus Rev 1.3", "rpi-3b-plus"),
-        ("Raspberry Pi 400 Rev 1.0", "rpi-400"),
-        ("Raspberry Pi 4 Model B Rev 1.4", "rpi-4b"),
-        ("Raspberry Pi Compute Module 4 Rev 1.1", "rpi-cm4"),
-        ("Raspberry Pi 5 Model B Rev 1.0", "rpi-5"),
-        ("Raspberry Pi Compute Module 5 Rev 1.0", "rpi-cm5"),
-        ("Hardkernel Odroid XU4", "odroid-xu4"),
-        ("NVIDIA Jetson Nano Developer Kit", "jetson-nano"),
-        ("NVIDIA Jetson Orin Nano Developer Kit", "jetson-orin-nano"),
-    ],
-)
-def test_each_board_is_recognised(tmp_path, model, name):
-    assert load_board("this", this_root(tmp_path, model)).name == name
-
-
 def test_a_machine_without_a_device_tree_is_any_x86(tmp_path):
     board = load_board("this", this_root(tmp_path))
     assert (board.name, board.verified) == ("generic-x86", False)
@@ -158,33 +137,6 @@ def test_the_services_own_limits_are_not_taken_off_twice(tmp_path):
     memory_max = f"{round(free.memory_max_mb * 1e6)}\n"
     served = load_board("this", this_root(tmp_path / "served", model, memory_max=memory_max, cpu_max=quota))
     assert served == free
-
-
-@pytest.mark.parametrize(
-    ("name", "single", "multi", "products", "thermal_limit_c"),
-    [
-        ("rpi-zero-2w", 838, 3030, None, 80),
-        ("rpi-3a-plus", 856, 3040, None, 60),
-        ("rpi-3b", 977, 2970, None, 80),
-        ("rpi-3b-plus", 856, 3040, None, 60),
-        ("rpi-400", 1741, 5760, 11.077, 80),
-        ("rpi-4b", 1741, 5760, 11.889, 80),
-        ("rpi-5", 3160, None, 30.249, 80),
-        ("rpi-cm4", 1741 * 1.5 / 1.8, 5760 * 1.5 / 1.8, 11.433, 80),
-        ("rpi-cm5", 3306, 11830, 32.152, 80),
-        ("odroid-xu4", 1604, 8980, None, None),
-        ("jetson-nano", 1578, 5250, None, None),
-        ("jetson-orin-nano", 2153, None, None, None),
-    ],
-)
-def test_the_scores_are_the_published_figures_beside_the_references(name, single, multi, products, thermal_limit_c):
-    board = load_board(name)
-    score = board.benchmark_score
-    assert score.single == pytest.approx(single / 4630, abs=0.006)
-    assert score.multi == (multi and pytest.approx(multi / 4630, abs=0.006))
-    assert score.products == (products and pytest.approx(products / 4 / 53, rel=0.02))
-    assert score.passes is None
-    assert board.thermal_limit_c == thermal_limit_c
 
 
 def test_this_machine_knows_where_it_begins_to_slow_down(tmp_path):

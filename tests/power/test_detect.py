@@ -110,24 +110,3 @@ def test_a_control_group_limits_what_the_profile_may_take(tree):
 def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, model):
     root = tree(arm(model, "0xd03"))
     assert written(root).recognised_by == model
-
-
-def test_an_unknown_processor_is_called_so(tree):
-    found = detect(tree(arm("Some board", "0xfff") | {"sys/devices/system/cpu/online": "0,2-3\n"}))
-    assert (found["cpu"], found["cores"]) == ("1 x CPU part 0xfff", 3)
-    assert detect(tree({"proc/cpuinfo": "nothing"}))["cpu"].startswith("unknown ")
-
-
-def test_the_real_machine_is_looked_at():
-    found = detect()
-    assert 0 < found["usable_cores"] <= found["cores"]
-    assert found["ram_limit_mb"] <= found["ram_mb"]
-
-
-def test_it_says_what_the_machine_is_and_what_a_control_group_leaves(tree):
-    limits = {"sys/fs/cgroup/memory.max": "300000000\n", "sys/fs/cgroup/cpu.max": "40000 100000\n"}
-    found = detect(tree(x86(sys_vendor="AAEON", product_name="UP-APL03") | limits))
-    assert found["title"].startswith("AAEON UP-APL03")
-    assert (found["board"], found["cores"], found["ram_mb"]) == (None, 4, 4096)
-    assert (found["usable_cores"], found["ram_limit_mb"], found["thermal_limit_c"]) == (0.4, 300, 80)
-    assert detect(tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4)))["board"] == "rpi-4b"

@@ -42,11 +42,6 @@ def test_the_limit_of_a_group_above_binds_too(tree):
     assert machine.ram_limit_mb(root) == 100.0
 
 
-def test_a_limit_above_the_machine_changes_nothing(tree):
-    root = tree({"proc/meminfo": MEMINFO, "proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "99999999999999\n"})
-    assert machine.ram_limit_mb(root) == 2048.0
-
-
 @pytest.mark.parametrize(("quota", "expected"), [("50000 100000", 0.5), ("max 100000", None)])
 def test_the_quota_of_the_service_bounds_the_cores(tree, quota, expected):
     root = tree({"proc/self/cgroup": SERVICE, "sys/fs/cgroup/system.slice/edgevpr.service/cpu.max": f"{quota}\n"})
@@ -62,25 +57,12 @@ def test_cores_obey_the_affinity_of_the_process(tree):
         os.sched_setaffinity(0, allowed)
 
 
-def test_the_model_is_read_without_its_closing_zero(tree):
-    root = tree({"proc/device-tree/model": "Raspberry Pi 4 Model B Rev 1.4\0"})
-    assert machine.model(root) == "Raspberry Pi 4 Model B Rev 1.4"
-
-
-def test_a_machine_without_a_device_tree_has_no_model(tmp_path):
-    assert machine.model(tmp_path) is None
-
-
 def test_memory_of_the_process_is_read_in_megabytes(tree):
     root = tree(
         {"proc/self/statm": "90000 10000 4000 1 0 20000 0\n", "proc/self/smaps_rollup": "Rss: 9 kB\nPss: 1000 kB\n"}
     )
     assert machine.rss_mb(root) == 10000 * os.sysconf("SC_PAGE_SIZE") / 1e6
     assert machine.pss_mb(root) == 1.024
-
-
-def test_a_kernel_without_proportional_memory_says_none(tmp_path):
-    assert machine.pss_mb(tmp_path) is None
 
 
 def test_the_real_process_grows_by_what_it_touches():

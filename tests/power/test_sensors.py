@@ -33,11 +33,6 @@ def test_the_input_goes_by_its_name_and_must_be_switched_on(tree, changes, watts
     assert [meter.read_w() for meter in find_meters(tree(orin(**changes)))] == pytest.approx(watts)
 
 
-def test_a_chip_that_nothing_says_the_wiring_of_is_no_meter(tree):
-    files = {"name": "ina219\n", "power1_input": "3250000\n", "in1_input": "5100\n", "curr1_input": "637\n"}
-    assert not list(find_meters(tree({f"{HWMON}/hwmon3/{name}": text for name, text in files.items()})))
-
-
 @pytest.mark.parametrize(
     ("current", "word"),
     [("-800", "-4 W"), ("900000", "4500 W"), ("many", "'many'"), ("", "''"), ("nan", "nan W"), ("inf", "inf W")],
@@ -59,8 +54,3 @@ def test_a_meter_that_goes_is_a_sentence(tree):
     (root / HWMON / "hwmon1/curr1_input").unlink()
     with pytest.raises(MeterError, match="curr1_input"):
         meter.read_w()
-
-
-def test_a_machine_without_a_meter_has_none(tree):
-    root = tree({f"{HWMON}/hwmon0/name": "coretemp\n", f"{HWMON}/hwmon0/temp1_input": "40000\n"})
-    assert list(find_meters(root)) == []

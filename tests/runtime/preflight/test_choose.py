@@ -134,14 +134,6 @@ def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
     assert probe(TinyTechnique(fine=True)).process_mb < costs.process_mb - 50, "the peak of another is forgotten"
 
 
-def test_a_technique_without_a_fine_part_is_tried_too():
-    technique = TinyTechnique(fine=False)
-    costs = probe(technique)
-    assert technique.matched == 0
-    assert costs.disk_bytes_per_place == 16
-    assert costs.match_per_place.wall_s > 0
-
-
 def test_the_most_accurate_is_taken_where_it_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
     assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "the order says nothing"
@@ -213,30 +205,10 @@ def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
     assert "RAM" in fit(board(), two_stages, 100_100, 1, 100).misfit
 
 
-def test_where_none_fits_it_says_why(accuracies):
-    none = wanted(board(), COSTS, 1000)
-    assert best(none, board()) is None
-    assert nothing_to_choose(none, board()) == (
-        "nothing is chosen for Test board by itself: regions does not fit: it reaches 0.24 Hz of 1, and vector does "
-        "not fit: its map takes 286.0 MB of RAM and 100.0 are allowed and the process takes 376 MB and 300 are allowed "
-        "and it reaches 0.95 Hz of 1"
-    )
-
-
 def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
     assert fit(board(cpu_share=1.0), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.2)
     assert fit(board(cpu_share=0.25), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.8)
-
-
-@pytest.mark.slow
-def test_the_technique_that_is_picked_is_the_boards_only_if_it_fits(monkeypatch, accuracies):
-    accuracies |= {"cohog": found(0.9), "hog": found(0.4)}
-    # The process that runs the tests is large by itself.
-    small = board(technique="hog", budget_mb=1.0, memory_max_mb=4000.0)
-    for own, places, taken in ((small, 2, "hog"), (small, 100, "cohog")):
-        monkeypatch.setattr(pick, "load_board", lambda name, own=own: own)
-        assert pick.picked_technique("this", places) == taken
 
 
 @pytest.mark.slow

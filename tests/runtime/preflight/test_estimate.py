@@ -6,7 +6,6 @@ import pytest
 from example_costs import REGIONS
 from example_costs import VECTOR as ONE_CORE_VECTOR
 
-from edgevpr import techniques
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.equations import parse_pack
@@ -164,44 +163,3 @@ def test_what_cannot_be_used_is_kept_beside():
 
 def table(costs, plan=PLAN, board=ZERO):
     return format_table(estimate(board, HERE, costs, plan))
-
-
-def test_three_tables_have_a_line_for_each_technique_in_columns(accuracies):
-    del accuracies["regions"]
-    said = table(COSTS, replace(PLAN, places=1000))
-    answer, _, rest = said.partition("\n\n")
-    assert answer.startswith("Recommended: None: ")
-    heading, _, heads, regions, vector, _, finds, regions_finds, _, _, draws, regions_draws, _, _, why, *_ = (
-        rest.splitlines()
-    )
-    assert heading == (
-        "Raspberry Pi Zero 2 W: 1000 places, 1 Hz, 20 min, 4S5200 at 85% regulator efficiency; times measured, scaled"
-    )
-    assert regions.split()[:4] == ["regions", "no", "1000", "1.0"]
-    assert heads.index("disk MB") + len("disk MB") == regions.index("124.0") + len("124.0")
-    assert len(heads) == len(regions) == len(vector)
-    assert len(draws) == len(regions_draws)
-    assert finds.split()[:3] == ["technique", "recall@1", "accepted"]
-    assert regions_finds.split() == ["regions", "?", "?", "?", "never", "measured"]
-    assert "lost" not in draws
-    assert why.startswith("regions does not fit: it reaches 0.021 Hz")
-    assert ZERO.source in said.replace("\n  ", " ")
-
-
-def test_what_cannot_be_used_is_a_row_and_a_reason_and_minutes_lost_are_there_when_the_hover_power_is():
-    broken = [Trial(label=name, name=name, settings={}, problem="There is no model.") for name in ("calc", "alexnet")]
-    found = estimate_of(ZERO, HERE, [*trials({"regions": REGIONS}), *broken], replace(PLAN, hover_w=150.0))
-    lines = format_table(found).partition("\n\n")[2].splitlines()
-    assert [line.split() for line in lines[4:6]] == [["calc", "n/a"], ["alexnet", "n/a"]]
-    assert "calc, alexnet cannot be used: There is no model." in lines
-    assert ", hovering at 150 W;" in lines[0]
-    assert lines[10].split()[-4:] == ["pack", "min", "lost", "marginal"]
-
-
-@pytest.mark.parametrize("places", [10, 1_000_000])
-def test_every_technique_and_form_fits_in_120_columns(places):
-    offered = {f"{name} {form}".strip(): VECTOR for name in techniques.names() for form in ("", "8bit", "1bit")}
-    plan = replace(PLAN, places=places, hover_w=1234.5)
-    said = table(offered, plan, THESIS).partition("\n\n")[2].splitlines()
-    assert all(len(line) <= 120 for line in said[1:])
-    assert said[0].endswith("; times measured here, unscaled")

@@ -15,7 +15,6 @@ import pytest
 from tiny_networks import CARD, write_card, write_network
 
 from edgevpr.cli.main import main
-from edgevpr.core import child
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.runtime.preflight.networks import add, list_models, verify, verify_here
 from edgevpr.techniques.card import load_card
@@ -55,17 +54,6 @@ def test_verifying_says_shapes_time_and_memory(models):
     assert found.file_mb == pytest.approx((models / "mine.onnx").stat().st_size / 1e6)
     write_network(models, "backbone", card={"outputs": {"features": "features"}})
     assert verify_here(load_card("backbone")).vector_length is None
-
-
-@pytest.mark.process
-def test_verifying_is_done_apart_so_that_memory_is_that_of_the_network(models):
-    write_network(models, "mine")
-    found = verify(load_card("mine"))
-    assert found.runtime_mb > 3  # onnxruntime is imported anew
-    assert found.network_mb > 0
-    write_network(models, "mine", fault="nan")
-    with pytest.raises(EdgevprError, match="finite"):
-        verify(load_card("mine"))
 
 
 def test_the_commands_list_and_verify_all_networks(models, capsys, monkeypatch):
@@ -159,16 +147,6 @@ def test_a_file_or_card_that_is_not_there_is_one_sentence(models, download, caps
         file, card = (str(download / word) for word in words)
         assert main(["models", "add", file, "--card", card]) == code
         assert "none." in capsys.readouterr().err
-
-
-@pytest.mark.process
-def test_a_network_that_ends_the_process_that_tries_it_is_one_sentence(models, monkeypatch):
-    write_network(models, "large")
-    really = subprocess.Popen
-    argv = [sys.executable, "-c", "import os; input(); os.kill(os.getpid(), 9)"]  # as the kernel does
-    monkeypatch.setattr(child.subprocess, "Popen", lambda _, **more: really(argv, **more))
-    with pytest.raises(EdgevprError, match="SIGKILL"):
-        verify(load_card("large"))
 
 
 @pytest.mark.process

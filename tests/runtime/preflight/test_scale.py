@@ -11,7 +11,7 @@ from example_costs import VECTOR
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ
-from edgevpr.runtime.preflight.scale import UNKNOWN_PRODUCTS, Ratios, counted_work, is_same, on_board, ratios
+from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
@@ -41,26 +41,6 @@ def test_a_network_is_products_and_a_scan_of_vectors_is_passes():
     assert on_board(replace(VECTOR, is_network=True), HERE, there).encode.wall_s == pytest.approx(0.05 / 0.05)
     assert on_board(VECTOR, HERE, there).encode.wall_s == pytest.approx(0.05 / 0.2)
     assert on_board(VECTOR, HERE, there).match_per_place.wall_s == pytest.approx(0.001 / 0.2)
-
-
-def test_what_is_not_known_apart_is_taken_from_the_single_thread_and_products_modestly():
-    assert ratios(HERE, scored(single=0.4)) == Ratios(pytest.approx(0.4 * UNKNOWN_PRODUCTS), 0.4)
-    assert ratios(HERE, scored(single=0.4, products=0.1)) == Ratios(0.1, 0.4)
-    twice = replace(
-        HERE,
-        benchmark_score=MachineSpeed(single=2.0, multi=4.0, products=4.0, passes=1.0, verified=True, source="by hand"),
-    )
-    assert ratios(twice, scored(single=0.4, products=0.1)) == Ratios(pytest.approx(0.025), 0.4)
-    assert ratios(HERE, scored(products=0.1, passes=0.2)) == Ratios(0.1, 0.2)
-
-
-def test_no_board_is_taken_to_be_quicker_at_products_because_nobody_has_measured_them():
-    known = PI.benchmark_score.products / PI.benchmark_score.single
-    assert pytest.approx(known, abs=0.005) == UNKNOWN_PRODUCTS
-    products = {
-        name: ratios(HERE, load_board(name)).products for name in ("rpi-zero-2w", "rpi-3b-plus", "rpi-4b", "rpi-5")
-    }
-    assert products["rpi-zero-2w"] <= products["rpi-3b-plus"] < products["rpi-4b"] < products["rpi-5"]
 
 
 def test_what_is_not_known_apart_of_an_arm_board_is_by_the_instructions_that_were_counted():

@@ -56,24 +56,3 @@ def test_a_process_that_dies_is_a_row_that_says_so_and_the_others_go_on(monkeypa
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"
     assert part in found[0].problem
     assert found[0].costs is None
-
-
-def test_ctrl_c_leaves_no_process_behind(monkeypatch):
-    started = []
-    really = subprocess.Popen
-
-    class Interrupted(really):
-        def __init__(self, argv, **more):
-            super().__init__([sys.executable, "-c", "import time; time.sleep(60)"], **more)
-            assert more["start_new_session"], "or it would be interrupted itself, with a traceback"
-            started.append(self)
-
-        def communicate(self, *args, **more):
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(child.subprocess, "Popen", Interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        list(try_each(offers(["hog"]), threads=1))
-    assert started[0].poll() == -signal.SIGKILL
-    for pipe in (started[0].stdin, started[0].stdout, started[0].stderr):
-        pipe.close()
