@@ -1,25 +1,22 @@
 """The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
-no port and no thread, and is used inside turns only. A turn is the time in which one thread, that of a link or of the
-flight, uses it alone, while its clock stands still. Turns are on the tape, so that a flight can be replayed."""
+no port and no thread, and is used inside turns only (see `turns`)."""
 
 import logging
 import math
 import struct
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from threading import RLock
-from typing import Any
 
 from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.clock import SILENT_AFTER_S, ForeignStamps
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
 from edgevpr.mavlink.ground import PAUSED, Requests, Texts, Wish, Wished
-from edgevpr.mavlink.messages import Fix, Health, Severity
+from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.origin import OriginAltitude
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -80,10 +77,11 @@ class Conversation:
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
         self._heartbeat_due_s = self._state_due_s = self._between_due_s = clock()
         self._ask_position_s: float | None = None  # when to request its reports next; None: not wanted
-        self._asked_for_state = False
-        self._told_channel = self.channel  # the channel that the listener knows
-        self._odometry_since_s = math.inf
-        self._origin = settings.origin
+        self._foreign_stamps = ForeignStamps()
+        self._restarts, self._restarted_s = 0, -math.inf
+        self._told_channel: Channel | None = self.channel  # the channel that the listener knows
+        self._asked_for_state: bool | None = None
+        self._no_origin_since_s, self._has_set_origin = math.inf, False
         self._origin_altitude = OriginAltitude(self.announce)
         self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
 
@@ -187,12 +185,16 @@ class Conversation:
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
-                    self.fixes.break_off("another autopilot has taken its place")
+                    self._begin_anew("another autopilot has taken its place")
                     self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
+            if self.autopilot.has_restarted:
+                self._begin_anew("the autopilot has restarted")
+                self._announce_restart(now_s)
             if self.autopilot.answer:
                 self._hear_answer(self.autopilot.answer, now_s)
             if not self.autopilot.identity.is_elsewhere(sender):
                 self._hear_request(message, now_s)
+                self._hear_stamp(message, now_s)
         return is_ours
 
     def tell_of_answers(self) -> None:
@@ -230,13 +232,17 @@ class Conversation:
             return messages.heartbeat(Health.CRITICAL if is_stuck else self._health), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.listens(now_s):
+            if request := self.autopilot.clock.request(now_s):
+                return request, None
             self._ask_for_position(system_id, now_s)
             if self.channel.is_continuous and (state := self._state(system_id, now_s)):
                 return state, None
             if why := PAUSED if self.requests.is_paused else self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
+            elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
+                self.fixes.drop_stale(now_s)
             elif sending := self.fixes.next(now_s) or self._between(now_s):
-                return messages.position_fix(sending.fix, now_s, system_id), sending
+                return messages.position_fix(sending.fix, now_s, system_id, stamp_s), sending
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
@@ -253,7 +259,7 @@ class Conversation:
         return self.fixes.next(now_s)
 
     def _state(self, system_id: int, now_s: float) -> Message | None:
-        """Make the next message of a continuous channel, if any: a position or, once, the origin of its local frame."""
+        """Make the next message of a continuous channel, if any: a position, or the origin of its local frame."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_S, now_s)
@@ -261,19 +267,23 @@ class Conversation:
         state = self.settings.listener.state_at(t_s := now_s - choice.lag_s)
         if self.requests.is_paused:
             state = None
-        if choice.channel is Channel.GPS_INPUT:
-            t_unix_s = None if autopilot.utc_ahead_s is None else t_s + autopilot.utc_ahead_s
-            return messages.gps_input(state, choice.receiver, t_s, t_unix_s)
         if choice.channel in (Channel.SENSOR, Channel.VISION):
             return autopilot.px4.told(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
-        if autopilot.origin is None and self._origin and now_s - self._odometry_since_s > ORIGIN_WITHIN_S:
-            log.warning("the autopilot has no origin: it is set to the first place of the map")
-            here, self._odometry_since_s = self._origin, now_s
+        if (stamp_s := autopilot.stamp_s(t_s)) is None:
+            return None
+        if choice.channel is Channel.GPS_INPUT:
+            return messages.gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
+        here = self.settings.origin
+        if autopilot.origin is None and here and now_s - self._no_origin_since_s > ORIGIN_WITHIN_S:
+            # Again if it is not heard: an autopilot whose filter has not started yet ignores it.
+            self._no_origin_since_s = now_s
             message = self._origin_altitude.place(here, system_id, autopilot.pressure_alt_m)
-            self._origin = None if message.get_type() == "SET_GPS_GLOBAL_ORIGIN" else here
+            if message.get_type() == "SET_GPS_GLOBAL_ORIGIN" and not self._has_set_origin:
+                log.warning("the autopilot has no origin: it is set to the first place of the map")
+                self._has_set_origin = True
             return message
         if state and state.attitude and autopilot.origin:
-            return messages.odometry(state, state.attitude, autopilot.origin)
+            return messages.odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
@@ -283,7 +293,7 @@ class Conversation:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))
         if self.channel is not self._told_channel:
-            self._told_channel, self._odometry_since_s = self.channel, now_s
+            self._told_channel, self._no_origin_since_s, self._ask_position_s = self.channel, now_s, now_s
             self.settings.listener.hear_channel(self.channel)
         if now_s < self._ask_position_s:
             return
@@ -294,9 +304,35 @@ class Conversation:
         is_silent = vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S
         # A ground station that asks for rates of its own sets ours back, as all of a port share them.
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
+        is_slowed |= is_continuous and now_s - self.autopilot.force_s > ASK_AGAIN_S
         if is_silent or is_slowed or self._asked_for_state != is_continuous:
             self._asked_for_state = is_continuous
             self.send(*messages.report_requests(system_id, self.autopilot.firmware, is_continuous))
+
+    def _begin_anew(self, why: str) -> None:
+        """Begin again with an autopilot that has forgotten everything. `why` goes to the fixes without an answer."""
+        self.fixes.break_off(why)
+        self._asked_for_state = self._told_channel = None
+        self._no_origin_since_s, self._has_set_origin = math.inf, False
+        if self._ask_position_s is not None:
+            self._ask_position_s = self._clock()
+
+    def _announce_restart(self, now_s: float) -> None:
+        self._restarts += 1
+        if now_s - self._restarted_s > SILENT_AFTER_S:
+            log.warning("the autopilot has restarted: its parameters, rates and origin are asked for again")
+            often = f" {self._restarts} times" if self._restarts > 1 else ""
+            self.announce(Severity.WARNING, f"autopilot has restarted{often}", "autopilot")
+        self._restarted_s = now_s
+
+    def _hear_stamp(self, message: Message, now_s: float) -> None:
+        """Report a time stamp of another program that spoils those of all senders to an ArduPilot."""
+        us = self._packer.srcSystem, self._packer.srcComponent
+        sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
+        if sender in (us, (us[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+            return
+        if found := self._foreign_stamps.find(message, autopilot.boot_time_s(now_s)):
+            self.announce(Severity.WARNING, f"wrong stamps: {found}", "stamps")
 
     def _hear_request(self, message: Message, now_s: float) -> None:
         self.send(*self.requests.hear(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
@@ -309,50 +345,3 @@ class Conversation:
         if answer == "FAILED" and readiness.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.send(messages.message_request(self.autopilot.system_id or 0, origin))
-
-
-class Turns:
-    """Gives turns to one thread at a time. A conversation depends only on their times and on its input."""
-
-    def __init__(self, clock: Callable[[], float], tape: Tape = NO_TAPE) -> None:
-        self._clock, self._tape = clock, tape
-        self._lock = RLock()
-        self._t_s: float | None = None  # time of the current turn; None between turns
-
-    def now_s(self) -> float:
-        """Return the time of the current turn, or that of the clock between turns."""
-        t_s = self._t_s
-        return self._clock() if t_s is None else t_s
-
-    @contextmanager
-    def taken(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn, named `what` on the tape, in the flight's thread, or go on with its own."""
-        with self._lock:
-            if self._t_s is not None:
-                yield
-                return
-            with self.again(self._tape.read(f"turn: {what}", self._clock)):
-                yield
-
-    @contextmanager
-    def again(self, t_s: float) -> Iterator[None]:
-        """Context manager: let the time stand still at `t_s`; in a replay, this repeats a link's turn."""
-        self._t_s = t_s
-        try:
-            yield
-        finally:
-            self._t_s = None
-
-    @contextmanager
-    def of_link(self, name: str) -> Iterator[Callable[..., None]]:
-        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`
-        that notes what happens in the turn, such as `step("heard", data)`. All steps go to the tape as one record."""
-        steps: list[tuple[Any, ...]] = []
-        with self._lock:
-            t_s = self._clock()
-            try:
-                with self.again(t_s):
-                    yield lambda *step: steps.append(step)
-            finally:
-                if steps:
-                    self._tape.note(name, t_s, steps)

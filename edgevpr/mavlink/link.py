@@ -13,9 +13,10 @@ from typing import Concatenate, ParamSpec, TypeVar
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.conversation import Conversation, LinkSettings, Turns
+from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.ports import Line, Port, open_port
 from edgevpr.mavlink.signing import OLD
+from edgevpr.mavlink.turns import Turns
 
 TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0

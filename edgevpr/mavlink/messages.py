@@ -1,7 +1,7 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
 
-`t_mono_s` is a time of the system's monotonic clock in seconds, the only clock of a link: an autopilot keeps a single
-time correction for all messages of a link.
+`t_mono_s` is a time of the system's monotonic clock in seconds. `stamp_s` is such a time by the clock of the receiver:
+an ArduPilot keeps a single time correction for all messages of a link, which every restart of our clock would spoil.
 """
 
 import math
@@ -86,9 +86,10 @@ def heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -
     return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, system_status=health, mavlink_version=3)
 
 
-def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
+def position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float | None = None) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
-    The age of the fix is sent as processing time. `t_sent_s` goes as a float32: good to 8 ms after one day."""
+    The age of the fix is sent as processing time. `stamp_s` (None: `t_sent_s`) is the time of sending. It goes as a
+    float32: good to 8 ms after one day."""
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
         target_component=AUTOPILOT,
@@ -96,7 +97,7 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int) -> Message:
         command=POSITION_FIX,
         current=0,
         autocontinue=0,
-        param1=t_sent_s,
+        param1=t_sent_s if stamp_s is None else stamp_s,
         param2=max(0.0, t_sent_s - fix.t_frame_s),
         param3=fix.accuracy_m,
         param4=math.nan,
@@ -125,9 +126,9 @@ def position_sensor(state: MotionState) -> Message:
     )
 
 
-def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_s: float | None) -> Message:
+def gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix", a
-    reserve as a poor fix. `t_mono_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970
+    reserve as a poor fix. `stamp_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970
     (None: unknown)."""
     week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
@@ -137,7 +138,7 @@ def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_
     if state and state.is_reserve:
         satellites, sd_m, sd_m_s = _RESERVE_SATELLITES, _RESERVE_SD_M, _RESERVE_SD_M_S
     return mavlink.MAVLink_gps_input_message(
-        time_usec=round(t_mono_s * 1e6),
+        time_usec=round(stamp_s * 1e6),
         gps_id=receiver,
         ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
         time_week_ms=int(rest_s * 1000),
@@ -158,7 +159,9 @@ def gps_input(state: MotionState | None, receiver: int, t_mono_s: float, t_unix_
     )
 
 
-def odometry(state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float]) -> Message:
+def odometry(
+    state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float], stamp_s: float
+) -> Message:
     """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `origin`
     (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
     `attitude` is (roll, pitch, yaw) in radians and must not contain NaN.
@@ -179,6 +182,7 @@ def odometry(state: MotionState, attitude: tuple[float, float, float], origin: t
     return _odometry(
         state,
         origin,
+        time_usec=round(stamp_s * 1e6),
         frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
         q=list(quaternion.QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
         vx=velocity.x,
@@ -198,6 +202,7 @@ def vision_position(state: MotionState, origin: tuple[float, float, float]) -> M
     return _odometry(
         state,
         origin,
+        time_usec=round(state.t_mono_s * 1e6),
         frame_id=mavlink.MAV_FRAME_LOCAL_NED,
         q=[math.nan] * 4,
         vx=math.nan,
@@ -212,7 +217,6 @@ def _odometry(state: MotionState, origin: tuple[float, float, float], **fields: 
     """Make an ODOMETRY with the position of a state beside `origin`, and with `fields`, those of the channel."""
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     return mavlink.MAVLink_odometry_message(
-        time_usec=round(state.t_mono_s * 1e6),
         child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
         x=float(north_m),
         y=float(east_m),

@@ -10,6 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel, Interview
+from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Use
@@ -19,8 +20,8 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
-SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
-_LEAST_HPA, _MOST_HPA = 300.0, 1100.0  # of the air where anything flies
+_LEAST_HPA = 300.0  # of the air where anything flies
+_MOST_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
 
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
@@ -94,7 +95,7 @@ class Listener:
     channel sends; this one does nothing. The link's thread calls the methods, which never block and never raise."""
 
     def hear_autopilot(self, t_s: float) -> None:
-        """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
+        """Note that at `t_s` an autopilot was first heard, has restarted, or that another one has taken its place."""
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which the autopilot is told positions: when first chosen, and when it changes."""
@@ -120,7 +121,8 @@ class Listener:
 
 class Autopilot:
     """The state of the autopilot and its vehicle, from all messages received, of which `identity` decides whose they
-    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
+    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard).
+    `has_restarted`: the last message showed it."""
 
     def __init__(self, own_component: int, system_id: int | None, listener: Listener) -> None:
         self.identity = Identity(system_id)
@@ -130,6 +132,7 @@ class Autopilot:
         self._listener, self._own_component = listener, own_component
         self.heard_s = -math.inf  # the time of its last heartbeat through the port now open
         self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
+        self.has_restarted = False
         self._forget()
 
     def _forget(self) -> None:
@@ -138,7 +141,7 @@ class Autopilot:
         self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self.heights, self.certainty = Attitudes(), Heights(), Certainty()
-        self.utc_ahead_s: float | None = None  # its clock (seconds since 1970) less our monotonic one
+        self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
         self.receivers = Receivers()
 
@@ -146,6 +149,18 @@ class Autopilot:
     def system_id(self) -> int | None:
         """System id of the autopilot; None until its first heartbeat."""
         return self.identity.kept.system_id if self.identity.kept else None
+
+    def boot_time_s(self, t_mono_s: float) -> float | None:
+        """Return its time since boot at `t_mono_s`, a time of our clock; None: not known (yet)."""
+        return self.clock.boot_time_s(t_mono_s)
+
+    def mono_s(self, boot_s: float) -> float | None:
+        """Return the time of our clock when it had run for `boot_s`; None: not known (yet)."""
+        return self.clock.mono_s(boot_s)
+
+    def stamp_s(self, t_mono_s: float) -> float | None:
+        """Return `t_mono_s` as a time stamp for it; None: not known yet. A PX4 converts stamps of our clock itself."""
+        return t_mono_s if self.firmware == mavlink.MAV_AUTOPILOT_PX4 else self.clock.stamp_s(t_mono_s)
 
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
@@ -171,7 +186,7 @@ class Autopilot:
 
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
         """Process a message received at `now_s` from `address`. Returns True if it is a heartbeat of our autopilot."""
-        self.answer = None
+        self.answer, self.has_restarted = None, False
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
             self.identity.foreign_messages += self.identity.is_elsewhere(address)
             return False
@@ -180,8 +195,11 @@ class Autopilot:
         before = self.identity.kept
         if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
             return False
-        if self.identity.kept != before:
+        is_other = self.identity.kept != before
+        self.has_restarted = not is_other and self.clock.hear(message, now_s)
+        if is_other or self.has_restarted:
             self._forget()
+            self.clock.hear(message, now_s)
             self._listener.hear_autopilot(now_s)
         self.interview.hear(message)
         if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
@@ -214,10 +232,9 @@ class Autopilot:
             case "ATTITUDE":
                 self.attitudes.hear(message, now_s)
             case "SCALED_IMU" if attitude := self.attitudes.at(now_s):
+                self.force_s = now_s
                 nose, right, down = (axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
                 self._listener.hear_force(now_s, (nose, right, down), attitude)
-            case "SYSTEM_TIME" if message.time_unix_usec:
-                self.utc_ahead_s = message.time_unix_usec / 1e6 - now_s
             case "SCALED_PRESSURE" if _LEAST_HPA < message.press_abs < _MOST_HPA:
                 self.pressure_alt_m = 44330.8 * (1 - (message.press_abs / 1013.25) ** 0.190263)
             case "GPS_GLOBAL_ORIGIN":

@@ -14,13 +14,46 @@ FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 class Autopilot:
-    """Autopilot 7, at 50, 8 unless it says another place; it says what it is told to."""
+    """Autopilot 7, at 50, 8 unless it says another place; it says what it is told to. It booted at `booted_s` of our
+    clock, and answers TIMESYNC, which is in no list, after `timesync_s` seconds (None: never)."""
 
-    def __init__(self, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, **settings) -> None:
+    def __init__(self, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, booted_s=0.0, timesync_s=0.0, **settings) -> None:
         self.clock, self.firmware = FakeClock(), firmware
         self.conversation = Conversation(LinkSettings(**settings), self.clock)
         self._packers, self.packets = {}, []
+        self.booted_s, self.timesync_s, self.timesyncs = booted_s, timesync_s, 0
         self.beat()
+        self._listen()
+
+    @property
+    def boot_s(self):
+        return self.clock.now_s - self.booted_s
+
+    @property
+    def boot_ms(self):
+        return round(self.boot_s * 1e3) % 2**32
+
+    def reboot(self, silent_s=1.6):
+        """Start anew, and be silent meanwhile."""
+        self.wait(silent_s)
+        self.booted_s = self.clock.now_s - 1.0
+
+    def _listen(self, address=None):
+        """Take what is sent now, and answer the questions for the time."""
+        for packet, fix in iter(self.conversation.next_packet, None):
+            (message,) = PacketReader().feed(packet)
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self.timesyncs += 1
+                if self.timesync_s is not None:
+                    self.wait(self.timesync_s)
+                    self.say(
+                        mavlink.MAVLink_timesync_message(round(self.boot_s * 1e9) + 1, message.ts1), address=address
+                    )
+            else:
+                self.packets.append(packet)
+            if fix:
+                fix.settle(True)
+                self.conversation.note_departed([fix])
 
     def say(self, message, system_id=7, component_id=1, address=None):
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
@@ -36,14 +69,15 @@ class Autopilot:
 
     def locate(self, at_deg, alt_m, relative_m, velocity_cm_s=(0, 0, 0), hdg=9050, **sender):
         where = *(round(degrees * 1e7) for degrees in at_deg), round(alt_m * 1e3), round(relative_m * 1e3)
-        self.say(mavlink.MAVLink_global_position_int_message(0, *where, *velocity_cm_s, hdg), **sender)
+        self.say(mavlink.MAVLink_global_position_int_message(self.boot_ms, *where, *velocity_cm_s, hdg), **sender)
 
     def gps(self, fix_type=FIX_3D, h_acc=0, message=mavlink.MAVLink_gps_raw_int_message, lat_deg=50.0):
         second = () if message is mavlink.MAVLink_gps_raw_int_message else (0, 0)
         self.say(message(0, fix_type, round(lat_deg * 1e7), 80_000_000, 0, 80, 120, 0, 0, 14, *second, h_acc=h_acc))
 
     def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
-        self.say(mavlink.MAVLink_attitude_message(0, *map(math.radians, (roll_deg, pitch_deg, yaw_deg)), 0, 0, 0))
+        radians = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
+        self.say(mavlink.MAVLink_attitude_message(self.boot_ms, *radians, 0, 0, 0))
 
     def fly_on(self, seconds, attitude_hz):
         for _ in range(seconds * attitude_hz):
@@ -69,11 +103,7 @@ class Autopilot:
         """Let a fix be sent where one may be; it leaves at once."""
         self.beat(**sender)
         sending = self.conversation.fixes.put(Fix(50.0, 8.0, accuracy_m, self.clock.now_s), self.clock.now_s)
-        for packet, fix in iter(self.conversation.next_packet, None):
-            self.packets.append(packet)
-            if fix:
-                fix.settle(True)
-                self.conversation.note_departed([fix])
+        self._listen(sender.get("address"))
         return sending
 
     def answer(self, result, command=43003, to=197):
@@ -92,7 +122,7 @@ class Autopilot:
     def told(self):
         """The messages that have been sent since the last call."""
         self.conversation.tell_of_answers()
-        self.packets += [packet for packet, _ in iter(self.conversation.next_packet, None)]
+        self._listen()
         packets, self.packets = self.packets, []
         return list(PacketReader().feed(b"".join(packets)))
 

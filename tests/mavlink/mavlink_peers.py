@@ -42,14 +42,25 @@ def free_port(kind: int = socket.SOCK_DGRAM) -> int:
 
 
 class Peer:
-    """An autopilot worked by hand over a socket-like `port` (recv, send); it sees nothing but what it reads."""
+    """An autopilot worked by hand over a socket-like `port` (recv, send); it sees nothing but what it reads. It answers
+    TIMESYNC as if it had booted with us."""
 
     def __init__(self, port, system_id: int = 1) -> None:
         self.port = port
         self.seen = []
         self.receiver = PacketReader()
         self._senders = {}
-        self._system_id = system_id
+        self._system_id, self._timesyncs = system_id, 0
+
+    def synchronise(self, link: Link) -> None:
+        """Answer a TIMESYNC, without which no fix leaves."""
+
+        def is_known() -> bool:
+            return link._conversation.autopilot.stamp_s(0.0) is not None
+
+        while not is_known() and not self._timesyncs:
+            self.read()
+        wait_until(is_known, "learning the autopilot's time")
 
     def send(self, message, system_id: int | None = None, component_id: int = 1) -> None:
         sender = (system_id or self._system_id, component_id)
@@ -70,7 +81,12 @@ class Peer:
 
     def read(self) -> None:
         """Take what comes next."""
-        self.seen += self.receiver.feed(self.port.recv(65_536))
+        for message in self.receiver.feed(self.port.recv(65_536)):
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self._timesyncs += 1
+                self.send(mavlink.MAVLink_timesync_message(message.ts1 + 1, message.ts1), message.get_srcSystem())
+            else:
+                self.seen.append(message)
 
     def expect(self, name: str):
         """Read until a message of this name comes; give it and forget it and all before."""

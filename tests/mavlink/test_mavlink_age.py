@@ -97,7 +97,7 @@ def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_s
         far = narrow_server.accept()
         peer = Peer(far, 7)
         peer.heartbeat()
-        wait_until(link.listens)
+        peer.synchronise(link)
         # So much text that the fixes behind it cannot leave.
         wait_until(lambda: (link.send(*[status_text(Severity.INFO, "x" * 50)] * 9), _held(link))[1], "filling the line")
         fixes = []
@@ -134,6 +134,7 @@ def test_the_longest_wait_is_the_configurations(clock, max_age_s, leaves):
         fix = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
         clock.now_s += 0.5
         peer.heartbeat()
+        peer.synchronise(link)
         wait_until(lambda: fix.sent is not None)
         assert fix.sent is leaves
         if not leaves:
@@ -146,7 +147,7 @@ def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
     peer = Peer(_Terminal(master), 7)
     with link_to(f"serial:{os.ttyname(slave)}:57600", max_fix_age_s=0.2) as link:
         peer.heartbeat()
-        wait_until(link.listens)
+        peer.synchronise(link)
         termios.tcflow(slave, termios.TCOOFF)
         fix = link.send_fix(Fix(50.0, 8.0, 20.0, time.monotonic()))
         wait_until(lambda: fix.sent is not None, "giving up the fix")

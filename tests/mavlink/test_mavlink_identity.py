@@ -110,6 +110,7 @@ def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speak
     link, autopilot = listening
     ours, thief = autopilot(1), autopilot(1)
     speak(link, ours, clock, 1)
+    ours.synchronise(link)
     for _ in range(40):
         speak(link, thief, clock, 1)
         thief.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
@@ -129,12 +130,14 @@ def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_
     link, autopilot = listening
     before = autopilot(1)
     speak(link, before, clock, 2)
+    before.synchronise(link)
     assert became_of_a_fix(link, clock)
     clock.now_s += 20.0
     after = autopilot(1)
     speak(link, after, clock, 7)
     assert not became_of_a_fix(link, clock)
     speak(link, after, clock, 7)
+    after.synchronise(link)
     assert became_of_a_fix(link, clock)
     after.expect_text("edgevpr: autopilot has another address")
     assert after.expect("COMMAND_INT").target_system == 1
@@ -152,6 +155,7 @@ def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one
         assert not became_of_a_fix(link, clock)
         assert link.stats().autopilot_system_id is None
         speak(link, peer, clock, 1, system_id=5)
+        peer.synchronise(link)
         assert became_of_a_fix(link, clock)
         assert peer.expect("COMMAND_INT").target_system == 5
         port.close()
@@ -163,7 +167,9 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog
     number = free_port(socket.SOCK_STREAM)
     server = TcpServer(number)
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
-        speak(link, Peer(server.accept(), 1), clock, 1)
+        ours = Peer(server.accept(), 1)
+        speak(link, ours, clock, 1)
+        ours.synchronise(link)
         server.close()
         wait_until(lambda: not link.stats().connected, "noticing the loss")
         server = TcpServer(number)
@@ -171,5 +177,6 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog
         speak(link, stranger, clock, 3)
         assert not became_of_a_fix(link, clock), "ours was heard 4 s ago, but over another connection"
         speak(link, stranger, clock, 1, system_id=1)
+        stranger.synchronise(link)
         assert became_of_a_fix(link, clock)
     server.close()

@@ -133,6 +133,7 @@ def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_
         peer = Peer(server.accept())
         peer.expect("HEARTBEAT")
         heard(link, peer)
+        peer.synchronise(link)
         peer.port.send(b"\xfd\xff\x00")  # dies in the middle of a message
         server.close()
         wait_until(lambda: not link.stats().connected, "noticing the loss")
@@ -215,6 +216,7 @@ def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
 
 def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
     heard(link, peer)
+    peer.synchronise(link)
     link.send_fix(fix_at(clock()))
     closing_link = threading.Thread(target=link.close)
     closing_link.start()
@@ -238,7 +240,7 @@ def test_pymavlinks_own_connection_decodes_all_that_is_sent(monkeypatch, clock):
         other.mav.heartbeat_send(
             mavutil.mavlink.MAV_TYPE_QUADROTOR, mavutil.mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4
         )
-        wait_until(lambda: link.stats().autopilot_heard)
+        other.mav.timesync_send(1, other.recv_match(type="TIMESYNC", blocking=True, timeout=60).ts1)
         link.send_fix(fix_at(clock.now_s))
         assert other.recv_match(type="COMMAND_INT", blocking=True, timeout=60).command == 43003
         link.send(*named_values(1.0, vpr_place=2, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0), text("end"))

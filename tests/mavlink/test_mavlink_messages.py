@@ -130,7 +130,7 @@ def test_a_receiver_without_a_fix_says_so_and_one_without_a_clock_says_no_time()
 
 def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airframe():
     origin = *moved(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
-    heard = sent_and_received(messages.odometry(STATE, STATE.attitude, origin))
+    heard = sent_and_received(messages.odometry(STATE, STATE.attitude, origin, 7.0))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)
     w, x, y, z = heard.q

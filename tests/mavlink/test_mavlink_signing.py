@@ -172,8 +172,8 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
 
             def beat() -> bool:
                 other.mav.heartbeat_send(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4)
-                other.recv_match(blocking=True, timeout=0.1)
-                return link.stats().autopilot_heard
+                request = other.recv_match(type="TIMESYNC", blocking=True, timeout=0.1)
+                return request and other.mav.timesync_send(1, request.ts1) is None
 
             wait_until(beat, "believing the autopilot that signs")
             link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))

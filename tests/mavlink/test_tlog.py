@@ -84,7 +84,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
             peer.expect("HEARTBEAT")
             port.send(b"no packet\xfd\x05" + bytes(300))
             peer.heartbeat()
-            wait_until(link.listens)
+            peer.synchronise(link)
             sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._settings.clock()))
             assert peer.expect("COMMAND_INT").x == 500_000_000
             wait_until(lambda: sending.sent)
@@ -99,7 +99,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     assert unknown in [each for _, each in written]
     names = [message.get_type() for message in PacketReader().feed(b"".join(each for _, each in written))]
     counted = {name: names.count(name) for name in names}
-    assert counted == {**stats.sent, "HEARTBEAT": stats.sent["HEARTBEAT"] + 1, "COMMAND_ACK": 1}
+    assert counted == {**stats.sent, "HEARTBEAT": stats.sent["HEARTBEAT"] + 1, "TIMESYNC": 2, "COMMAND_ACK": 1}
     said = dumped(path, "--show-source")
     for words in ("COMMAND_INT {target_system : 1", "srcComponent=197", "COMMAND_ACK {command : 43003"):
         assert words in said

@@ -1,0 +1,202 @@
+"""The autopilot's clock, the seconds since its boot, as a function of our monotonic clock. It is learnt by TIMESYNC
+(ArduPilot `GCS_MAVLINK::handle_timesync`, PX4 `MavlinkTimesync::handle_message`), and shows when the autopilot has
+restarted."""
+
+import logging
+import math
+from collections import deque
+from typing import NamedTuple
+
+from edgevpr.mavlink.wire import Message, mavlink
+
+SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
+OWN_CLOCK_AFTER_S = 5.0  # without an answer
+_ASK_EVERY_S, _ASK_EVERY_AT_FIRST_S = 1.0, 0.25
+_KEPT_S = 10.0  # of answers; two quartz clocks drift apart by 1 ms at most in this time
+_DRIFT_S = 1e-3
+_MAX_REQUESTS = 64  # whose answers are still awaited: those of a link that is very late
+_BACK_S = 1.0  # a boot time that goes back by more is that of another boot
+_DOUBT_S = 3.0  # after a gap of heartbeats; an autopilot that shows no boot time meanwhile counts as restarted
+_UTC_ROUNDED_S = 5e-3  # its boot time comes in whole milliseconds
+_STAMP_OFF_S = 1.0
+# Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
+_BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
+_WRAP_MS, _NEAR_WRAP_MS = 2**32, 60_000
+# The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
+# `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
+_STAMPS = {
+    "ATT_POS_MOCAP": "time_usec",
+    "GLOBAL_VISION_POSITION_ESTIMATE": "usec",
+    "LANDING_TARGET": "time_usec",
+    "ODOMETRY": "time_usec",
+    "VICON_POSITION_ESTIMATE": "usec",
+    "VISION_POSITION_ESTIMATE": "usec",
+    "VISION_SPEED_ESTIMATE": "usec",
+}
+
+log = logging.getLogger(__name__)
+
+
+class _Answer(NamedTuple):
+    """The bounds that an answer to TIMESYNC sets to the offset, boot time less monotonic time; received at `t_s`."""
+
+    t_s: float
+    least_s: float
+    most_s: float
+
+    @property
+    def round_trip_s(self) -> float:
+        return self.most_s - self.least_s
+
+    def overlaps(self, other: "_Answer") -> bool:
+        return self.least_s <= other.most_s + _DRIFT_S and other.least_s <= self.most_s + _DRIFT_S
+
+
+class AutopilotClock:
+    """Converts our monotonic time to the autopilot's time since boot, and to its UTC. The offset is that of the answer
+    with the shortest round trip of the last ten seconds. Where TIMESYNC is not answered within five seconds, time
+    stamps are those of our own clock until the autopilot restarts."""
+
+    def __init__(self) -> None:
+        self._requests_ns: deque[int] = deque(maxlen=_MAX_REQUESTS)
+        self._asked_s = self._due_s = -math.inf  # first asked; when to ask again
+        self._answers: list[_Answer] = []
+        self._best: _Answer | None = None
+        self._uses_own = False
+        self._beat_s = math.inf  # of the last heartbeat
+        self._boot_ms: dict[str, int] = {}  # the last of each kind of message
+        self._doubt_s: float | None = None  # when a heartbeat came after a gap; None: it is the same boot
+        self._goes_on = False  # boot times have gone on since the gap
+        self._utc_ahead_s: float | None = None  # UTC less boot time
+        self._utc_ahead_of_ours_s: float | None = None  # UTC less our time, where the boot time is not known
+
+    def request(self, now_s: float) -> Message | None:
+        """Return the TIMESYNC to be sent at `now_s`; None if none is due."""
+        if not self._requests_ns:
+            self._asked_s = now_s
+        if self._best is None and not self._uses_own and now_s - self._asked_s > OWN_CLOCK_AFTER_S:
+            self._uses_own = True
+            log.warning("the autopilot does not answer TIMESYNC: time stamps are those of our own clock")
+        if now_s < self._due_s:
+            return None
+        is_urgent = self._doubt_s is not None or (self._best is None and not self._uses_own)
+        self._due_s = now_s + (_ASK_EVERY_AT_FIRST_S if is_urgent else _ASK_EVERY_S)
+        self._requests_ns.append(round(now_s * 1e9))
+        return mavlink.MAVLink_timesync_message(tc1=0, ts1=self._requests_ns[-1])
+
+    def hear(self, message: Message, now_s: float) -> bool:
+        """Process a message of the autopilot. Returns True if it shows that the autopilot has restarted: its boot time
+        goes back or, after a gap of heartbeats, does not go on."""
+        kind = message.get_type()
+        if kind == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._requests_ns:
+            if self._hear_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
+                return True
+        elif kind in _BOOT_TIMES:
+            if self._hear_boot_time(kind, message.time_boot_ms):
+                return True
+            if kind == "SYSTEM_TIME" and message.time_unix_usec:
+                self._hear_utc(message, now_s)
+        elif kind == "HEARTBEAT":
+            if now_s - self._beat_s > SILENT_AFTER_S:
+                self._doubt_s, self._due_s, self._goes_on = now_s, now_s, False
+            self._beat_s = now_s
+        if self._doubt_s is not None and now_s - self._doubt_s > _DOUBT_S:
+            self._doubt_s = None
+            return not self._goes_on
+        return False
+
+    def boot_time_s(self, t_mono_s: float) -> float | None:
+        """Return the autopilot's time since boot at `t_mono_s`; None: not known (yet)."""
+        offset_s = self._offset_s
+        return None if offset_s is None else t_mono_s + offset_s
+
+    def mono_s(self, boot_s: float) -> float | None:
+        """Return our time when the autopilot's boot was `boot_s` ago; None: not known (yet)."""
+        offset_s = self._offset_s
+        return None if offset_s is None else boot_s - offset_s
+
+    def stamp_s(self, t_mono_s: float) -> float | None:
+        """Return `t_mono_s` as a time stamp for the autopilot; None: not known yet, or perhaps that of a past boot."""
+        if self._doubt_s is not None:
+            return None
+        return t_mono_s if self._uses_own else self.boot_time_s(t_mono_s)
+
+    def utc_s(self, t_mono_s: float) -> float | None:
+        """Return the autopilot's UTC at `t_mono_s`, seconds since 1970; None: unknown."""
+        boot_s = self.boot_time_s(t_mono_s)
+        if boot_s is not None and self._utc_ahead_s is not None:
+            return boot_s + self._utc_ahead_s
+        return None if self._utc_ahead_of_ours_s is None else t_mono_s + self._utc_ahead_of_ours_s
+
+    @property
+    def _offset_s(self) -> float | None:
+        return (self._best.least_s + self._best.most_s) / 2 if self._best else None
+
+    def _hear_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
+        """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
+        answer, before = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
+        last = self._answers[-1] if self._answers else None
+        if last and boot_s < last.t_s + last.least_s - _BACK_S:
+            return True
+        if self._doubt_s is not None and before and answer.round_trip_s < _BACK_S:
+            if answer.most_s < before.least_s - _BACK_S:
+                return True
+            self._doubt_s = None
+        # One that contradicts the newest is from before a pause of either clock.
+        kept = (old for old in self._answers if now_s - old.t_s <= _KEPT_S and old.overlaps(answer))
+        self._answers = [*kept, answer]
+        self._best = min(self._answers, key=lambda each: each.round_trip_s)
+        return False
+
+    def _hear_boot_time(self, kind: str, boot_ms: int) -> bool:
+        """Process the boot time in a message of `kind`. Returns True if it goes back."""
+        last_ms = self._boot_ms.get(kind)
+        self._boot_ms[kind] = boot_ms
+        if last_ms is None:
+            return False
+        is_wrapped = last_ms > _WRAP_MS - _NEAR_WRAP_MS and boot_ms < _NEAR_WRAP_MS
+        is_back = boot_ms < last_ms - _BACK_S * 1e3 and not is_wrapped
+        self._goes_on |= not is_back
+        return is_back
+
+    def _hear_utc(self, message: Message, now_s: float) -> None:
+        """Process a SYSTEM_TIME: UTC and boot time of one instant, by one clock. Their difference is constant but for
+        the rounding of the boot time, and keeps its first value until it is corrected by more."""
+        utc_s, boot_s = message.time_unix_usec / 1e6, message.time_boot_ms / 1e3
+        self._utc_ahead_of_ours_s = utc_s - now_s
+        expected_s = self.boot_time_s(now_s)
+        if expected_s is None:
+            return
+        boot_s += round((expected_s - boot_s) * 1e3 / _WRAP_MS) * _WRAP_MS / 1e3
+        if self._utc_ahead_s is None or abs(utc_s - boot_s - self._utc_ahead_s) > _UTC_ROUNDED_S:
+            self._utc_ahead_s = utc_s - boot_s
+
+
+class ForeignStamps:
+    """Finds time stamps of other programs that are not in the autopilot's time. ArduPilot has one correction of time
+    stamps for all senders of a link (`JitterCorrection`): such stamps make ours up to 0.5 s too old."""
+
+    def __init__(self) -> None:
+        self._found: set[tuple[str, str]] = set()
+
+    def find(self, message: Message, boot_s: float | None) -> str | None:
+        """Return the sender and the name of a message whose stamp is off by more than a second, the first time; None:
+        there is no such stamp in it, or its sender is known. `boot_s` is the autopilot's time since boot."""
+        kind = message.get_type()
+        if kind in _STAMPS:
+            stamp_s = getattr(message, _STAMPS[kind]) / 1e6
+        elif kind == "COMMAND_INT" and message.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
+            kind, stamp_s = "43003", message.param1
+        else:
+            return None
+        sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+        if boot_s is None or abs(stamp_s - boot_s) <= _STAMP_OFF_S or (sender, kind) in self._found:
+            return None
+        self._found.add((sender, kind))
+        log.warning(
+            "%s stamps its %s %.1f s off the autopilot's time since boot: ArduPilot has one time correction for all "
+            "senders of a link, so if it shares ours, fixes count as up to 0.5 s older than they are; let it take its "
+            "time from TIMESYNC, or give it a port of its own",
+            sender, kind, stamp_s - boot_s,
+        )  # fmt: skip
+        return f"{sender} {kind}"

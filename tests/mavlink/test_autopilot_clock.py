@@ -1,0 +1,189 @@
+"""The autopilot's clock: how it is learnt by TIMESYNC, and the time stamps that are made by it."""
+
+import math
+
+import pytest
+from conversing import Autopilot
+
+from edgevpr.mavlink.channel import Channel, Choice
+from edgevpr.mavlink.clock import AutopilotClock
+from edgevpr.mavlink.messages import MotionState, Severity, status_text
+from edgevpr.mavlink.peer import Listener
+from edgevpr.mavlink.wire import mavlink
+
+PX4 = mavlink.MAV_AUTOPILOT_PX4
+WRAP_MS = 2**32
+
+
+class Still(Listener):
+    """A vehicle that hovers at 47, 8."""
+
+    def state_at(self, t_s):
+        return MotionState(
+            t_mono_s=t_s, lat_deg=47.0, lon_deg=8.0, alt_m=500.0, velocity_m_s=(0.0, 0.0, 0.0), accuracy_m=3.0,
+            alt_accuracy_m=5.0, speed_accuracy_m_s=0.5, attitude=(0.0, 0.0, 0.0),
+        )  # fmt: skip
+
+
+def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
+    """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
+    autopilot = Autopilot(firmware, booted_s=600.0, listener=Still())
+    autopilot.conversation.autopilot.interview.choice = Choice(channel, "for a test", 1, lag_s)
+    autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
+    return autopilot
+
+
+def next_sent(autopilot, name):
+    """The next message of this name, and when it was sent; none for a second: None."""
+    for _ in range(40):
+        autopilot.wait(0.025)
+        for message in autopilot.told():
+            if message.get_type() == name:
+                return message, autopilot.clock.now_s
+    return None
+
+
+def test_a_fix_and_a_position_carry_the_autopilots_own_time():
+    autopilot = streaming(Channel.COMMAND)
+    autopilot.put_fix()
+    (fix,) = [message for message in autopilot.told() if message.get_type() == "COMMAND_INT"]
+    assert fix.param1 == pytest.approx(autopilot.boot_s, abs=1e-3)
+    odometry, now_s = next_sent(streaming(Channel.ODOMETRY), "ODOMETRY")
+    assert odometry.time_usec == pytest.approx((now_s - 600.0) * 1e6, abs=100)
+
+
+def test_gps_input_carries_its_time_since_boot_and_its_utc_without_the_jitter_of_the_link():
+    autopilot = streaming(Channel.GPS_INPUT, lag_s=0.2)
+    position, now_s = next_sent(autopilot, "GPS_INPUT")
+    assert position.time_usec == pytest.approx((now_s - 600.2) * 1e6, abs=100)
+    assert position.time_week == 0, "its UTC is not known yet"
+    for late_s in (0.0, 0.3, 0.1):
+        boot_ms, utc_us = autopilot.boot_ms, round((1_700_000_000 + autopilot.boot_s) * 1e6)
+        autopilot.wait(late_s)
+        autopilot.say(mavlink.MAVLink_system_time_message(utc_us, boot_ms))
+        position, now_s = next_sent(autopilot, "GPS_INPUT")
+        since_1980_s = position.time_week * 604_800 + position.time_week_ms / 1e3
+        expected_s = 1_700_000_000 + (now_s - 600.2) - 315_964_800 + 18
+        assert since_1980_s == pytest.approx(expected_s, abs=2.1e-3), f"{late_s} s late"
+
+
+def test_a_px4_gets_stamps_of_our_clock_which_it_converts_itself():
+    odometry, now_s = next_sent(streaming(Channel.VISION, PX4), "ODOMETRY")
+    assert odometry.time_usec == pytest.approx(now_s * 1e6, abs=100)
+
+
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY])
+def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_for_five_seconds(channel, caplog):
+    name = {Channel.COMMAND: "COMMAND_INT", Channel.GPS_INPUT: "GPS_INPUT", Channel.ODOMETRY: "ODOMETRY"}[channel]
+    autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Still())
+    sent_after_s = []
+    for step in range(80):
+        autopilot.conversation.autopilot.interview.choice = Choice(channel, "for a test", 1)
+        autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
+        autopilot.wait(0.1)
+        autopilot.put_fix()
+        for message in autopilot.told():
+            if message.get_type() == name:
+                sent_after_s.append((step + 1) / 10)
+                stamp_s = message.param1 if channel is Channel.COMMAND else message.time_usec / 1e6
+                assert stamp_s == pytest.approx(autopilot.clock.now_s, abs=1e-3), "our own clock"
+    assert sent_after_s[0] == pytest.approx(5.1, abs=0.15)
+    assert caplog.text.count("does not answer TIMESYNC") == 1
+
+
+def test_it_is_asked_some_times_a_second_at_first_and_then_once_a_second():
+    for timesync_s, first_second, fifth_second in ((None, 4, 4), (0.0, 1, 1)):
+        autopilot = Autopilot(timesync_s=timesync_s)
+        counts = []
+        for _ in range(5):
+            before = autopilot.timesyncs
+            autopilot.beat()
+            for _ in range(40):
+                autopilot.wait(0.025)
+                autopilot.told()
+            counts.append(autopilot.timesyncs - before)
+        assert counts[0] == pytest.approx(first_second, abs=1)
+        assert counts[4] == pytest.approx(fifth_second, abs=1)
+
+
+def learnt(*trips, start_s=1000.0):
+    """A clock that has learnt by round trips a second apart, each (seconds to it, seconds back), from an autopilot
+    whose boot was at 600 s."""
+    clock = AutopilotClock()
+    for number, (there_s, back_s) in enumerate(trips):
+        sent_s = start_s + number
+        request = clock.request(sent_s)
+        boot_ns = round((sent_s + there_s - 600.0) * 1e9)
+        assert not clock.hear(mavlink.MAVLink_timesync_message(boot_ns, request.ts1), sent_s + there_s + back_s)
+    return clock
+
+
+def test_the_shortest_round_trip_counts_for_ten_seconds():
+    slow, quick = (0.4, 0.01), (0.004, 0.002)
+    assert learnt(slow).boot_time_s(1000.0) == pytest.approx(400.195)
+    assert learnt(slow, quick, slow).boot_time_s(1000.0) == pytest.approx(400.001)
+    assert learnt(quick, *[slow] * 12).boot_time_s(1000.0) == pytest.approx(400.195)
+    clock = learnt(quick)
+    assert clock.mono_s(clock.boot_time_s(1234.5)) == pytest.approx(1234.5)
+    assert AutopilotClock().boot_time_s(1.0) is AutopilotClock().mono_s(1.0) is None
+
+
+def test_an_answer_that_we_have_not_asked_for_is_ignored():
+    clock = AutopilotClock()
+    request = clock.request(1000.0)
+    for tc1, ts1 in ((5 * 10**9, request.ts1 + 1), (0, request.ts1), (-5, request.ts1), (2**62, 0)):
+        assert not clock.hear(mavlink.MAVLink_timesync_message(tc1, ts1), 1000.1)
+    assert clock.boot_time_s(1000.0) is None
+    autopilot = Autopilot(timesync_s=None)
+    autopilot.say(mavlink.MAVLink_timesync_message(5 * 10**9, round(autopilot.clock.now_s * 1e9)), component_id=190)
+    assert autopilot.conversation.autopilot.boot_time_s(1000.0) is None, "answered by another component"
+
+
+def test_an_answer_that_contradicts_older_ones_replaces_them():
+    """As after a pause of a simulated autopilot, or of our computer."""
+    clock = learnt((0.001, 0.001), (0.001, 0.001))
+    request = clock.request(1002.0)
+    assert not clock.hear(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
+    assert clock.boot_time_s(1002.1) == pytest.approx(401.5)
+
+
+@pytest.mark.parametrize(
+    ("first_ms", "then_ms", "has_restarted"),
+    [
+        (400_000, 2_000, True),
+        (400_000, 398_900, True),
+        (400_000, 399_100, False),
+        (3_000_000_000, 2_000, True),
+        (WRAP_MS - 500, 500, False),
+    ],
+)
+def test_a_boot_time_that_goes_back_is_that_of_another_boot_but_for_its_wrap(first_ms, then_ms, has_restarted):
+    clock = AutopilotClock()
+    assert not clock.hear(mavlink.MAVLink_attitude_message(first_ms, 0, 0, 0, 0, 0, 0), 1000.0)
+    assert not clock.hear(mavlink.MAVLink_system_time_message(0, then_ms), 1001.0), "each kind has its own"
+    assert clock.hear(mavlink.MAVLink_attitude_message(then_ms, 0, 0, 0, 0, 0, 0), 1001.0) is has_restarted
+
+
+def foreign(kind, stamp_s):
+    time_us = round(stamp_s * 1e6)
+    if kind == "LANDING_TARGET":
+        return mavlink.MAVLink_landing_target_message(time_us, 0, 8, 0, 0, 0, 0, 0)
+    if kind == "VISION_POSITION_ESTIMATE":
+        return mavlink.MAVLink_vision_position_estimate_message(time_us, 0, 0, 0, 0, 0, 0)
+    return mavlink.MAVLink_command_int_message(7, 1, 0, 43003, 0, 0, stamp_s, 0, 9, math.nan, 0, 0, math.nan)
+
+
+@pytest.mark.parametrize("kind", ["LANDING_TARGET", "VISION_POSITION_ESTIMATE", "43003"])
+def test_stamps_of_others_that_are_not_in_the_autopilots_time_are_reported_once(kind, caplog):
+    autopilot = Autopilot(booted_s=600.0)
+    autopilot.say(foreign(kind, autopilot.boot_s - 0.4), component_id=191)
+    autopilot.say(foreign(kind, 1.7e9), component_id=1)
+    assert autopilot.texts() == []
+    for _ in range(3):
+        autopilot.say(foreign(kind, 1.7e9), component_id=191)
+    texts = [text for _, text in autopilot.texts()]
+    assert texts == [status_text(Severity.WARNING, f"edgevpr: wrong stamps: 7/191 {kind}").text]
+    assert caplog.text.count("off the autopilot's time since boot") == 1
+    px4 = Autopilot(PX4)
+    px4.say(foreign(kind, 1.7e9), component_id=191)
+    assert px4.texts() == [], "which converts each sender's own clock"

@@ -1,0 +1,165 @@
+"""An autopilot that restarts is a new one, and one whose link is lost for some seconds is not."""
+
+import pytest
+from conversing import Autopilot
+from test_autopilot_clock import Still
+
+from edgevpr.core.types import Position
+from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.wire import mavlink
+
+IMU = mavlink.MAVLINK_MSG_ID_SCALED_IMU
+VERSION = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+RECEIVER, VISION = {"GPS1_TYPE": 1, "GPS2_TYPE": 14}, {"GPS2_TYPE": 0, "VISO_TYPE": 1}
+
+
+class Ear(Still):
+    """Notes what it is told."""
+
+    def __init__(self):
+        self.autopilots, self.channels = 0, []
+
+    def hear_autopilot(self, t_s):
+        self.autopilots += 1
+
+    def hear_channel(self, channel):
+        self.channels.append(channel)
+
+
+class Aircraft(Autopilot):
+    """An ArduPilot that answers for its parameters and keeps an origin until it restarts. `received` are our messages
+    since the last restart, `rates` the messages that it was asked to stream."""
+
+    def __init__(self, parameters, *, says_boot_time=True, booted_s=600.0, **settings):
+        self.parameters, self.ear = dict(parameters), Ear()
+        self.says_boot_time, self.has_origin = says_boot_time, False
+        super().__init__(booted_s=booted_s, listener=self.ear, origin=Position(46.5, 7.5, 400.0), **settings)
+        self.conversation.want_position()
+        self.forget()
+
+    def forget(self):
+        self.received, self.rates = [], set()
+
+    def power_cycle(self, silent_s):
+        self.told()
+        self.reboot(silent_s)
+        self.has_origin = False
+        self.forget()
+
+    def live(self, seconds, answers=True):
+        """Live on, as far as its messages reach us; `answers`: ours reach it, too. Returns the texts."""
+        texts = []
+        for tick in range(round(seconds * 10)):
+            if tick % 10 == 0:
+                self.beat()
+                if self.has_origin:
+                    self.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+            if self.says_boot_time and mavlink.MAVLINK_MSG_ID_ATTITUDE in self.rates:
+                self.attitude()
+                self.position()
+            for message in self.told() if answers else ():
+                self.received.append(message)
+                texts += [message.text] if message.get_type() == "STATUSTEXT" else []
+                self.obey(message)
+            self.wait(0.1)
+        return texts
+
+    def obey(self, message):
+        if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
+            value, kind = self.parameters[message.param_id], mavlink.MAV_PARAM_TYPE_INT8
+            self.say(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
+        elif message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self.rates.add(int(message.param1))
+        elif message.get_type() == "COMMAND_LONG" and message.param1 == VERSION:
+            nothing = [bytes(8)] * 3
+            self.say(mavlink.MAVLink_autopilot_version_message(0, 4 << 24, 0, 0, 0, *nothing, 0, 0, 0))
+        elif message.get_type() == "SET_GPS_GLOBAL_ORIGIN":
+            self.has_origin = True
+
+    def names(self):
+        return [message.get_type() for message in self.received]
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "says_boot_time", "timesync_s"),
+    [
+        (1.6, True, 0.0),
+        (1.6, True, None),
+        (1.6, False, 0.0),
+        (6.0, True, 0.0),
+        (6.0, False, 0.0),
+        (6.0, False, None),
+        (40.0, True, None),
+    ],
+)
+def test_a_power_cycle_of_any_length_makes_a_new_autopilot(silent_s, says_boot_time, timesync_s, caplog):
+    aircraft = Aircraft({"GPS2_TYPE": 0}, says_boot_time=says_boot_time, timesync_s=timesync_s)
+    aircraft.live(20)
+    assert "GPS_INPUT" not in aircraft.names()
+    sending = aircraft.put_fix()
+    aircraft.parameters = RECEIVER
+    aircraft.power_cycle(silent_s)
+    texts = aircraft.live(15)
+    assert sending.answer is None
+    assert "edgevpr: autopilot has restarted" in texts
+    assert {IMU, mavlink.MAVLINK_MSG_ID_ATTITUDE} <= aircraft.rates
+    assert aircraft.names().count("GPS_INPUT") > 20
+    last = [message for message in aircraft.received if message.get_type() == "GPS_INPUT"][-1]
+    if timesync_s is not None:
+        assert last.time_usec / 1e6 == pytest.approx(aircraft.boot_s, abs=0.5), "the time since this boot"
+    assert (aircraft.ear.autopilots, aircraft.ear.channels[-1]) == (2, Channel.GPS_INPUT)
+    assert caplog.text.count("the autopilot has restarted") == 1
+
+
+def test_what_stays_the_same_is_said_and_asked_for_again():
+    aircraft = Aircraft(VISION)
+    aircraft.live(20)
+    assert aircraft.names().count("SET_GPS_GLOBAL_ORIGIN") == 1
+    assert aircraft.names().count("ODOMETRY") > 50
+    for restarts in (1, 2):
+        aircraft.power_cycle(1.6)
+        texts = aircraft.live(20)
+        assert aircraft.names().count("SET_GPS_GLOBAL_ORIGIN") == 1
+        assert aircraft.names().count("ODOMETRY") > 50
+        assert IMU in aircraft.rates
+        often = "" if restarts == 1 else " 2 times"
+        assert texts == [f"edgevpr: autopilot has restarted{often}"]
+        assert aircraft.ear.channels[-2:] == [Channel.COMMAND, Channel.ODOMETRY]
+    assert aircraft.conversation.autopilot.identity.foreign_messages == 0
+
+
+@pytest.mark.parametrize("outage_s", [2.0, 8.0, 25.0])
+def test_an_outage_without_a_restart_resets_nothing(outage_s):
+    aircraft = Aircraft(VISION)
+    aircraft.live(20)
+    before = aircraft.conversation.autopilot.clock
+    aircraft.wait(outage_s)
+    aircraft.received = []
+    texts = aircraft.live(20)
+    assert aircraft.conversation.autopilot.clock is before
+    assert (aircraft.ear.autopilots, aircraft.ear.channels) == (1, [Channel.ODOMETRY])
+    assert not {"PARAM_REQUEST_READ", "SET_GPS_GLOBAL_ORIGIN"} & set(aircraft.names())
+    assert aircraft.names().count("ODOMETRY") > 150, "at once"
+    assert not any("restarted" in text for text in texts)
+
+
+def test_a_restart_is_recognised_though_the_new_boot_is_older_than_the_first_one_was():
+    aircraft = Aircraft(VISION, booted_s=997.0)
+    aircraft.live(3)
+    aircraft.wait(9.0)
+    aircraft.booted_s = aircraft.clock.now_s - 7.5
+    assert "edgevpr: autopilot has restarted" in aircraft.live(20)
+
+
+def test_messages_that_were_held_up_on_their_way_are_no_restart():
+    """A busy companion reads what has come in ten seconds at once."""
+    aircraft = Aircraft(VISION)
+    aircraft.live(20)
+    held_up = [round(aircraft.boot_s * 1e3) + number * 100 for number in range(100)]
+    aircraft.wait(10.0)
+    for boot_ms in held_up:
+        aircraft.say(mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
+        if boot_ms % 1000 < 100:
+            aircraft.beat()
+    assert not any("restarted" in text for text in aircraft.live(20))
+    assert aircraft.ear.autopilots == 1
