@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig from-space bench-fleet service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space bench-fleet service-faults soak test-arm64 sites sweeps peers clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -108,6 +108,11 @@ $(VENV)/clients/installed: $(VENV)/installed
 # benchmarks/results/: two and a half hours.
 rig: $(VENV)/installed
 	$(BIN)/python benchmarks/rig/rig.py
+
+# Every set-up and event of the sweep beside its control, with a real ArduPilot and PX4 (EDGEVPR_PX4), into
+# benchmarks/results/: two to three hours. QUICK=1: the part of ten minutes before a release.
+never-worse: $(VENV)/installed
+	$(BIN)/python benchmarks/rig/never_worse.py $(if $(QUICK),--quick)
 
 # Maps of a picture from space, flown over on another day, into benchmarks/results/: twenty minutes.
 from-space: $(VENV)/installed

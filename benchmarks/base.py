@@ -51,15 +51,22 @@ def made_by() -> Row:
 
 
 @cache
-def commit() -> str:
-    """Return the commit that is measured, and whether something has changed since."""
+def commit(repository: Path = REPOSITORY) -> str:
+    """Return the commit of a repository that is measured, and whether something has changed since."""
 
     if not shutil.which("git"):
         return "unknown"
     asked = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
-    of = ("git", "-C", str(REPOSITORY))
+    of = ("git", "-C", str(repository))
     head, changed = (subprocess.run([*of, *words], capture_output=True, text=True).stdout.strip() for words in asked)
     return head + (" with changes" if changed else "") or "unknown"
+
+
+def program_commit(repository: Path) -> str:
+    """Return what identifies the edgevpr of a repository: no other file changes it."""
+    asked = ("git", "-C", str(repository), "log", "-1", "--format=%h", "--", "edgevpr", "models")
+    last = subprocess.run(asked, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
+    return last + " with changes" * commit(repository).endswith("changes") or "unknown"
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:

@@ -28,6 +28,7 @@ PICTURES_HZ = 5.0
 _LEAD_S = 0.08  # rendering takes 20 to 60 ms
 _UNIT = Fraction(1, 10_000)  # of the time stamps, in seconds
 _BEYOND_DEG = 60.0  # a picture that is tilted farther shows the sky
+_SLOPE_M = 80.0  # beyond the map, the ground comes to its other height on so many metres
 COLUMNS = ("t_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 
@@ -42,14 +43,15 @@ class Picture:
 
 class Camera:
     """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
-    file: that of the airframe. `seed` is that of the noise, the `scenario` says how the camera is mounted, and if the
-    pictures have their times."""
+    file: that of the airframe. `seed` is that of the noise, the `scenario` says how the camera is mounted, what it
+    sees, and if the pictures have their times. While it `is_frozen`, it gives its last picture again."""
 
     def __init__(self, truth: Truth, lit_ground: np.ndarray, log: Path, seed: int, scenario: Scenario) -> None:
         self._truth, self._ground, self._scenario, self.is_stamped = truth, lit_ground, scenario, scenario.is_stamped
         self._log, self._rng = log, np.random.default_rng(seed)
         self._picture: Picture | None = None
         self._is_on, self._changed = True, threading.Condition()
+        self.is_frozen = False
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _Viewer)
         self._server.daemon_threads = True
         self._server.camera = self
@@ -85,7 +87,8 @@ class Camera:
                 pose = self._truth.at(due_s)
                 if pose is None:
                     continue
-                jpeg = self._rendered(pose)
+                if not (self.is_frozen and self._picture):
+                    jpeg = self._rendered(pose)
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 number += 1
                 with self._changed:
@@ -97,12 +100,29 @@ class Camera:
             self._changed.notify_all()
 
     def _rendered(self, pose: CameraPose) -> bytes:
-        pose = replace(pose, height_m=max(pose.height_m, 1.0))
+        if self._scenario.is_blind:
+            return _noise(self._rng)
+        pose = replace(pose, height_m=max(pose.height_m * self._ground_scale(pose.north_m), 1.0))
         if self._scenario.is_level:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
         elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _BEYOND_DEG:
             pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
         return ground.picture(self._ground, mounted(pose, self._scenario.mount), "later", self._rng)
+
+    def _ground_scale(self, north_m: float) -> float:
+        """Return by how much farther below the ground lies there than where it is mapped."""
+        if self._scenario.mapped_m is None:
+            return 1.0
+        beyond = min(max((north_m - self._scenario.mapped_m) / _SLOPE_M, 0.0), 1.0)
+        return 1.0 + beyond * (self._scenario.beyond_scale - 1.0)
+
+
+def _noise(rng: np.random.Generator) -> bytes:
+    """Return a picture that no map knows, as a JPEG."""
+    camera = ground.CAMERAS["later"]
+    grains = rng.integers(0, 255, (camera.height // 8, camera.width // 8, 3), np.uint8)
+    noise = cv2.resize(grains, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+    return cv2.imencode(".jpg", noise)[1].tobytes()
 
 
 def mounted(pose: CameraPose, mount: Mount) -> CameraPose:

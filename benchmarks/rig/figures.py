@@ -64,8 +64,6 @@ def figures_of(folder: Path) -> Row:
         found["gps_alarms_s"] = [
             round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
         ]
-    if "back" in run["marks_s"]:
-        found["heard_again_s"] = round(run["marks_s"]["heard_again"] - run["marks_s"]["back"], 2)
     return found
 
 

@@ -13,9 +13,8 @@ from typing import Any
 import base
 import ground
 from camera import Camera
-from px4 import COMPANION_PORTS, GROUND_ALT_M, Px4
+from px4 import GROUND_ALT_M, Px4
 from recording import Recorder
-from relay import DatagramRelay, Relay
 from scenarios import (
     CIRCUIT_M,
     CLIMB_M,
@@ -28,22 +27,26 @@ from scenarios import (
     Scenario,
     scenario_of,
 )
-from simulator import COMPANION_PORT, Simulator, at_degrees, mission
+from simulator import Simulator, mission
 from truth import Truth
 
 from edgevpr.mavlink.wire import mavlink
 
 _STEP_S = 0.1
-_RETURN_S = 8.0  # an autopilot that was rebooted is back after so long
+_OTHER_CLOCK = (
+    "import runpy, time; own, ahead = time.monotonic, {} - time.monotonic(); time.monotonic = lambda: own() + ahead; "
+    "runpy.run_module('edgevpr', None, '__main__')"
+)
 _ONLY_VELOCITY = 0b0000110111000111  # of SET_POSITION_TARGET_LOCAL_NED: position, acceleration and yaw do not count
 
 
 class Run:
-    """A run of a scenario, with edgevpr or without: `fly` makes it, and returns the folder of its files."""
+    """A run of a scenario, with edgevpr or without, in the simulator of an `instance`: `fly` makes it, and returns the
+    folder of its files."""
 
-    def __init__(self, work: Path, name: str, scenario: Scenario, is_control: bool) -> None:
+    def __init__(self, work: Path, folder: Path, scenario: Scenario, is_control: bool, instance: int = 0) -> None:
         self._work, self._scenario, self._is_control = work, scenario, is_control
-        self._folder = work / "runs" / (f"{name}-control" if is_control else name)
+        self._folder, self._instance = folder, instance
         shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True)
         self._truth = Truth(GROUND_ALT_M if scenario.is_px4 else ground.GROUND_ALT_M)
@@ -54,49 +57,55 @@ class Run:
 
     def fly(self) -> Path:
         """Fly the scenario. Raises RuntimeError where that cannot be done."""
-        scenario, folder, own = self._scenario, self._folder, {} if self._is_control else self._scenario.with_edgevpr
-        home_m = COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M
-        parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters, **own}
-        listeners = [self._truth.listen, self._recorder.listen]
-        place_map = ground.place_map(self._work, scenario.height_m, scenario.mapped_m)
-        make = Px4 if scenario.is_px4 else Simulator
         with ExitStack() as stack:
-            stack.callback(self._recorder.close)
-            simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners)
-            self._simulator = stack.enter_context(simulator)
-            if not self._is_control:
-                lit = ground.lit_ground(self._work, "later")
-                seed = ground.SEED + scenario_of(folder.name)[1]
-                camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
-                between = DatagramRelay, COMPANION_PORTS, "udpin"
-                relay_of, ports, kind = between if scenario.is_px4 else (Relay, COMPANION_PORT, "tcp")
-                relay = stack.enter_context(relay_of(self._truth, folder / "sent.csv", ports, home_m))
-                link = f"{kind}:127.0.0.1:{relay.port}"
-                config = self._config(folder / "learnt.gpkg" if scenario.learns else place_map, camera.uri, link)
-                (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
-            stack.callback(self._end_edgevpr)
-            if scenario.starts_early:
+            self._equip(stack)
+            if self._scenario.starts_early:
                 self._start_edgevpr()
             self._take_off()
             self._start_edgevpr()
-            self._watch(scenario.gps_s)
-            if scenario.reboots:
-                self._lose()
-                self._watch(20.0)
-                self._reboot()
-                self._watch(scenario.gps_s)
+            self._watch(self._scenario.gps_s)
             self._lose()
-            self._watch(scenario.off_s)
-        run = {"commit": base.commit(), "marks_s": self._marks_s, "texts": self._recorder.texts}
-        (folder / "run.json").write_text(json.dumps(run))
-        return folder
+            self._watch(self._scenario.off_s)
+        run = {"commit": base.commit(ground.CHECKOUT), "marks_s": self._marks_s, "texts": self._recorder.texts}
+        (self._folder / "run.json").write_text(json.dumps(run))
+        return self._folder
 
-    def _start_edgevpr(self) -> None:
-        """Start edgevpr, unless it runs or is not to be in this flight."""
+    def _equip(self, stack: ExitStack) -> None:
+        """Start the simulator and the camera, lay the wire between them, and write edgevpr's configuration."""
+        scenario, folder, own = self._scenario, self._folder, {} if self._is_control else self._scenario.with_edgevpr
+        home_m = scenario.home_m or (COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M)
+        parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters, **own}
+        listeners = [self._truth.listen, self._recorder.listen]
+        make = Px4 if scenario.is_px4 else Simulator
+        stack.callback(self._recorder.close)
+        simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners, self._instance)
+        self._simulator = stack.enter_context(simulator)
+        if not self._is_control:
+            lit = ground.lit_ground(self._work, "later")
+            seed = ground.SEED + scenario_of(folder.name)[1]
+            self._camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
+            self._relay = stack.enter_context(simulator.relay(self._truth, folder / "sent.csv", home_m))
+            place_map = folder / "learnt.gpkg" if scenario.learns else self._place_map()
+            config = self._config(place_map, self._camera.uri, self._relay.uri)
+            (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
+        stack.callback(self._end_edgevpr)
+
+    def _place_map(self) -> Path:
+        """Return the map of the ground, by the altitude of the simulator's."""
+        scenario = self._scenario
+        place_map = ground.place_map(self._work, scenario.height_m, scenario.mapped_m)
+        up_m = GROUND_ALT_M - ground.GROUND_ALT_M if scenario.is_px4 else 0.0
+        return ground.moved_map(place_map, scenario.map_east_m, up_m)
+
+    def _start_edgevpr(self, clock_s: float | None = None) -> None:
+        """Start edgevpr, unless it runs or is not to be in this flight; a `clock_s` is that of its computer."""
         if self._is_control or self._edgevpr:
             return
-        command = [sys.executable, "-m", "edgevpr", "run", "--config", str(self._folder / "config.yaml")]
-        with open(self._folder / "edgevpr.txt", "w", encoding="utf-8") as said:
+        module = ["-m", "edgevpr"]
+        if clock_s is not None:
+            module = ["-c", _OTHER_CLOCK.format(clock_s)]
+        command = [sys.executable, *module, "run", "--config", str(self._folder / "config.yaml")]
+        with open(self._folder / "edgevpr.txt", "a", encoding="utf-8") as said:
             self._edgevpr = subprocess.Popen(command, stdout=said, stderr=said, env=ground.environment())
 
     def _end_edgevpr(self) -> None:
@@ -149,18 +158,6 @@ class Run:
         if scenario.source_set and (scenario.parameters or not self._is_control):
             simulator.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, scenario.source_set)
 
-    def _reboot(self) -> None:
-        self._recorder.is_on = False
-        self._simulator.kill()
-        time.sleep(_RETURN_S)
-        self._simulator.start(wipe=False)
-        self._marks_s["back"] = time.monotonic()
-        heard = self._simulator.link.wait_for("HEARTBEAT of 197", lambda _: True, 60)
-        self._marks_s["heard_again"] = time.monotonic() if heard else float("nan")
-        self._simulator.set_gps(True)
-        self._simulator.set_wind(WIND_FROM_DEG, 0.0)
-        self._take_off()
-
     def _watch(self, seconds: float) -> None:
         """Let the flight go on for so long; a copter is steered meanwhile, and ends where it has landed."""
         began_s = time.monotonic()
@@ -169,8 +166,7 @@ class Run:
                 return
             if self._scenario.glitch_m_s and "loss" in self._marks_s:
                 away_m = self._scenario.glitch_m_s * (now_s - self._marks_s["loss"])
-                north_deg = at_degrees(0.0, away_m)[0] - at_degrees(0.0, 0.0)[0]
-                self._simulator.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
+                self._simulator.displace_gps(away_m)
             time.sleep(_STEP_S)
 
     def _is_down(self) -> bool:

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +11,14 @@ import cv2
 import numpy as np
 import rasterio
 
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
 from edgevpr.lab.simulate.generated import ORIGIN, to_position
 from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.places.mapfile import PlaceMap
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(os.environ.get("EDGEVPR_CHECKOUT") or Path(__file__).parents[2]).resolve()  # the edgevpr that flies
 WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16
 GROUND_ALT_M = ORIGIN.alt_m
 SPACING_M, EDGE_M = 30.0, 50.0
@@ -69,8 +73,8 @@ def picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Gener
 
 
 def environment() -> dict[str, str]:
-    """Return the environment in which `python -m edgevpr` is the code of this checkout, on one core as on a board."""
-    return {**os.environ, "PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1"}
+    """Return the environment in which `python -m edgevpr` is the code of CHECKOUT, on one core as on a board."""
+    return {**os.environ, "PYTHONPATH": str(CHECKOUT), "OPENBLAS_NUM_THREADS": "1"}
 
 
 def place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Path:
@@ -99,6 +103,23 @@ def place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Pat
     words = [sys.executable, "-m", "edgevpr", *map(str, command)]
     subprocess.run(words, env=environment(), check=True, stdout=subprocess.DEVNULL)
     unfinished.rename(path)
+    return path
+
+
+def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
+    """Return a map with all of its places so far east and up; made once, beside it."""
+    if not (east_m or up_m):
+        return place_map
+    path = place_map.with_name(f"{place_map.stem}-{east_m:g}m-east-{up_m:g}m-up.gpkg")
+    if not path.exists():
+        unfinished = path.with_name(f"{os.getpid()}-{path.name}")
+        shutil.copy(place_map, unfinished)
+        with PlaceMap.open_for_adding(unfinished) as places, places.transaction():
+            for place in list(places.places()):
+                at = place.position
+                lat_deg, lon_deg = moved(at.lat_deg, at.lon_deg, east_m, 0.0)
+                places.lay(place.place_id, Position(lat_deg, lon_deg, at.alt_m + up_m), place.pose)
+        unfinished.rename(path)
     return path
 
 

@@ -190,8 +190,6 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
                 f"{gap['s']:.0f} s and {gap['way_m']} m without a match; what was sent {gap['told_s']:.0f} s after the "
                 f"last one was {gap['off_m']} m off"
             )
-        if run.get("heard_again_s") is not None:
-            told.append(f"heard again {run['heard_again_s']} s after the autopilot was back")
         if name in ("plane_glitch", "plane_clean") and which == "with":
             alarms_s = run["gps_alarms_s"]
             minutes = run["estimate"]["after"]["n"] / 600

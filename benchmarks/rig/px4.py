@@ -6,13 +6,16 @@ import time
 from pathlib import Path
 
 from link import Link, Listener
+from relay import DatagramRelay
 from scenarios import COPTER_CIRCUIT_M, COPTER_HOME_M, COPTER_SPEED_M_S, HOME_M
 from simulator import Process, at_degrees
+from truth import Truth
 
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_PX4"
-OWN_PORTS, COMPANION_PORTS = (14550, 18570), (14540, 14580)  # of each: where PX4 sends to, and where it listens
+# Of the first instance, 1 more for each next one: where PX4 listens for us; where it sends to and listens for edgevpr.
+_OWN_PORT, _COMPANION_PORTS = 18570, (14540, 14580)
 GROUND_ALT_M = 1.0  # of the simulated ground: a plane's height control begins at an altitude of 0 and ramps from there
 # What an aircraft of the simulator needs to fly a mission that nobody holds a transmitter for, and that ends nowhere.
 PARAMETERS = {
@@ -46,31 +49,46 @@ def build() -> Path | None:
 
 
 class Px4(Process):
-    """A PX4 that starts with the `with` block and ends with it; `home_m` is where it stands, metres east and north."""
+    """A PX4 that starts with the `with` block and ends with it; `home_m` is where it stands, metres east and north.
+    Those of other `instance` numbers run beside it."""
+
+    ground_alt_m = GROUND_ALT_M
 
     def __init__(
-        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
+        self,
+        vehicle: str,
+        folder: Path,
+        home_m: tuple[float, float],
+        parameters: dict,
+        listeners: list[Listener],
+        instance: int = 0,
     ) -> None:
         super().__init__(folder, listeners)
-        self._vehicle = vehicle
+        self._vehicle, self._instance = vehicle, instance
         lat_deg, lon_deg = at_degrees(*home_m)
         home = {"PX4_HOME_LAT": f"{lat_deg:.7f}", "PX4_HOME_LON": f"{lon_deg:.7f}", "PX4_HOME_ALT": str(GROUND_ALT_M)}
         model = {"PX4_SIMULATOR": "sihsim", "PX4_SIM_MODEL": _MODELS[vehicle], "HEADLESS": "1"}
-        parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters
+        parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters | {"MAV_SYS_ID": 1}
         own = {f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()}
         self._environment = {**os.environ, **home, **model, **own}
 
     def start(self, *, wipe: bool) -> None:
-        self._launch([build() / "bin/px4", "-d", build() / "etc", "-w", self._folder], self._environment)
+        self._launch(
+            [build() / "bin/px4", "-i", self._instance, "-d", build() / "etc", "-w", self._folder], self._environment
+        )
         station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        station.bind(("127.0.0.1", OWN_PORTS[0]))
-        station.connect(("127.0.0.1", OWN_PORTS[1]))
+        station.connect(("127.0.0.1", _OWN_PORT + self._instance))
         self._talk(Link(station, self._listeners, bytewise=True), _STREAMS_HZ)
 
-    def take_off(self, height_m: float) -> None:
-        """Start the mission, and wait until the aircraft is at that height. Raises RuntimeError where it never is."""
-        self._wait_ready()
-        self.link.upload(_mission(self._vehicle, height_m))
+    def relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> DatagramRelay:
+        """Make the wire to edgevpr."""
+        return DatagramRelay(truth, log, tuple(port + self._instance for port in _COMPANION_PORTS), origin_m)
+
+    def take_off(self, height_m: float, items: list[Message] | None = None) -> None:
+        """Start a mission (None: round and round a circuit), and wait until the aircraft is at that height. Raises
+        RuntimeError where it never is."""
+        self.wait_ready()
+        self.link.upload(items or _mission(self._vehicle, height_m))
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _AUTO, _MISSION)
         for _ in range(30):
             if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
@@ -82,14 +100,21 @@ class Px4(Process):
             raise RuntimeError(f"{height_m:.0f} m are not reached")
 
     def set_gps(self, is_on: bool) -> None:
-        self.link.set_parameter("SIM_GPS_USED", 10 if is_on else 0)
+        self.set_satellites(10 if is_on else 0)
+
+    def set_satellites(self, count: int) -> None:
+        self.link.set_parameter("SIM_GPS_USED", count)
+
+    def displace_gps(self, north_m: float) -> None:
+        """Let the receiver's positions lie so far north of the truth. README.md names the patch that this takes."""
+        self.link.put_parameter("SIM_GPS_OFF_N", float(north_m))
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         if from_deg != 270.0:
             raise ValueError("the wind blows from the west")
         self.link.set_parameter("SIH_WIND_E", float(speed_m_s))
 
-    def _wait_ready(self) -> None:
+    def wait_ready(self) -> None:
         give_up_s = time.monotonic() + 120
         while time.monotonic() < give_up_s:
             filter_, gps, status = (self.link.last.get(n) for n in ("ESTIMATOR_STATUS", "GPS_RAW_INT", "SYS_STATUS"))
@@ -114,6 +139,11 @@ def _mission(vehicle: str, height_m: float) -> list[Message]:
         rows += [(mavlink.MAV_CMD_DO_CHANGE_SPEED, (1, COPTER_SPEED_M_S, -1, 0), None, 0)]
         rows += [(waypoint, free, corner_m, height_m) for corner_m in COPTER_CIRCUIT_M]
         rows += [(jump, (2, -1, 0, 0), None, 0)]
+    return mission_items(rows)
+
+
+def mission_items(rows) -> list[Message]:
+    """Make the items of a mission from (command, its four values, place or None, height) each."""
     items = []
     for number, (command, values, at_m, up_m) in enumerate(rows):
         lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)

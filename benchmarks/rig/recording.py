@@ -7,13 +7,15 @@ from pathlib import Path
 from truth import Truth
 
 from edgevpr.lab.simulate.generated import to_metres
-from edgevpr.mavlink.wire import Message
+from edgevpr.mavlink.wire import Message, mavlink
 
-COLUMNS = ("t_s", "east_m", "north_m", "est_east_m", "est_north_m", "error_m", "mode")
+EDGEVPR = 197  # its component id
+COLUMNS = ("t_s", "east_m", "north_m", "est_east_m", "est_north_m", "error_m", "mode", "height_m")
 
 
 class Recorder:
-    """Writes a line for every GLOBAL_POSITION_INT while it `is_on`, and keeps the texts: time, component, text."""
+    """Writes a line for every GLOBAL_POSITION_INT while it `is_on`, and keeps the texts: time, component, text.
+    `has_warned`: edgevpr has sent a text that a ground station shows as a warning."""
 
     def __init__(self, truth: Truth, path: Path) -> None:
         self._truth, self._lock = truth, threading.Lock()
@@ -22,6 +24,7 @@ class Recorder:
         self.is_on = False
         self._mode = 0
         self.texts: list[tuple[float, int, str]] = []
+        self.has_warned = False
 
     def close(self) -> None:
         with self._lock:
@@ -33,6 +36,7 @@ class Recorder:
         name, sender = message.get_type(), message.get_srcComponent()
         if name == "STATUSTEXT":
             self.texts.append((now_s, sender, message.text))
+            self.has_warned |= sender == EDGEVPR and message.severity <= mavlink.MAV_SEVERITY_WARNING
         elif name == "HEARTBEAT" and sender == 1:
             self._mode = message.custom_mode
         elif name == "GLOBAL_POSITION_INT" and sender == 1 and (true := self._truth.at(now_s)):
@@ -41,4 +45,4 @@ class Recorder:
             where = ",".join(f"{each:.2f}" for each in (true.east_m, true.north_m, east_m, north_m, error_m))
             with self._lock:
                 if self.is_on:
-                    self._file.write(f"{now_s:.3f},{where},{self._mode}\n")
+                    self._file.write(f"{now_s:.3f},{where},{self._mode},{true.height_m:.2f}\n")

@@ -1,9 +1,11 @@
 """The wire between edgevpr and the autopilot, listened to: every position that was sent, against the true one."""
 
 import contextlib
+import math
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from truth import Truth
@@ -12,64 +14,94 @@ from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 COLUMNS = ("t_s", "kind", "age_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
+_TURN_S = 0.2
+_SLOW_BUFFER_BYTES = 4096  # of a slow wire: what does not fit is lost, not late
 Sent = tuple[float, float, float, float]  # age in seconds, east and north in metres, accuracy in metres
 
 
 class Relay:
-    """Hands on what edgevpr and the autopilot say to each other over TCP, from the begin of the `with` block to its
-    end. `origin_m` is where the autopilot's local frame begins, metres east and north."""
+    """A wire between edgevpr, which connects to `uri`, and the autopilot at a port, from the begin of the `with` block
+    to its end. As with a wire, edgevpr notices nothing of the autopilot's power but silence. `drops` says which of
+    edgevpr's messages are lost; `inject` sends what another program on the same wire would; `saturate` makes it slow.
+    `origin_m` is where the autopilot's local frame begins, metres east and north."""
 
     def __init__(self, truth: Truth, log: Path, autopilot_port: int, origin_m: tuple[float, float]) -> None:
         self._truth, self._autopilot_port, self._origin_m = truth, autopilot_port, origin_m
         self._log = open(log, "w", encoding="utf-8", buffering=1)  # noqa: SIM115 (closed at the end of the block)
         self._log.write(",".join(COLUMNS) + "\n")
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
+        self.drops: Callable[[Message], bool] = lambda message: False
+        self._reader, self._bytes_per_s = PacketReader(), math.inf
+        self._near: socket.socket | None = None
+        self._far: socket.socket | None = None
         self._is_open = True
-        self._thread = threading.Thread(target=self._serve)
+        self.uri = self._listen()
+        self._threads = [threading.Thread(target=work) for work in (self._serve_edgevpr, self._serve_autopilot)]
 
     def __enter__(self) -> "Relay":
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._is_open = False
-        self._thread.join()
-        self._listener.close()
+        for thread in self._threads:
+            thread.join()
+        self._server.close()
         self._log.close()
 
-    def _serve(self) -> None:
-        self._listener.settimeout(0.2)
-        while self._is_open:
-            with contextlib.suppress(OSError):  # nobody comes, one of the two is not there, or has gone
-                near, _ = self._listener.accept()
-                with near, socket.create_connection(("127.0.0.1", self._autopilot_port), 1) as far:
-                    for end in (near, far):
-                        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    back = threading.Thread(target=self._hand_on, args=(far, near, None), daemon=True)
-                    back.start()
-                    self._hand_on(near, far, PacketReader())
-                    back.join()
+    def inject(self, data: bytes) -> None:
+        self._send(self._far, data)
 
-    def _hand_on(self, source: socket.socket, sink: socket.socket, receiver: PacketReader | None) -> None:
-        """Hand on bytes until one of the two has gone, and let the other one know."""
-        source.settimeout(0.2)
-        try:
-            while self._is_open:
-                try:
-                    data = source.recv(65536)
-                except TimeoutError:
-                    continue
-                if not data:
-                    break
-                sink.sendall(data)
-                for message in receiver.feed(data) if receiver else ():
-                    self._note(message, time.monotonic())
-        except OSError:
-            pass
-        for end in (source, sink):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
+    def saturate(self, bytes_per_s: float) -> None:
+        """Carry no more than that from now on, either way, and lose what is sent beyond it."""
+        self._bytes_per_s = bytes_per_s
+        for end in filter(None, (self._near, self._far)):
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SLOW_BUFFER_BYTES)
+
+    def _listen(self) -> str:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server.settimeout(_TURN_S)
+        return f"tcp:127.0.0.1:{self._server.getsockname()[1]}"
+
+    def _serve_edgevpr(self) -> None:
+        while self._is_open:
+            with contextlib.suppress(OSError):  # nobody comes
+                self._near, _ = self._server.accept()
+                with self._near:
+                    self._carry(self._near, self._to_autopilot)
+
+    def _serve_autopilot(self) -> None:
+        while self._is_open:
+            with contextlib.suppress(OSError):  # it has no power
+                self._far = socket.create_connection(("127.0.0.1", self._autopilot_port), 1)
+                with self._far:
+                    self._carry(self._far, lambda data: self._send(self._near, data))
+            time.sleep(_TURN_S)
+
+    def _carry(self, source: socket.socket, deliver: Callable[[bytes], object]) -> None:
+        """Deliver what comes from a source until it has gone."""
+        source.settimeout(_TURN_S)
+        if source.type == socket.SOCK_STREAM:
+            source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        while self._is_open:
+            try:
+                data = source.recv(65536)
+            except (TimeoutError, ConnectionRefusedError):  # refused: datagrams to one that is still to start
+                continue
+            if not data:
+                return
+            time.sleep(len(data) / self._bytes_per_s)
+            deliver(data)
+
+    def _to_autopilot(self, data: bytes) -> None:
+        for message in self._reader.feed(data):
+            if not self.drops(message):
+                self.inject(bytes(message.get_msgbuf()))
+            self._note(message, time.monotonic())
+
+    def _send(self, sink: socket.socket | None, data: bytes) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # nobody is there
+            sink.sendall(data)
 
     def _note(self, message: Message, now_s: float) -> None:
         sent = _sent(message, self._origin_m)
@@ -82,31 +114,27 @@ class Relay:
 
 
 class DatagramRelay(Relay):
-    """The same between a PX4, which sends to a port of its choice, and edgevpr, which listens at `port`."""
+    """The same between a PX4, which sends to one port and listens at another, and edgevpr, which listens at `uri`."""
 
     def __init__(self, truth: Truth, log: Path, ports: tuple[int, int], origin_m: tuple[float, float]) -> None:
-        self._autopilot, self._heard = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        self._autopilot.bind(("127.0.0.1", ports[0]))
-        self._autopilot.connect(("127.0.0.1", ports[1]))
         super().__init__(truth, log, ports[1], origin_m)
-        self._heard.connect(("127.0.0.1", self.port))
+        self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._far.bind(("127.0.0.1", ports[0]))
+        self._far.connect(("127.0.0.1", ports[1]))
 
-    def _serve(self) -> None:
-        back = threading.Thread(target=self._carry, args=(self._autopilot, self._heard, None))
-        back.start()
-        self._carry(self._heard, self._autopilot, PacketReader())
-        back.join()
-        for each in (self._autopilot, self._heard):
-            each.close()
+    def _listen(self) -> str:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        self._near = self._server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._near.connect(("127.0.0.1", port))
+        return f"udpin:127.0.0.1:{port}"
 
-    def _carry(self, source: socket.socket, sink: socket.socket, receiver: PacketReader | None) -> None:
-        source.settimeout(0.2)
-        while self._is_open:
-            with contextlib.suppress(OSError):  # nothing comes, or the other one does not listen yet
-                data = source.recv(65536)
-                sink.send(data)
-                for message in receiver.feed(data) if receiver else ():
-                    self._note(message, time.monotonic())
+    def _serve_edgevpr(self) -> None:
+        self._carry(self._near, self._to_autopilot)
+
+    def _serve_autopilot(self) -> None:
+        with self._far:
+            self._carry(self._far, lambda data: self._send(self._near, data))
 
 
 def _sent(message: Message, origin_m: tuple[float, float]) -> Sent | None:

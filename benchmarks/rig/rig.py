@@ -59,7 +59,7 @@ def main() -> None:
             flights = [(numbered(name, seed), False) for seed in range(1, 1 + arguments.seeds)]
             for flight, is_control in [*flights, (name, True)][: arguments.seeds + scenario.is_compared]:
                 try:
-                    folder = Run(work, flight, shown, is_control).fly()
+                    folder = Run(work, work / "runs" / f"{flight}{'-control' * is_control}", shown, is_control).fly()
                     print(f"{folder.name}: {json.dumps(figures_of(folder))}", flush=True)
                     flown += [] if is_control else [folder]
                 except RuntimeError as error:  # one that does not arm, for example: the page has the others

@@ -24,8 +24,9 @@ class Scenario:
     `is_level` on a gimbal, or fixed to the airframe with a `mount` that edgevpr is not told, and its pictures are
     `is_stamped` with their times, or not. `parameters` are the autopilot's, `with_edgevpr` those that are set for a
     flight with edgevpr only; `config` is what edgevpr's configuration says beside the usual; its map ends `mapped_m`
-    north (None: nowhere). `starts_early`: edgevpr runs before arming. `is_compared`: the same flight without edgevpr
-    says something."""
+    north (None: nowhere), where the ground comes to lie so many times (`beyond_scale`) farther below, and all of
+    it lies `map_east_m` off; `is_blind`: the camera sees nothing known. The vehicle stands at `home_m` (None: the
+    usual). `starts_early`: edgevpr runs before arming. `is_compared`: the flight without edgevpr says something."""
 
     vehicle: str = "plane"
     is_px4: bool = False
@@ -46,7 +47,10 @@ class Scenario:
     starts_early: bool = False
     mapped_m: float | None = None
     learns: bool = False
-    reboots: bool = False
+    home_m: tuple[float, float] | None = None
+    map_east_m: float = 0.0
+    is_blind: bool = False
+    beyond_scale: float = 1.0
     is_compared: bool = True
 
 
@@ -126,5 +130,4 @@ SCENARIOS = {
     ),
     "px4_copter_vision": Scenario(is_px4=True, vehicle="copter", with_edgevpr={"EKF2_EV_CTRL": 1}, is_compared=False),
     "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
-    "reboot": Scenario(gps_s=30.0, off_s=60.0, reboots=True, is_compared=False),
 }

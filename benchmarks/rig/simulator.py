@@ -11,13 +11,15 @@ from pathlib import Path
 
 from ground import GROUND_ALT_M
 from link import STREAMS_HZ, Link, Listener, connected
+from relay import Relay
+from truth import Truth
 
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.lab.simulate.generated import to_position
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_ARDUPILOT"
-OWN_PORT, COMPANION_PORT, LAST_PORT = 5760, 5762, 5763  # the rig's, edgevpr's, and one that is left open
+_PORTS = 5760, 5762, 5763  # the rig's, edgevpr's, and one that is left open; those of the next instance are 10 higher
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,18 +32,19 @@ class Vehicle:
     modes: dict[str, int]
 
 
+_PLANE_MODES = {"CIRCLE": 1, "AUTO": 10, "RTL": 11, "LOITER": 12, "TAKEOFF": 13, "GUIDED": 15}
 VEHICLES = {
-    "plane": Vehicle("arduplane", "plane", "models/plane.parm", {"CIRCLE": 1, "AUTO": 10, "RTL": 11, "LOITER": 12}),
+    "plane": Vehicle("arduplane", "plane", "models/plane.parm", _PLANE_MODES),
     "copter": Vehicle(
         "arducopter", "quad", "default_params/copter.parm", {"ALT_HOLD": 2, "GUIDED": 4, "RTL": 6, "LAND": 9}
     ),
 }
 
 
-def tree() -> Path | None:
-    """Return the folder of ArduPilot that EDGEVPR_ARDUPILOT names, None where no simulator has been built there."""
+def tree(vehicle: str = "plane") -> Path | None:
+    """Return the folder of ArduPilot that EDGEVPR_ARDUPILOT names, None where that vehicle has not been built there."""
     folder = Path(os.environ.get(VARIABLE, ""))
-    return folder.resolve() if (folder / "build/sitl/bin/arduplane").exists() else None
+    return folder.resolve() if (folder / "build/sitl/bin" / VEHICLES[vehicle].binary).exists() else None
 
 
 def at_degrees(east_m: float, north_m: float) -> tuple[float, float]:
@@ -102,19 +105,30 @@ class Process:
 
 
 class Simulator(Process):
-    """ArduPilot's simulator; `home_m` is where it stands, metres east and north."""
+    """ArduPilot's simulator; `home_m` is where it stands, metres east and north. Those of other `instance` numbers run
+    beside it."""
+
+    ground_alt_m = GROUND_ALT_M
 
     def __init__(
-        self, vehicle: str, folder: Path, home_m: tuple[float, float], parameters: dict, listeners: list[Listener]
+        self,
+        vehicle: str,
+        folder: Path,
+        home_m: tuple[float, float],
+        parameters: dict,
+        listeners: list[Listener],
+        instance: int = 0,
     ) -> None:
         self.vehicle = VEHICLES[vehicle]
         super().__init__(folder, listeners)
+        self._name, self._instance = vehicle, instance
+        self._ports = [port + 10 * instance for port in _PORTS]
         self._parameters = parameters
         self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
 
     def __enter__(self) -> "Simulator":
         try:
-            socket.create_server(("", LAST_PORT)).close()
+            socket.create_server(("", self._ports[2])).close()
         except OSError:
             raise RuntimeError("another simulator runs on this machine: end it first") from None
         return super().__enter__()
@@ -122,13 +136,17 @@ class Simulator(Process):
     def start(self, *, wipe: bool) -> None:
         own = self._folder / "rig.parm"
         own.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
-        folder = tree()
+        folder = tree(self._name)
         defaults = folder / "Tools/autotest" / self.vehicle.defaults
         command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
-        command += ["--home", self._home, "--sim-address", "127.0.0.1"]
+        command += ["--home", self._home, "--sim-address", "127.0.0.1", f"-I{self._instance}"]
         command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
         self._launch(command, dict(os.environ))
-        self._talk(Link(connected(OWN_PORT), self._listeners), STREAMS_HZ)
+        self._talk(Link(connected(self._ports[0]), self._listeners), STREAMS_HZ)
+
+    def relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> Relay:
+        """Make the wire to edgevpr."""
+        return Relay(truth, log, self._ports[1], origin_m)
 
     def wait_ready(self) -> None:
         """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""
@@ -145,13 +163,16 @@ class Simulator(Process):
 
     def arm(self, mode: str) -> None:
         """Change the mode and arm. Raises RuntimeError where the autopilot refuses."""
-        number = self.vehicle.modes[mode]
-        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
+        self.set_mode(mode)
         for _ in range(20):
             if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
                 return
             time.sleep(1)
         raise RuntimeError("the autopilot does not arm")
+
+    def set_mode(self, mode: str) -> None:
+        number = self.vehicle.modes[mode]
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
 
     def wait_height(self, height_m: float) -> None:
         """Wait until the aircraft is that high. Raises RuntimeError where it does not climb."""
@@ -160,6 +181,14 @@ class Simulator(Process):
 
     def set_gps(self, is_on: bool) -> None:
         self.link.set_parameter("SIM_GPS1_ENABLE", int(is_on))
+
+    def set_satellites(self, count: int) -> None:
+        self.link.set_parameter("SIM_GPS1_NUMSATS", count)
+
+    def displace_gps(self, north_m: float) -> None:
+        """Let the receiver's positions lie so far north of the truth."""
+        north_deg = at_degrees(0.0, north_m)[0] - at_degrees(0.0, 0.0)[0]
+        self.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         self.link.set_parameter("SIM_WIND_DIR", from_deg)

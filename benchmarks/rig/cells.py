@@ -1,0 +1,267 @@
+"""The table of the sweep: set-ups, events, and which of them are flown together, each beside its control."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from scenarios import Scenario
+
+WATCHED_S, HEIGHT_M = 120.0, 100.0
+MAP_END_M = 500.0  # north: what is flown over beyond it is in no map, where the ground changes its height
+CENTRE_M, RADIUS_M = (700.0, 500.0), 200.0  # of a plane's circle: half of it lies beyond that end
+HOVER_M, LEG_M = (600.0, 450.0), ((700.0, 320.0), (700.0, 900.0))
+HOME_M = (300.0, 500.0)  # of a plane
+ODOMETRY_SET = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetUp:
+    """An autopilot and its `parameters` for edgevpr, `common` ones with edgevpr and without, and edgevpr's `config`."""
+
+    vehicle: str = "copter"
+    is_px4: bool = False
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    common: Mapping[str, float] = field(default_factory=dict)
+    config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def alone(self) -> str:
+        """The name of the same autopilot without edgevpr."""
+        return f"{'px4_' * self.is_px4}{self.vehicle}"
+
+    @property
+    def sends_beside_gps(self) -> bool:
+        """True if edgevpr sends positions while the autopilot has GPS too."""
+        return bool({"GPS2_TYPE", "VISO_TYPE"} & set(self.parameters))
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What happens `at_s` after the begin of the watched time: `action` is the name of a method of `Trial`, `values`
+    are its arguments."""
+
+    at_s: float
+    action: str
+    values: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """What happens in a flight: `before`, on the ground (actions and values), and `steps`.
+
+    The control is the same flight without edgevpr, or with `control_has_edgevpr` one with it; `control` names its event
+    (None: this one). From `gps_back_s` on GPS is as it was; from `silent_s` on edgevpr must send no position. An
+    aircraft that `leaves_map` flies along LEG_M (copter) or on its circle, and the map ends at MAP_END_M; beyond it the
+    ground lies `beyond_scale` times as far below. `parameters_come_late`: the autopilot has the parameters of the
+    set-up only by the action `adopt`."""
+
+    steps: tuple[Step, ...] = ()
+    before: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    control: str | None = None
+    control_has_edgevpr: bool = False
+    gps_back_s: float | None = None
+    silent_s: float | None = None
+    leaves_map: bool = False
+    beyond_scale: float = 1.0
+    parameters_come_late: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One flight: the names of a set-up and an event, and the kind of matches ("" without edgevpr)."""
+
+    set_up: str
+    event: str
+    matches: str = ""
+
+    @property
+    def name(self) -> str:
+        return "-".join(filter(None, (self.set_up, self.event, self.matches)))
+
+    @property
+    def has_edgevpr(self) -> bool:
+        return bool(self.matches)
+
+    def scenario(self) -> Scenario:
+        """Return what the rig needs to know of it."""
+        set_up, event = SET_UPS[self.set_up], EVENTS[self.event]
+        homes_m = {"plane": HOME_M, "copter": LEG_M[0] if event.leaves_map else HOVER_M}
+        return Scenario(
+            vehicle=set_up.vehicle,
+            is_px4=set_up.is_px4,
+            height_m=HEIGHT_M,
+            home_m=homes_m[set_up.vehicle],
+            parameters={**_FLOWN_WITH[set_up.alone], **set_up.common},
+            with_edgevpr={} if event.parameters_come_late else set_up.parameters,
+            config=set_up.config,
+            mapped_m=MAP_END_M if event.leaves_map else None,
+            beyond_scale=event.beyond_scale,
+            **MATCHES.get(self.matches, {}),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A flight of the table; `is_quick`: also of the part of ten minutes."""
+
+    flight: Flight
+    is_quick: bool = False
+
+    @property
+    def control(self) -> Flight:
+        """The flight that it is compared with."""
+        event = EVENTS[self.flight.event]
+        flown = event.control or self.flight.event
+        if event.control_has_edgevpr:
+            return replace(self.flight, event=flown)
+        return Flight(SET_UPS[self.flight.set_up].alone, flown)
+
+
+MATCHES = {"right": {}, "none": {"is_blind": True}, "displaced": {"map_east_m": 8.0}, "wrong": {"map_east_m": 300.0}}
+
+_FLOWN_WITH = {
+    "copter": {"WPNAV_SPEED_UP": 500, "WPNAV_SPEED": 700, "GPS1_TYPE": 5, "SIM_GPS1_TYPE": 5},  # NMEA: a plain 3D fix
+    "plane": {"TKOFF_ALT": 60, "WP_LOITER_RAD": RADIUS_M},
+    "px4_copter": {"MPC_TKO_SPEED": 5.0, "MPC_Z_V_AUTO_UP": 5.0, "MPC_Z_VEL_MAX_UP": 5.0, "MPC_XY_CRUISE": 7.0},
+    "px4_plane": {},
+}
+_GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
+_ODOMETRY = {
+    "VISO_TYPE": 1,
+    "EK3_SRC2_POSXY": 6,
+    "EK3_SRC2_VELXY": 0,
+    "EK3_SRC2_POSZ": 1,
+    "EK3_SRC2_VELZ": 0,
+    "EK3_SRC2_YAW": 1,
+}
+_SENSOR = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}
+SET_UPS = {
+    "copter": SetUp(),
+    "plane": SetUp(vehicle="plane"),
+    "px4_copter": SetUp(is_px4=True),
+    "px4_plane": SetUp(is_px4=True, vehicle="plane"),
+    "gps_input": SetUp(parameters=_GPS_INPUT),
+    "gps_input_never_switched": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 0}),
+    "gps_input_blended": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 2}),
+    "gps_input_if_no_fix": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 4}),
+    "gps_primary": SetUp(parameters={**_GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}),
+    "gps_primary_never_switched": SetUp(parameters={**_GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 0}),
+    "affinity": SetUp(parameters={**_GPS_INPUT, "EK3_AFFINITY": 1}),
+    "affinity_ours": SetUp(parameters={**_GPS_INPUT, "EK3_AFFINITY": 1, "EK3_PRIMARY": 1}),
+    "odometry": SetUp(parameters=_ODOMETRY),
+    "odometry_switched": SetUp(parameters=_ODOMETRY, config={"mavlink": {"source_sets": {"gps": 1, "no_gps": 2}}}),
+    "plane_command": SetUp(vehicle="plane"),
+    "plane_gps_input": SetUp(vehicle="plane", parameters=_GPS_INPUT),
+    "px4_sensor": SetUp(is_px4=True, parameters=_SENSOR),
+    "px4_odometry": SetUp(is_px4=True, parameters={"EKF2_EV_CTRL": 1}),
+    "px4_plane_sensor": SetUp(is_px4=True, vehicle="plane", parameters=_SENSOR),
+}
+
+_GPS_OFF, _GPS_ON = Step(0, "set_gps", (0,)), "set_gps"
+_DEAF_BY_THEN = (Step(20, "set_gps", (0,)),)
+EVENTS = {
+    "quiet": Event(),
+    "4_satellites": Event(steps=(Step(0, "set_satellites", (4,)),)),
+    "5_satellites": Event(steps=(Step(0, "set_satellites", (5,)),)),
+    "satellites_back": Event(
+        steps=(Step(0, "set_satellites", (4,)), Step(60, "set_satellites", (10,))), gps_back_s=60.0
+    ),
+    "gps_off": Event(steps=(_GPS_OFF,)),
+    "gps_back": Event(steps=(_GPS_OFF, Step(50, _GPS_ON, (1,))), gps_back_s=50.0),
+    "gps_flaps": Event(
+        steps=tuple(Step(6.0 * number, "set_gps", (number % 2,)) for number in range(12)), gps_back_s=66.0
+    ),
+    "gps_jumps": Event(steps=(Step(0, "displace_gps", (100,)), Step(60, "displace_gps", (0,))), gps_back_s=60.0),
+    "gps_drifts": Event(steps=(Step(0, "drift_gps", (0.5,)),)),
+    "gps_drifts_fast": Event(steps=(Step(0, "drift_gps", (2.0,)),)),
+    "gps_spoofed": Event(steps=(Step(0, "flag_gps", (3,)), Step(25, "flag_gps", (1,))), gps_back_s=25.0),
+    "gps_unused": Event(steps=(Step(0, "use_gps", (0,)), Step(20, "use_gps", (7,))), gps_back_s=20.0),
+    "source_set": Event(steps=(Step(0, "choose_sources", (ODOMETRY_SET,)),), control="quiet"),
+    "source_set_and_back": Event(
+        steps=(Step(0, "choose_sources", (ODOMETRY_SET,)), Step(60, "choose_sources", (1,))), control="quiet"
+    ),
+    "home_set": Event(
+        steps=(Step(0, "set_home", (60,)), Step(10, "set_gps", (0,))), control="gps_off_late", control_has_edgevpr=True
+    ),
+    "gps_off_late": Event(steps=(Step(10, "set_gps", (0,)),)),
+    "origin_set": Event(steps=(Step(0, "set_origin", (100, 80)),)),
+    "companion_reboots": Event(
+        steps=(_GPS_OFF, Step(30, "restart_edgevpr", (25,))), control="companion_restarts", control_has_edgevpr=True
+    ),
+    "companion_restarts": Event(steps=(_GPS_OFF, Step(30, "restart_edgevpr"))),
+    "companion_reboots_with_gps": Event(steps=(Step(0, "restart_edgevpr", (25,)),), control="quiet"),
+    "autopilot_reboots": Event(before=(("reboot", ()),), steps=_DEAF_BY_THEN, control="gps_off_20"),
+    "set_up_late": Event(
+        before=(("adopt", ()), ("reboot", ())), steps=_DEAF_BY_THEN, control="gps_off_20", parameters_come_late=True
+    ),
+    "parameters_late": Event(before=(("lose_requests", (8,)),), steps=_DEAF_BY_THEN, control="gps_off_20"),
+    "gps_off_20": Event(steps=_DEAF_BY_THEN),
+    "other_stamps": Event(steps=(_GPS_OFF, Step(20, "send_other_stamps")), control="gps_off", control_has_edgevpr=True),
+    "paused": Event(steps=(_GPS_OFF, Step(20, "pause")), control="gps_off", silent_s=22.0),
+    "camera_freezes": Event(steps=(_GPS_OFF, Step(30, "freeze", (1,)), Step(90, "freeze", (0,))), control="gps_off"),
+    "companion_busy": Event(steps=(_GPS_OFF, Step(30, "stop_edgevpr", (10,))), control="gps_off"),
+    "companion_busy_with_gps": Event(steps=(Step(10, "stop_edgevpr", (10,)),), control="quiet"),
+    "link_saturated": Event(steps=(Step(0, "saturate", (2000,)), *_DEAF_BY_THEN), control="gps_off_20"),
+    "link_saturated_with_gps": Event(steps=(Step(0, "saturate", (2000,)),), control="quiet"),
+    **{
+        f"{word}_ground": Event(
+            steps=(Step(5, "set_gps", (0,)), Step(55, "set_gps", (1,))),
+            gps_back_s=55.0,
+            leaves_map=True,
+            beyond_scale=scale,
+        )
+        for word, scale in (("lower", 1.4), ("higher", 0.7))
+    },
+}
+
+
+def _cells(set_up: str, events: str, matches: str = "right") -> list[Cell]:
+    """Return the cells of a set-up and several events; those with a `*` are of the quick part."""
+    each = ((event.rstrip("*"), event.endswith("*")) for event in events.split())
+    return [Cell(Flight(set_up, event, matches), is_quick) for event, is_quick in each]
+
+
+CELLS = {
+    cell.flight.name: cell
+    for cell in (
+        *_cells("gps_input", "4_satellites* 5_satellites satellites_back gps_back gps_flaps quiet", "none"),
+        *_cells("gps_input", "gps_drifts_fast link_saturated_with_gps companion_reboots_with_gps", "none"),
+        *_cells("gps_input", "4_satellites gps_back gps_jumps gps_drifts gps_drifts_fast home_set paused"),
+        *_cells("gps_input", "autopilot_reboots* set_up_late parameters_late companion_busy_with_gps"),
+        *_cells("gps_input", "camera_freezes companion_busy link_saturated lower_ground"),
+        *_cells("gps_input", "quiet", "displaced"),
+        *_cells("gps_input", "quiet gps_back", "wrong"),
+        *_cells("gps_input_never_switched", "4_satellites", "none"),
+        *_cells("gps_input_never_switched", "gps_back"),
+        *_cells("gps_input_blended", "quiet 4_satellites", "none"),
+        *_cells("gps_input_blended", "gps_back gps_jumps"),
+        *_cells("gps_input_blended", "quiet", "displaced"),
+        *_cells("gps_input_if_no_fix", "4_satellites", "none"),
+        *_cells("gps_input_if_no_fix", "gps_back"),
+        *_cells("gps_primary", "quiet*", "none"),
+        *_cells("gps_primary_never_switched", "quiet", "none"),
+        *_cells("affinity", "4_satellites", "none"),
+        *_cells("affinity", "gps_back"),
+        *_cells("affinity_ours", "quiet", "none"),
+        *_cells("odometry", "source_set", "none"),
+        *_cells("odometry", "source_set* source_set_and_back 4_satellites"),
+        *_cells("odometry", "source_set", "displaced"),
+        *_cells("odometry", "source_set", "wrong"),
+        *_cells("odometry_switched", "gps_back gps_jumps"),
+        *_cells("odometry_switched", "gps_back", "wrong"),
+        *_cells("plane_command", "gps_back gps_jumps gps_drifts_fast home_set companion_reboots other_stamps"),
+        *_cells("plane_command", "lower_ground"),
+        *_cells("plane_command", "gps_back", "wrong"),
+        *_cells("plane_gps_input", "4_satellites", "none"),
+        *_cells("plane_gps_input", "gps_back gps_drifts_fast"),
+        *_cells("px4_sensor", "5_satellites gps_back", "none"),
+        *_cells("px4_sensor", "gps_back gps_jumps gps_drifts gps_spoofed home_set origin_set paused"),
+        *_cells("px4_sensor", "autopilot_reboots set_up_late companion_busy lower_ground* higher_ground"),
+        *_cells("px4_sensor", "gps_unused quiet", "displaced"),
+        *_cells("px4_sensor", "gps_back", "wrong"),
+        *_cells("px4_odometry", "gps_back gps_spoofed lower_ground"),
+        *_cells("px4_odometry", "gps_unused", "displaced"),
+        *_cells("px4_plane_sensor", "gps_back gps_spoofed home_set lower_ground"),
+        *_cells("px4_plane_sensor", "gps_back", "wrong"),
+    )
+}

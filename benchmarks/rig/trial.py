@@ -1,0 +1,247 @@
+"""One flight of the sweep: the aircraft hovers, circles or flies a leg, and what the table says happens to it."""
+
+import json
+import math
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import base
+import ground
+from cells import CENTRE_M, EVENTS, HEIGHT_M, LEG_M, RADIUS_M, SET_UPS, WATCHED_S, Flight
+from flying import Run
+from px4 import mission_items
+from recording import EDGEVPR
+from simulator import at_degrees
+
+from edgevpr.mavlink.wire import mavlink
+
+_STEP_S, _SETTLED_S, _OFF_S = 0.1, 10.0, 6.0
+_SAVED_S = 3.0  # after which a parameter that was set outlives a loss of power
+_CIRCLE_S = 40.0  # until a plane is on its circle, at the most
+_POINTS = 72  # of a circle
+_PAUSE = 1  # edgevpr's wish, first parameter of MAV_CMD_USER_1
+
+
+class Trial(Run):
+    """A flight of the table. The actions of its steps are methods; those of edgevpr and of its wire do nothing in a
+    flight without edgevpr."""
+
+    def __init__(self, work: Path, folder: Path, flight: Flight, instance: int) -> None:
+        super().__init__(work, folder, flight.scenario(), not flight.has_edgevpr, instance)
+        self._flight, self._event = flight, EVENTS[flight.event]
+        self._each_turn: dict[str, Callable[[float], object]] = {}
+
+    def fly(self) -> Path:
+        """Fly it. What cannot be flown is said in run.json."""
+        cannot = None
+        with ExitStack() as stack:
+            try:
+                self._equip(stack)
+                self._start_edgevpr()
+                for action, values in self._event.before:
+                    self._act(action, values)
+                self._marks_s["started"] = time.monotonic()
+                self._simulator.wait_ready()
+                self._take_off()
+                self._settle()
+                self._watch(WATCHED_S)
+            except RuntimeError as error:
+                cannot = str(error)
+            self._recorder.is_on = False
+        run = {
+            "commit": base.program_commit(ground.CHECKOUT),
+            "cannot": cannot,
+            "marks_s": self._marks_s,
+            "path_m": getattr(self, "_path_m", None),
+            "texts": self._recorder.texts,
+            "has_warned": self._recorder.has_warned,
+        }
+        (self._folder / "run.json").write_text(json.dumps(run))
+        shutil.rmtree(self._folder / "simulator", ignore_errors=True)  # the autopilot's own logs are large
+        return self._folder
+
+    def _take_off(self) -> None:
+        simulator, is_plane = self._simulator, self._scenario.vehicle == "plane"
+        if self._scenario.is_px4:
+            rows = [(mavlink.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, math.nan), self._scenario.home_m, HEIGHT_M)]
+            if is_plane:
+                east_m, north_m = self._scenario.home_m
+                circle = (mavlink.MAV_CMD_NAV_LOITER_UNLIM, (0, 0, RADIUS_M, math.nan), CENTRE_M, HEIGHT_M)
+                rows = [(*rows[0][:2], (east_m, north_m + 320), 0.6 * HEIGHT_M), circle]
+            simulator.take_off(HEIGHT_M, mission_items(rows))
+        elif is_plane:
+            simulator.arm("TAKEOFF")
+            simulator.wait_height(50.0)
+            simulator.set_mode("GUIDED")
+            self._go_to(CENTRE_M)
+            simulator.wait_height(HEIGHT_M - 3.0)
+        else:
+            simulator.arm("GUIDED")
+            simulator.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT_M)
+            simulator.wait_height(HEIGHT_M - 1.0)
+
+    def _settle(self) -> None:
+        """Wait until the aircraft is where it is to be watched, and note the path that it should keep to."""
+        give_up_s = time.monotonic() + _CIRCLE_S
+        is_plane = self._scenario.vehicle == "plane"
+        while is_plane and time.monotonic() < give_up_s and abs(self._from_centre_m() - RADIUS_M) > 40.0:
+            time.sleep(_STEP_S)
+        self._recorder.is_on = True
+        time.sleep(_SETTLED_S)
+        if is_plane:
+            radius_m = self._from_centre_m()
+            turns = [2 * math.pi * number / _POINTS for number in range(_POINTS + 1)]
+            self._path_m = [
+                (CENTRE_M[0] + radius_m * math.cos(turn), CENTRE_M[1] + radius_m * math.sin(turn)) for turn in turns
+            ]
+        else:
+            at = self._pose()
+            self._path_m = [(at.east_m, at.north_m), LEG_M[1] if self._event.leaves_map else (at.east_m, at.north_m)]
+
+    def _pose(self):
+        for _ in range(50):
+            if at := self._truth.at(time.monotonic()):
+                return at
+            time.sleep(_STEP_S)
+        raise RuntimeError("the simulator has stopped")
+
+    def _from_centre_m(self) -> float:
+        at = self._pose()
+        return math.hypot(at.east_m - CENTRE_M[0], at.north_m - CENTRE_M[1])
+
+    def _watch(self, seconds: float) -> None:
+        began_s = self._marks_s["event"] = time.monotonic()
+        if self._event.leaves_map and self._scenario.vehicle == "copter":
+            self._go_to(LEG_M[1])
+        steps = list(self._event.steps)
+        while (now_s := time.monotonic()) < began_s + seconds:
+            while steps and now_s >= began_s + steps[0].at_s:
+                step = steps.pop(0)
+                self._act(step.action, step.values)
+            for act in list(self._each_turn.values()):
+                act(now_s)
+            time.sleep(_STEP_S)
+
+    def _go_to(self, at_m: tuple[float, float]) -> None:
+        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m))
+        values = (0, 0, -1, 1, RADIUS_M if self._scenario.vehicle == "plane" else 0, math.nan, lat, lon)
+        up_m, frame = HEIGHT_M, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+        if self._scenario.is_px4:  # which knows this command by altitude only
+            up_m, frame = self._simulator.link.last["GLOBAL_POSITION_INT"].alt / 1e3, mavlink.MAV_FRAME_GLOBAL
+        command = mavlink.MAV_CMD_DO_REPOSITION
+        self._simulator.link.send(mavlink.MAVLink_command_int_message(1, 1, frame, command, *values, up_m))
+
+    def _act(self, action: str, values: tuple[float, ...]) -> None:
+        self._marks_s.setdefault(action, time.monotonic())
+        if action not in _OF_EDGEVPR or not self._is_control:
+            getattr(self, action)(*values)
+
+    # What happens to the autopilot and its receiver
+
+    def set_gps(self, is_on: float) -> None:
+        self._simulator.set_gps(bool(is_on))
+
+    def set_satellites(self, count: float) -> None:
+        self._simulator.set_satellites(int(count))
+
+    def displace_gps(self, north_m: float) -> None:
+        self._simulator.displace_gps(north_m)
+
+    def drift_gps(self, speed_m_s: float) -> None:
+        began_s = time.monotonic()
+        self._each_turn["drift"] = lambda now_s: self._simulator.displace_gps(speed_m_s * (now_s - began_s))
+
+    def flag_gps(self, state: float) -> None:
+        self._simulator.link.set_parameter("SIM_GPS_SPOOF", int(state))
+
+    def use_gps(self, bits: float) -> None:
+        self._simulator.link.set_parameter("EKF2_GPS_CTRL", int(bits))
+
+    def choose_sources(self, number: float) -> None:
+        self._simulator.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
+
+    def set_home(self, up_m: float) -> None:
+        """Set the home so far above the ground on which it was."""
+        place = *at_degrees(*self._scenario.home_m), self._simulator.ground_alt_m + up_m
+        self._simulator.link.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, *place)
+
+    def set_origin(self, east_m: float, up_m: float) -> None:
+        """Set the origin of the local frame so far east of the place where it stood, and above it."""
+        east_from, north_from = self._scenario.home_m
+        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(east_from + east_m, north_from))
+        alt_mm = round(1000 * (self._simulator.ground_alt_m + up_m))
+        self._simulator.link.send(mavlink.MAVLink_set_gps_global_origin_message(1, lat, lon, alt_mm))
+
+    def reboot(self) -> None:
+        """Take the autopilot's power away and give it back; it keeps its parameters."""
+        self._simulator.kill()
+        time.sleep(_OFF_S)
+        self._simulator.start(wipe=False)
+
+    # What happens to edgevpr and to its wire
+
+    def adopt(self) -> None:
+        """Give the autopilot the parameters of the set-up, as edgevpr's doctor advises."""
+        for name, value in SET_UPS[self._flight.set_up].parameters.items():
+            self._simulator.link.set_parameter(name, value)
+        time.sleep(_SAVED_S)
+
+    def lose_requests(self, seconds: float) -> None:
+        """Let no request for a parameter reach the autopilot until so long after the first."""
+        asked_s: list[float] = []
+
+        def is_lost(message) -> bool:
+            if message.get_type() != "PARAM_REQUEST_READ":
+                return False
+            asked_s.append(time.monotonic())
+            return asked_s[-1] < asked_s[0] + seconds
+
+        self._relay.drops = is_lost
+
+    def restart_edgevpr(self, clock_s: float | None = None) -> None:
+        """Kill edgevpr and start it again, with a computer whose clock begins anew (None: it goes on)."""
+        self._edgevpr.kill()
+        self._edgevpr.wait()
+        self._edgevpr = None
+        self._start_edgevpr(clock_s)
+
+    def stop_edgevpr(self, seconds: float) -> None:
+        """Give edgevpr no processor for so long."""
+        goes_on_s = time.monotonic() + seconds
+        self._edgevpr.send_signal(signal.SIGSTOP)
+
+        def go_on(now_s: float) -> None:
+            if now_s >= goes_on_s:
+                self._edgevpr.send_signal(signal.SIGCONT)
+                del self._each_turn["stopped"]
+
+        self._each_turn["stopped"] = go_on
+
+    def freeze(self, is_frozen: float) -> None:
+        self._camera.is_frozen = bool(is_frozen)
+
+    def pause(self) -> None:
+        wish = (1, EDGEVPR, mavlink.MAV_CMD_USER_1, 0, _PAUSE, 0, 0, 0, 0, 0, 0)
+        self._simulator.link.send(mavlink.MAVLink_command_long_message(*wish))
+
+    def saturate(self, bytes_per_s: float) -> None:
+        self._relay.saturate(bytes_per_s)
+
+    def send_other_stamps(self) -> None:
+        """Let another program on the wire send stamps of the year."""
+        packer = mavlink.MAVLink(None, 1, 198)
+
+        def send(_now_s: float) -> None:
+            numbers = (round(time.time() * 1e6), 0, mavlink.MAV_FRAME_BODY_FRD, 0.1, 0.1, 20.0, 0.0, 0.0)
+            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer))
+
+        self._each_turn["stamps"] = send
+
+
+_OF_EDGEVPR = frozenset(
+    ("adopt", "lose_requests", "restart_edgevpr", "stop_edgevpr", "freeze", "pause", "saturate", "send_other_stamps")
+) | {"choose_sources"}  # the control has but one set

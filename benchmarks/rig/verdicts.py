@@ -1,0 +1,165 @@
+"""The figures of a flight of the sweep, what is wrong with a cell, and the page of them all."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import base
+import numpy as np
+from base import Row
+from cells import CELLS, EVENTS, SET_UPS, WATCHED_S, Flight
+from figures import read_table
+from recording import EDGEVPR
+
+from edgevpr.runtime.flight.flightlog import read_log
+
+WORSE_M, LATER_S = 3.0, 5.0  # what a flight with edgevpr may be beyond its control
+FIRST_WITHIN_S = 60.0  # after an autopilot has started, which needs 25 s to find its place
+_ON_GPS_M = 5.0  # the estimate is on GPS again from when on it stays this near the truth
+_DISTANCES = {"strayed_m": "strays {:.0f} m", "sank_m": "sinks {:.0f} m", "error_m": "estimate {:.0f} m off"}
+_COLUMNS = {
+    "cell": "{cell}",
+    "strays": "{with[strayed_m]:.1f}",
+    "alone ": "{control[strayed_m]:.1f}",
+    "sinks": "{with[sank_m]:.1f}",
+    "alone  ": "{control[sank_m]:.1f}",
+    "estimate off": "{with[error_m]:.1f}",
+    "alone   ": "{control[error_m]:.1f}",
+    "on GPS after s": "{with[on_gps_s]}",
+    "alone    ": "{control[on_gps_s]}",
+    "sent": "{with[sent]}",
+    "accepted": "{with[accepted]}",
+    "verdict": "{verdict}",
+}
+
+
+def figures_of(folder: Path, flight: Flight) -> Row:
+    """Return the figures of a flight, from its folder: of the watched time, the largest distances; and the texts."""
+    run, event = json.loads((folder / "run.json").read_text()), EVENTS[flight.event]
+    edgevprs = [text.removeprefix("edgevpr: ") for _, sender, text in run["texts"] if sender == EDGEVPR]
+    row: Row = {"commit": run["commit"], "cannot": run["cannot"], "has_warned": run["has_warned"], "texts": edgevprs}
+    started_s, began_s = (run["marks_s"].get(name, math.inf) for name in ("started", "event"))
+    if (folder / "sent.csv").exists():
+        sent_s = read_table(folder / "sent.csv")["t_s"]
+        after_s = sent_s[sent_s >= began_s] - began_s
+        row["sent"] = int((after_s <= WATCHED_S).sum())
+        if event.before:
+            due_s = started_s if SET_UPS[flight.set_up].sends_beside_gps else began_s
+            first_s = sent_s[sent_s >= due_s] - due_s
+            row["first_s"] = round(float(first_s[0]), 1) if len(first_s) else None
+        if event.silent_s is not None:
+            row["sent_though_silent"] = int((after_s >= event.silent_s).sum())
+        row["accepted"] = _accepted(folder / "flight.jsonl")
+    if run["cannot"]:
+        return row
+    track = read_table(folder / "track.csv")
+    track = track[(track["t_s"] >= began_s) & (track["t_s"] <= began_s + WATCHED_S)]
+    after_s, error_m, height_m = track["t_s"] - began_s, track["error_m"], track["height_m"]
+    row["strayed_m"] = float(distances(np.stack((track["east_m"], track["north_m"]), 1), run["path_m"]).max())
+    row["sank_m"] = float(height_m[0] - height_m.min())
+    row["error_m"] = float(error_m.max())
+    if event.gps_back_s is not None:
+        row["on_gps_s"] = seconds_until_near(after_s - event.gps_back_s, error_m)
+    return row
+
+
+def _accepted(log: Path) -> str:
+    """Return how many queries were accepted, of how many."""
+    queries = [line for line in read_log(log) if line["kind"] == "query"] if log.exists() else []
+    return f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
+
+
+def distances(points_m: np.ndarray, path_m: list) -> np.ndarray:
+    """Return the distance of each point (N, 2) from a path, a list of corners."""
+    corners = np.array(path_m, float)
+    found = np.full(len(points_m), math.inf)
+    for start, end in pairwise(corners):
+        along = end - start
+        share = np.clip((points_m - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
+        found = np.minimum(found, np.hypot(*(points_m - start - share[:, None] * along).T))
+    return found
+
+
+def seconds_until_near(after_s: np.ndarray, error_m: np.ndarray) -> float | None:
+    """Return after how many seconds the error is small for good; None where it is not at the end."""
+    far = np.flatnonzero((error_m > _ON_GPS_M) & (after_s >= 0))
+    if len(far) == 0:
+        return 0.0
+    return None if far[-1] == len(after_s) - 1 else round(float(after_s[far[-1] + 1]), 1)
+
+
+def faults(flown: Row, control: Row) -> list[str]:
+    """Return what is wrong with a flight, by the figures and those of its control."""
+    if control["cannot"]:
+        return [f"no control: {control['cannot']}"]
+    if flown["cannot"]:
+        return [] if is_refused(flown) else [f"without a warning: {flown['cannot']}"]
+    found = []
+    if not is_refused(flown):
+        worse = [key for key in _DISTANCES if flown[key] > control[key] + WORSE_M]
+        found += [_DISTANCES[key].format(flown[key]) for key in worse]
+        back_s, control_s = flown.get("on_gps_s", 0.0), control.get("on_gps_s", 0.0)
+        if control_s is not None and (back_s is None or back_s > control_s + LATER_S):
+            found.append("not on GPS again" if back_s is None else f"on GPS {back_s - control_s:.0f} s later")
+    first_s = flown.get("first_s", 0.0)
+    if first_s is None or first_s > FIRST_WITHIN_S:
+        found.append("no position in time")
+    if flown.get("sent_though_silent"):
+        found.append(f"{flown['sent_though_silent']} positions though paused")
+    return found
+
+
+def is_refused(flown: Row) -> bool:
+    """Tell whether edgevpr sent nothing in the watched time, and warned of something."""
+    return flown["has_warned"] and not flown.get("sent")
+
+
+def judged(rows: Mapping[str, Row]) -> list[Row]:
+    """Return a row for each cell of the table that was flown beside its control, by the figures of flights by name."""
+    found = []
+    for name, cell in CELLS.items():
+        flown, control = rows.get(name), rows.get(cell.control.name)
+        if flown and control:
+            wrong = faults(flown, control)
+            verdict = "; ".join(wrong) or ("refused" if is_refused(flown) else "right")
+            own = {"cell": name, "beside": cell.control.name, "verdict": verdict, "is_right": not wrong}
+            found.append({**own, "with": flown, "control": control})
+    return found
+
+
+def page(result: Row) -> str:
+    """Return the page for people."""
+    cells = result["cells"]
+    wrong = [row for row in cells if not row["is_right"]]
+    texts = "\n".join(f"* {row['cell']}: {'; '.join(row['with']['texts']) or 'none'}" for row in cells)
+    other = [f"{row['cell']} (by {row['beside']})" for row in cells if CELLS[row["cell"]].control.has_edgevpr]
+    commits = Counter(row["with"]["commit"] for row in cells)
+    flown = ", ".join(f"{commit} ({count} cells)" for commit, count in commits.items())
+    return f"""# Never worse than alone
+
+A real ArduPilot or PX4 in its own simulator, with edgevpr, and the same flight without it: {len(cells)} of {len(CELLS)}
+cells of the table (benchmarks/rig/cells.py: set-up, event, and what the camera recognises) are flown, {len(wrong)} are
+worse. A copter hovers 100 m high or flies a leg, a plane circles; then comes the event, and {WATCHED_S:.0f} s are
+watched.
+
+Metres, the largest of that time: how far the aircraft strays from where it should fly, how far it sinks, and how far
+its autopilot's estimate is from the truth; beside each the same of the control. Seconds from the moment at which GPS is
+as before until the estimate stays within {_ON_GPS_M:.0f} m. Positions sent; queries accepted in all of the flight.
+
+Right: nothing is more than {WORSE_M:.0f} m worse than the control, GPS is used again {LATER_S:.0f} s later than by it
+at the latest, after a start of the autopilot positions come within {FIRST_WITHIN_S:.0f} s, and none while paused.
+Refused: edgevpr sends nothing, and has warned.
+
+{base.table(cells, _COLUMNS)}
+
+Where edgevpr is needed, the control has it too and lacks a part of the event: {", ".join(other) or "none"}.
+
+What edgevpr reported to the ground station:
+
+{texts}
+
+Flown with edgevpr at {flown}. {base.made_line(result, "make never-worse")}
+"""
