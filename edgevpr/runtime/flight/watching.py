@@ -44,6 +44,7 @@ _GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly 
 _GPS_WITHIN_S = 30.0  # the matches in a row must be no older
 _GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
+_REPORTED_AGAIN = 2.0  # times the distance that was last reported
 _TIME_SD_S = 0.1  # between a position of the receiver and a frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
@@ -156,8 +157,8 @@ class Sight:
 
 class GpsWatch:
     """Compares GPS with the matches: a receiver far from them is jammed, spoofed, or wrong for a moment. It reports
-    once when they contradict each other and when they agree again. Every comparison is sent to the autopilot, and the
-    navigation does not use a GPS that is wrong.
+    when they contradict each other, whenever the distance has doubled, and when they agree again. Every comparison is
+    sent to the autopilot, and the navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
     from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
@@ -173,6 +174,7 @@ class GpsWatch:
         self._agreeing = 0
         self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
+        self._reported_m = 0.0  # the distance that was last reported
         self.is_wrong = False
 
     def begin_anew(self) -> None:
@@ -198,7 +200,9 @@ class GpsWatch:
         away_m = math.hypot(*off_m)
         if self._autopilot:
             self._autopilot.compare_gps(away_m, self.is_wrong)
-        if self.is_wrong != was_wrong:
+        has_grown = self.is_wrong and away_m > _REPORTED_AGAIN * self._reported_m
+        if self.is_wrong != was_wrong or has_grown:
+            self._reported_m = away_m
             severity = Severity.WARNING if self.is_wrong else Severity.INFO
             news = (
                 f"GPS is {away_m:.0f} m from the map's position" if self.is_wrong else "GPS agrees with the map again"

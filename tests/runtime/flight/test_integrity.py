@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -96,14 +97,26 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     glitch(air, drift_m_s)
     assert until_found(air) < 15
     air.fly(60)
-    (news,) = air.news
-    assert news["is_wrong"]
+    news = air.news[0]
+    assert all(line["is_wrong"] for line in air.news)
     said_m, rest = news["said"].removeprefix("GPS is ").split(" ", 1)
     assert float(said_m) == pytest.approx(news["off_m"], abs=0.6)
     assert "map" in rest
-    assert [text for _, text in air.link.texts() if "GPS" in text] == [f"edgevpr: {news['said']}"]
+    assert [text for _, text in air.link.texts() if "GPS" in text] == [f"edgevpr: {line['said']}" for line in air.news]
     assert len(air.distances()) == len(air.events)
     assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
+
+
+def test_gps_watch_reports_a_distance_again_when_it_has_doubled(watched):
+    air = watched()
+    air.fly(20)
+    air.drift_m_s = 2.0
+    air.fly(100)
+    first, *later = [line["off_m"] for line in air.news]
+    assert 15 <= first < 50
+    assert len(later) >= 2
+    for before, after in pairwise([first, *later]):
+        assert 2 * before < after < 2.5 * before + 5
 
 
 def seconds_to_alarm(air, drift_m_s):
