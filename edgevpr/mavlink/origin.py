@@ -30,6 +30,7 @@ class OriginAltitude:
                 self._report("set EKF origin", "the autopilot does not report the air pressure either")
             self._has_asked = True
             return messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
+        self._has_asked = False  # an autopilot that restarts is asked again
         if here.alt_m is None:
             self._report(f"about {alt_m:.0f} m", "the autopilot's pressure altitude is sent, it may be 150 m off")
         return messages.origin(system_id, here.lat_deg, here.lon_deg, alt_m)
