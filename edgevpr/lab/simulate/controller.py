@@ -70,6 +70,17 @@ class FlightController:
         """Set a parameter, as PARAM_SET does. For example, SIM_GPS1_ENABLE 0 switches GPS off."""
         self.brain.parameters.set(name, value)
 
+    def reboot(self) -> None:
+        """Start anew, as after a power cycle: it keeps parameters and forgets message rates, origin and estimate. Its
+        silence meanwhile is left to the caller."""
+        before, self.brain = self.brain, VEHICLES[self.vehicle](self.brain.motion)
+        self.brain.parameters.update(before.parameters)
+        self.brain.start_utc_s, self.brain.truth = before.start_utc_s, before.truth
+        self.brain.now_s = self.brain.booted_s = before.now_s
+        self.brain.is_armed = False
+        self._interval_s = dict(self._default_s)
+        self._due_s = dict.fromkeys(self._interval_s, before.now_s)
+
     def advance(self, now_s: float) -> list[Message]:
         """Simulate up to `now_s` in steps of STEP_S seconds; return the messages sent meanwhile."""
         said = []
@@ -99,7 +110,7 @@ class FlightController:
             case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
                 return self.brain.parameters.answer(message)
             case "TIMESYNC" if message.tc1 == 0:
-                return [mavlink.MAVLink_timesync_message(round(self.brain.now_s * 1e9) + 1, message.ts1)]
+                return [mavlink.MAVLink_timesync_message(round(self.brain.boot_s * 1e9) + 1, message.ts1)]
             case "GPS_INPUT":
                 self.brain.receivers.hear(message, self.brain.now_s)
             case "ODOMETRY":

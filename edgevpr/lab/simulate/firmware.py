@@ -54,9 +54,14 @@ class Firmware(ABC):
         self.origin: Origin | None = None
         self.is_armed = motion.is_flying
         self.test_ratio = 0.0
-        self.start_utc_s = 0.0
+        self.start_utc_s = self.booted_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
         self._wind_m_s = 0j  # as the filter has learnt it
+
+    @property
+    def boot_s(self) -> float:
+        """Seconds since the last boot."""
+        return self.now_s - self.booted_s
 
     def step(self, dt_s: float) -> None:
         """Advance by `dt_s` seconds: motion, sensors, estimator."""

@@ -80,7 +80,7 @@ def _gps(last: PositionMeasurement, brain: Firmware) -> dict[str, int]:
         return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
     velocity_m_s = last.velocity_m_s or 0j
     return {
-        "time_usec": round(last.t_s * 1e6),
+        "time_usec": round((last.t_s - brain.booted_s) * 1e6),
         "fix_type": last.fix_type,
         "lat": round(last.lat_deg * 1e7),
         "lon": round(last.lon_deg * 1e7),
@@ -112,7 +112,16 @@ def _version(brain: Firmware) -> Message:
 def _estimator_status(brain: Firmware) -> Message:
     both_m = math.sqrt(2) * brain.sd_m if brain.origin else 0.0
     return mavlink.MAVLink_estimator_status_message(
-        round(brain.now_s * 1e6), brain.flags(), brain.velocity_ratio, brain.test_ratio, 0.1, 0.1, 0.0, 0.0, both_m, 0.5
+        round(brain.boot_s * 1e6),
+        brain.flags(),
+        brain.velocity_ratio,
+        brain.test_ratio,
+        0.1,
+        0.1,
+        0.0,
+        0.0,
+        both_m,
+        0.5,
     )
 
 
@@ -143,7 +152,7 @@ SILENT = {mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR, mavlink.MAVLINK_MSG_ID_TERRAIN
 
 
 def _boot_ms(brain: Firmware) -> int:
-    return round(brain.now_s * 1000)
+    return round(brain.boot_s * 1000) % 2**32
 
 
 def yaw_of(truth: TrueState) -> float:

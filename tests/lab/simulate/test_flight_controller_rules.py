@@ -438,3 +438,24 @@ def test_accelerometers_and_attitude_show_the_acceleration_and_the_tilt(accelera
         angles_deg = (math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw))
         felt = complex(*over_ground(force_m_s2, *angles_deg))
         assert felt == pytest.approx(acceleration_m_s2 + GRAVITY_M_S2 * error, abs=0.05)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_a_reboot_keeps_parameters_and_starts_all_else_anew(vehicle):
+    flown = Flown(vehicle).in_air()
+    flown.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_SCALED_IMU, 40_000)
+    flown.controller.set("SIM_WIND_SPD", 3.0)
+    place = flown.truth
+    flown.controller.set("SIM_GPS1_ENABLE", 0)
+    flown.controller.reboot()
+    brain = flown.controller.brain
+    assert (brain.boot_s, brain.origin, brain.is_armed, brain.truth) == (0.0, None, False, place)
+    assert brain.parameters["SIM_WIND_SPD"] == 3.0
+    flown.wait(2.0)
+    assert "SCALED_IMU" not in {message.get_type() for message in flown.said}
+    (answer,) = flown.tell(mavlink.MAVLink_timesync_message(0, 7))
+    assert (answer.ts1, answer.tc1) == (7, pytest.approx(2e9, abs=0.05e9))
+    request = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, *[0] * 6
+    _, time = flown.tell(mavlink.MAVLink_command_long_message(1, 1, *request))
+    assert time.time_boot_ms == pytest.approx(2000, abs=50)
+    assert time.time_unix_usec / 1e6 - flown.controller.brain.start_utc_s == pytest.approx(42.0, abs=0.1), "it goes on"
