@@ -96,8 +96,8 @@ class Autopilot:
     def filter(self, flags):
         self.say(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
 
-    def px4_filter(self, accuracy_m, flags=ABS):
-        self.say(mavlink.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, accuracy_m, 1.0))
+    def px4_filter(self, accuracy_m, flags=ABS, vel_ratio=0):
+        self.say(mavlink.MAVLink_estimator_status_message(0, flags, vel_ratio, 0, 0, 0, 0, 0, accuracy_m, 1.0))
 
     def put_fix(self, accuracy_m=12.0, **sender):
         """Let a fix be sent where one may be; it leaves at once."""

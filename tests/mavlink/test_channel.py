@@ -1,5 +1,6 @@
 """The channel by which an autopilot is told positions: asked for, chosen, and used."""
 
+import math
 import struct
 from dataclasses import replace
 
@@ -258,6 +259,26 @@ def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
     ear.state = STATE
     sent(autopilot, "GLOBAL_POSITION_SENSOR")
     assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
+
+
+def test_a_px4_is_left_to_a_receiver_whose_velocity_it_takes():
+    """It does not reset to GPS while positions of ours are active, so they have to stop first."""
+    autopilot, _ = px4_that_fuses()
+
+    def has_gps_after(seconds, flags, vel_ratio, sends):
+        for _ in range(round(seconds * 5)):
+            sent(autopilot, "GLOBAL_POSITION_SENSOR", 0.2) if sends else autopilot.wait(0.2)
+            autopilot.beat()
+            autopilot.gps(h_acc=800)
+            autopilot.px4_filter(2.0, flags, vel_ratio=vel_ratio)
+        return autopilot.position().has_gps
+
+    assert not has_gps_after(5, GLOBAL | FUSES, math.nan, sends=True), "what it fuses is ours"
+    assert has_gps_after(2, GLOBAL | FUSES, 0.1, sends=True)
+    assert has_gps_after(5, GLOBAL | FUSES, 0.1, sends=False)
+    assert not has_gps_after(6, GLOBAL, 0.1, sends=False), "it does not take its position after all"
+    assert not has_gps_after(10, GLOBAL | FUSES, 0.1, sends=True), "another try waits"
+    assert has_gps_after(30, GLOBAL | FUSES, 0.1, sends=True)
 
 
 def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():

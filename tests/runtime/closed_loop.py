@@ -2,6 +2,8 @@
 conversation and the navigator of edgevpr beside it, in steps of 20 ms. The same flight without edgevpr is its control.
 """
 
+import math
+
 import numpy as np
 from air import match_at
 from fakes import FakeClock
@@ -21,7 +23,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.stride import Stride
 
 HEIGHT_M = 60.0
-_FRAME_S, _LATE_S = 1.0, 0.5  # from frame to frame, and from a frame to its recognition
+_FRAME_S = 1.0  # from frame to frame
 _MATCH_SD_M, _STRIDE_SD_M = 1.0, 0.2
 _VIEW = View(up_deg=0.0, footprint_m=60.0, aside=(0.0, 0.0))
 _PICTURE = np.zeros((8, 8), np.uint8)
@@ -29,9 +31,11 @@ _PICTURE = np.zeros((8, 8), np.uint8)
 
 class ClosedLoop:
     """A flight of a `vehicle` of the flight controller with its `parameters`, that hovers or cruises by a velocity.
-    While it `matches`, every frame is recognised, `map_off_m` (east + 1j * north) beside the truth. `stride_scale` is
-    by what strides are too long. `away_m` and `error_m` are, step by step, the true distance from the target, and that
-    of the autopilot's estimate from the truth; `sent` is all that edgevpr sends, with the times."""
+    While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
+    the truth. `stride_scale` is by what strides are too long, `time_error_s` by how much frames carry too late a time,
+    and `mount_tilt_deg` by how much the camera looks east of straight down. `away_m` and `error_m` are, step by step, the
+    true distance from the target, and that of the autopilot's estimate from the truth; `sent` is all that edgevpr
+    sends, with the times."""
 
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
@@ -39,7 +43,8 @@ class ClosedLoop:
         self.controller.brain.is_armed = True
         for name, value in parameters.items():
             self.controller.set(name, value)
-        self.matches, self.map_off_m, self.stride_scale = matches, 0j, 1.0
+        self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
+        self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
         self.away_m, self.error_m, self.sent = [], [], []
         self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
         self.navigator = Navigator(1.0, _FRAME_S)
@@ -74,7 +79,7 @@ class ClosedLoop:
                 self._exchange(said)
                 if self._steps % round(_FRAME_S / STEP_S) == 0:
                     self._take_frame()
-                if self._waiting and self._waiting[0].frame.t_mono_s <= self._clock.now_s - _LATE_S:
+                if self._waiting and self._waiting[0].frame.t_mono_s <= self._clock.now_s - self.late_s:
                     self._recognise(self._waiting.pop(0))
         return self
 
@@ -128,11 +133,13 @@ class ClosedLoop:
         return packet
 
     def _take_frame(self):
-        truth, t_s = self.brain.truth, self._clock.now_s
+        truth, t_s = self.brain.truth, self._clock.now_s + self.time_error_s
         vehicle = self.conversation.vehicle_at(t_s)
-        if self.matches:
+        frames = round(self.now_s / _FRAME_S)
+        if self.matches and frames % self.match_every == 0:
             # A camera that is levelled by an attitude that is wrong puts the place beside the true one.
-            off_m = self.map_off_m + HEIGHT_M * self.brain.tilt + complex(*self._rng.normal(0, _MATCH_SD_M, 2))
+            off_m = self.map_off_m + HEIGHT_M * math.tan(math.radians(self.mount_tilt_deg))
+            off_m += HEIGHT_M * self.brain.tilt + complex(*self._rng.normal(0, _MATCH_SD_M, 2))
             place = Position(*moved(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
             event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW)
         else:

@@ -163,6 +163,11 @@ class ToAutopilot:
             self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong)
 
+    def correct_height(self, ratio: float) -> None:
+        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree)."""
+        with self._link.turn("height"):
+            self._navigator.correct_height(ratio)
+
     def begin_anew(self) -> None:
         """Begin to navigate anew, since fixes err otherwise from now on."""
         with self._link.turn("anew"):

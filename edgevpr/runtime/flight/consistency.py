@@ -29,13 +29,15 @@ _IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are beli
 class HeardFrame:
     """A frame taken at `t_s`. `sd_m` is the standard deviation, of each axis, by which its picture puts the aircraft
     wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter` in `drift`). `stride` is
-    the motion since the frame before (None: unknown). `alike_m` is how far apart pictures are whose fixes do not err
+    the motion since the frame before (None: unknown), whose scale is wrong by `scale_sd` where heights contradict each
+    other. `alike_m` is how far apart pictures are whose fixes do not err
     alike."""
 
     t_s: float
     sd_m: float
     lean_s2: float = 0.0
     stride: Stride | None = None
+    scale_sd: float = 0.0
     alike_m: float = 0.0
 
 

@@ -78,7 +78,7 @@ class Flight:
             Sight(herald).tell,
             ScaleWatch(herald).tell,
             TurnWatch(herald, config.source).tell,
-            HeightWatch(herald).tell,
+            HeightWatch(herald, crew.autopilot).tell,
             gps.tell,
             self._surveyor.tell,
             self._log_event,

@@ -5,6 +5,7 @@ import statistics
 from collections import deque
 
 from edgevpr.mavlink.messages import Severity
+from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -16,13 +17,14 @@ LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
 class HeightWatch:
     """Compares the height that accepted matches give with the reported one, and reports once when they contradict each
     other in five matches in a row, and once when five agree again. A match gives a height only if the lens is known.
+    The `autopilot` (None: there is no link) gets the ratio, by which positions claim to be less accurate.
 
     `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
 
-    def __init__(self, herald: Herald) -> None:
+    def __init__(self, herald: Herald, autopilot: ToAutopilot | None = None) -> None:
         self.by_pictures_m: float | None = None
         self.by_autopilot_m: float | None = None
-        self._herald = herald
+        self._herald, self._autopilot = herald, autopilot
         self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # by pictures, by the autopilot
         self._last_s: float | None = None
 
@@ -54,6 +56,8 @@ class HeightWatch:
             self.by_pictures_m = self.by_autopilot_m = None
         elif was_so or min(ratios) > CONTRADICTION_RATIO or max(ratios) < 1 / CONTRADICTION_RATIO:
             self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
+        if self._autopilot:
+            self._autopilot.correct_height(self.ratio)
         if was_so != (self.by_pictures_m is not None):
             self._report()
 

@@ -207,7 +207,7 @@ class Navigation:
             strode = Strode(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
         is_used = self._filter.hear_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
         if stride and strode and is_used:
-            self._strides_since_fix.add(strode.moved_m, stride.zoom, frame.t_s)
+            self._strides_since_fix.add(strode.moved_m, stride.zoom, frame)
             self._strode_s = frame.t_s
 
     def compared(self, seen: PositionedMatch) -> ComparedFix | None:
@@ -292,18 +292,20 @@ class _StridesSinceFix:
     """What strides have shown since the last fix or GPS, at `fixed_s`: how far they lead, and how the scale changes."""
 
     def __init__(self, fixed_s: float = -math.inf) -> None:
-        self._moved_m, self._zoom, self._last_s, self._has_gap = np.zeros(2), 0.0, fixed_s, False
+        self._moved_m, self._zoom, self._last_s = np.zeros(2), 0.0, fixed_s
+        self._has_gap, self._scale_sd = False, 0.0
 
-    def add(self, moved_m: Doubles, zoom: float, t_s: float) -> None:
-        """Add a stride by `moved_m` (2,) metres to a frame of `t_s`."""
-        self._has_gap |= t_s - self._last_s > _STRIDE_GAP_S
-        self._moved_m, self._zoom, self._last_s = self._moved_m + moved_m, self._zoom + zoom, t_s
+    def add(self, moved_m: Doubles, zoom: float, frame: HeardFrame) -> None:
+        """Add a stride by `moved_m` (2,) metres to a frame."""
+        self._has_gap |= frame.t_s - self._last_s > _STRIDE_GAP_S
+        self._scale_sd = max(self._scale_sd, frame.scale_sd)
+        self._moved_m, self._zoom, self._last_s = self._moved_m + moved_m, self._zoom + zoom, frame.t_s
 
     @property
     def error_m(self) -> float:
         """Standard deviation of one axis by which a changed height of the ground can have led us astray, metres."""
         unseen = _UNSEEN_SCALE if self._has_gap else 0.0
-        return float(np.hypot(*self._moved_m)) * max(unseen, abs(self._zoom) - _UNTOLD_ZOOM, 0.0)
+        return float(np.hypot(*self._moved_m)) * max(unseen, self._scale_sd, abs(self._zoom) - _UNTOLD_ZOOM)
 
 
 def reckons_by_gps(vehicle: Vehicle) -> bool:

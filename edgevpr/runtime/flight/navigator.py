@@ -76,6 +76,7 @@ class Navigator(Listener):
         self._channel, self._believes_gps = Channel.COMMAND, True
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._given_s = OutputWatch(), -math.inf
+        self._height_ratio = 1.0
 
     @property
     def has_gps(self) -> bool:
@@ -88,6 +89,12 @@ class Navigator(Listener):
 
     def believes_gps(self) -> bool:
         return self._believes_gps
+
+    def correct_height(self, ratio: float) -> None:
+        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree). Where they do not,
+        motion between pictures may be wrong by as much, and positions claim that."""
+        with self._lock:
+            self._height_ratio = ratio
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
@@ -260,7 +267,7 @@ class Navigator(Listener):
         vehicle = event.vehicle or self._vehicle
         height_m, has_attitude, speed_m_s = 0.0, False, 0.0
         if vehicle:
-            height_m, has_attitude = vehicle.height_m or 0.0, vehicle.roll_deg is not None
+            height_m, has_attitude = self._height_ratio * (vehicle.height_m or 0.0), vehicle.roll_deg is not None
             tilting_m_s = height_m * math.radians(0.0 if self._is_level else vehicle.tilting_deg_s)
             speed_m_s = math.hypot(tilting_m_s, *(vehicle.velocity_m_s or (0.0, 0.0)))
         is_apart = self._is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
@@ -270,6 +277,7 @@ class Navigator(Listener):
             sd_m=math.hypot(tilt_sd * height_m, _TIME_SD_S * speed_m_s),
             lean_s2=0.0 if is_apart else height_m / GRAVITY_M_S2,
             stride=event.stride,
+            scale_sd=abs(self._height_ratio - 1.0),
             alike_m=_ALIKE_SHARE * (event.view.footprint_m or 0.0),
         )
 

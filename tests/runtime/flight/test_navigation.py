@@ -8,7 +8,8 @@ import pytest
 from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
-from edgevpr.core.types import Position
+from edgevpr.core.types import Position, Receiver
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
 from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
@@ -260,3 +261,84 @@ def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
     assert max(steps_m) < 0.1 * (12 + 2 + 3), "its own speed, the catching up, and what the filter thinks of the speed"
     slew.forget()
     assert slew.followed(flown.navigation.at(flown.t_s))[2] == 0.0
+
+
+class Received:
+    """A path of accelerations that stands still, beside a receiver that is `off_m` east of HOME and an estimate of the
+    autopilot that is elsewhere, since it is made of our own positions."""
+
+    def __init__(self):
+        self.navigation, self.t_s, self.steady_since_s = Navigation(INERTIAL, 1.0), 0.0, 0.0
+
+    def fly(self, seconds, off_m=0.0, has_gps=True, estimate_m=300.0, velocity_m_s=(0.0, 0.0)):
+        for _ in range(round(seconds * 10)):
+            self.t_s += 0.1
+            self.navigation.hear_acceleration(self.t_s, np.zeros(2))
+            steady_for_s = self.t_s - self.steady_since_s
+            where = moved(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
+            known = {"velocity_m_s": velocity_m_s, "steady_for_s": steady_for_s}
+            gps = Receiver(*where, 1.0, self.t_s, **known) if has_gps else None
+            estimate = moved(*HOME, estimate_m, 0.0)
+            known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
+            self.navigation.hear_vehicle(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)
+        return self
+
+    @property
+    def east_m(self):
+        here = self.navigation.at(self.t_s).position
+        return float(offset_m(*HOME, here.lat_deg, here.lon_deg)[0])
+
+
+def test_navigation_beside_accelerations_takes_the_receiver_and_never_the_estimate():
+    flown = Received().fly(20)
+    assert flown.east_m == pytest.approx(0.0, abs=0.5)
+    assert flown.navigation.has_gps
+    assert Received().fly(5, has_gps=False).navigation.at(5.0) is None, "its estimate may be ours"
+
+
+def test_navigation_allows_for_the_lag_of_a_receiver():
+    flown = Received()
+    for number in range(100):
+        flown.fly(0.1, off_m=2.0 * number, velocity_m_s=(20.0, 0.0))
+    assert flown.east_m == pytest.approx(2.0 * 99, abs=1.5)
+
+
+def test_steady_receiver_that_contradicts_overrules_us_after_two_seconds():
+    flown = Received().fly(20)
+    flown.steady_since_s = flown.t_s
+    flown.fly(1, off_m=150.0)
+    assert flown.navigation.is_in_doubt
+    assert not flown.navigation.has_gps
+    assert flown.east_m == pytest.approx(0.0, abs=1.0), "a jump of a moment moves nothing"
+    flown.fly(2, off_m=150.0)
+    assert flown.navigation.has_gps
+    assert not flown.navigation.is_in_doubt
+    assert flown.east_m == pytest.approx(150.0, abs=1.0)
+
+
+def test_receiver_that_contradicts_does_not_overrule_recent_matches():
+    flown = Received().fly(20)
+    for _ in range(5):
+        flown.fly(1, off_m=150.0)
+        fix = flown.navigation.compared(match_at(Position(*HOME), flown.t_s, 1.0))
+        flown.navigation.hear_fix(fix)
+    assert not flown.navigation.has_gps
+    assert not flown.navigation.is_in_doubt
+    assert flown.east_m == pytest.approx(0.0, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("zoom", "gap_s", "least_m", "most_m"), [(0.0, 0.0, 0.0, 8.0), (0.04, 0.0, 20.0, 60.0), (0.0, 8.0, 15.0, 60.0)]
+)
+def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
+    """A hundred metres without a match: over ground that seems flat, that falls away, and after a gap."""
+    flown = Received().fly(10)
+    flown.fly(gap_s, has_gps=False)
+    for number in range(10):
+        flown.fly(1, has_gps=False)
+        stride = Stride(from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom)
+        flown.navigation._strides_since_fix.add(
+            np.array([10.0, 0.0]), zoom, HeardFrame(t_s=flown.t_s, sd_m=0.2, stride=stride)
+        )
+        assert number or flown.navigation.at(flown.t_s)
+    assert least_m <= flown.navigation._strides_since_fix.error_m <= most_m

@@ -1,0 +1,104 @@
+"""The loop of an autopilot that flies by edgevpr's positions while edgevpr takes its attitude: `python
+benchmarks/loop.py` flies simulated autopilots, whose filter tilts with the errors that it is fed, and writes
+benchmarks/results/loop.md.
+
+Each flight lasts two minutes in closed loop, with one thing changed; three last half an hour by our stream alone.
+"""
+
+import itertools
+import sys
+from pathlib import Path
+
+sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1] / "tests")]
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "runtime"))
+
+import base
+import closed_loop
+from closed_loop import ClosedLoop
+
+SETTLED_S, FLOWN_S, LONG_S = 40.0, 120.0, 1800.0
+ODOMETRY = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}
+SET_UPS = {
+    "GPS_INPUT": ("arducopter", {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}),
+    "ODOMETRY (ArduPilot)": ("arducopter", ODOMETRY),
+    "message 296": ("px4-copter", {"EKF2_AGP0_CTRL": 1}),
+    "ODOMETRY (PX4)": ("px4-copter", {"EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 1}),
+}
+CHANGES = {
+    "nothing": {},
+    **{f"answers {late_s:g} s late": {"late_s": late_s} for late_s in (0.1, 0.25, 0.5, 1.0, 2.0)},
+    **{f"times {time_s:+g} s wrong": {"time_error_s": time_s} for time_s in (-0.3, -0.1, 0.1, 0.3)},
+    **{f"strides {scale:g} times as long": {"stride_scale": scale} for scale in (0.7, 0.9, 1.1, 1.4)},
+    **{f"camera tilted by {tilt_deg:g} degrees": {"mount_tilt_deg": tilt_deg} for tilt_deg in (-5.0, -2.0, 2.0, 5.0)},
+}
+SET_2 = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
+
+
+def without_gps(name: str, changes: dict[str, float]) -> dict[str, float]:
+    """Fly by our stream alone, GPS lost, a match each second; return the largest distances, metres."""
+    vehicle, parameters = SET_UPS[name]
+    flight = ClosedLoop(vehicle, **parameters).fly(SETTLED_S)
+    for field, value in changes.items():
+        setattr(flight, field, value)
+    if parameters == ODOMETRY:
+        flight.command(SET_2, 2)
+    return worst(flight.set("SIM_GPS1_ENABLE", 0), FLOWN_S)
+
+
+def beside_gps(every: int | None) -> dict[str, float]:
+    """Fly half an hour by our ODOMETRY alone while GPS is good, with each `every`-th frame matched (None: none)."""
+    flight = ClosedLoop("arducopter", matches=every is not None, **ODOMETRY).fly(SETTLED_S)
+    flight.match_every = every or 1
+    flight.command(SET_2, 2)
+    return worst(flight, LONG_S)
+
+
+def worst(flight: ClosedLoop, seconds: float) -> dict[str, float]:
+    """Fly on, and return the largest distances in each half of it: of the aircraft from its target, and of the
+    autopilot's estimate from the truth."""
+    begin_s = flight.now_s
+    flight.fly(seconds)
+    half = round((begin_s + seconds / 2) / closed_loop.STEP_S)
+    first = round(begin_s / closed_loop.STEP_S)
+    return {
+        "away_m": round(max(flight.away_m[first:half]), 1),
+        "away_later_m": round(max(flight.away_m[half:]), 1),
+        "error_m": round(max(flight.error_m[first:]), 1),
+    }
+
+
+def page(rows: list[dict]) -> str:
+    """Return the page of the results."""
+    columns = {
+        "positions by": "{set_up}",
+        "changed": "{changed}",
+        "away, first half": "{away_m:.1f}",
+        "away, second half": "{away_later_m:.1f}",
+        "estimate": "{error_m:.1f}",
+    }
+    return f"""# The loop of an autopilot that flies by edgevpr
+
+An autopilot that flies by our positions tilts with their errors, and we take its attitude. Simulated autopilots in
+closed loop, a hover 60 m above ground, two minutes each: largest distance of the aircraft from its target in the first
+and in the second half of the flight, and of the autopilot's estimate from the truth, metres. A stable loop does not
+grow.
+
+{base.table(rows, columns, left=2)}
+"""
+
+
+def main() -> None:
+    rows = []
+    for name, (changed, changes) in itertools.product(SET_UPS, CHANGES.items()):
+        rows.append({"set_up": name, "changed": f"no GPS, {changed}", **without_gps(name, changes)})
+        print(rows[-1], flush=True)
+    for every, words in ((1, "a match each second"), (10, "a match each ten seconds"), (None, "no match")):
+        row = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {words}", **beside_gps(every)}
+        rows.append(row)
+        print(row, flush=True)
+    result = {**base.made_by(), "rows": rows}
+    base.write("loop", result, f"{page(rows)}\n{base.made_line(result, 'python benchmarks/loop.py')}")
+
+
+if __name__ == "__main__":
+    base.run(main)
