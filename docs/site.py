@@ -19,6 +19,8 @@ from mkdocs.structure.pages import Page
 
 from edgevpr.cli.main import EXIT_CODES, command_line
 from edgevpr.core.config import Config, Key, keys_of
+from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.choice import TABLES
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = "benchmarks/results"
@@ -30,6 +32,21 @@ PAGES = {
     "models/README.md": "reference/networks.md",
 }
 KINDS = {str: "text", float: "number", int: "whole number", bool: "true or false"}
+CHANNELS = {
+    Channel.COMMAND: "single fixes (command 43003)",
+    Channel.GPS_INPUT: "GPS_INPUT, as a GPS receiver",
+    Channel.ODOMETRY: "ODOMETRY",
+    Channel.SENSOR: "message 296",
+    Channel.VISION: "ODOMETRY",
+}
+PARAMETERS_INTRODUCTION = """\
+These parameters change what the positions of edgevpr do. Made from the table in `edgevpr/mavlink` by which `run` and
+`doctor` go. `doctor` names each that is not right, with the exact change.
+
+In flight all are read at the start, and again in turn: a change is noticed at once where the autopilot broadcasts it,
+else within two minutes. Until they are answered, and while one is dangerous, nothing is sent, and the ground station
+shows why. What only makes edgevpr useless or weak is reported once. A parameter that your firmware does not have needs
+nothing. "We" and "us" are edgevpr."""
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -39,6 +56,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     files.append(File.generated(config, "results/index.md", content=contents_of_results()))
     files.append(File.generated(config, "reference/configuration.md", content=configuration()))
+    files.append(File.generated(config, "reference/parameters.md", content=parameters()))
     files.append(File.generated(config, "reference/command-line.md", content=commands()))
     files.append(File.generated(config, "reference/json-output.md", content=json_output()))
     return files
@@ -113,6 +131,20 @@ def details(key: Key, default: str) -> str:
     if key.flags:
         facts.append(f"flag {', '.join(f'`{name}`' for name in key.flags)}")
     return f"*{'; '.join(facts)}*"
+
+
+def parameters() -> str:
+    """Return the page of the autopilot's parameters, made from the table that `run` and `doctor` go by."""
+    lines = ["# Parameters of the autopilot", "", PARAMETERS_INTRODUCTION]
+    for table in TABLES.values():
+        lines += ["", f"## {table.name}"]
+        for channel in dict.fromkeys(channel for rule in table.rules for channel in rule.channels):
+            lines += ["", f"### {table.name} by {CHANNELS[channel]}", ""]
+            lines += ["| parameter | right | otherwise | why |", "|---|---|---|---|"]
+            for rule in (rule for rule in table.rules if channel in rule.channels):
+                otherwise = "**nothing is sent**" if rule.is_dangerous else "reported"
+                lines.append(f"| `{rule.label}` | {rule.right} | {otherwise} | {rule.why} |")
+    return "\n".join(lines) + "\n"
 
 
 def commands() -> str:

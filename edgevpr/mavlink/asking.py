@@ -13,6 +13,7 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Kind, kind_of
 from edgevpr.mavlink.messages import AUTOPILOT, Health
+from edgevpr.mavlink.parameters import name_alternative
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
@@ -198,7 +199,7 @@ class AutopilotReading:
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
     """Read all that an autopilot tells about itself; return None if no heartbeat comes. `wanted` maps a firmware (as in
-    `AutopilotReading`) to the names of the parameters to be read.
+    `AutopilotReading`) to the names of the parameters to be read; those that it has under another name are found too.
 
     It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
     """
@@ -219,8 +220,12 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
         mavlink.MAVLINK_MSG_ID_ATTITUDE,
     )
+    names = tuple(wanted.get(firmware, ())) if answers else ()
     # Without an answer each question would take three seconds. Of the last two it only counts that they are heard.
     filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
+    parameters = asking.parameters(names, is_px4)
+    others = (name_alternative(name) for name in names if name not in parameters)
+    parameters |= asking.parameters(filter(None, others), is_px4)
     packed = said.flight_sw_version if said else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
     return AutopilotReading(
@@ -230,7 +235,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         version=version if said else None,
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
-        parameters=asking.parameters(wanted.get(firmware, ()) if answers else (), is_px4),
+        parameters=parameters,
         heard=tuple(sorted(asking.heard)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
         filter_flags=filter_state and filter_state.flags,

@@ -198,8 +198,7 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Queue a text for the ground station about each change since the last call: the autopilot falls silent or is
-        heard again; fixes are answered in another way, or not in time (see `Fixes.news`); heights (see `Heights`)."""
+        """Queue texts for the ground station about what has changed with the autopilot since the last call."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)
         if is_there and self._is_there is False:
@@ -209,8 +208,9 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_there or self._is_there is not None:
             self._is_there = is_there
-        fixes_news = self.fixes.news(self.autopilot.readiness.why_silent(), now_s)
-        for news in (*fixes_news, *self.autopilot.heights.news()):
+        readiness, interview = self.autopilot.readiness, self.autopilot.interview
+        fixes_news = self.fixes.news(readiness.why_silent(), now_s)
+        for news in (*interview.take_news(), *fixes_news, *self.autopilot.heights.news()):
             self.announce(*news)
 
     def break_off(self, lost_fixes: int) -> None:
@@ -237,7 +237,8 @@ class Conversation:
             self._ask_for_position(system_id, now_s)
             if self.channel.is_continuous and (state := self._state(system_id, now_s)):
                 return state, None
-            if why := PAUSED if self.requests.is_paused else self.fixes.why_not(now_s):
+            pause = PAUSED if self.requests.is_paused else self.autopilot.interview.choice.why_nothing
+            if why := pause or self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s)
@@ -287,8 +288,7 @@ class Conversation:
         return None
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
-        """Queue the questions that choose the channel, and request reports that have stopped, as after a restart, or
-        have become half as frequent."""
+        """Queue the questions that are due, and request reports that have stopped or have become half as frequent."""
         if self._ask_position_s is None:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))

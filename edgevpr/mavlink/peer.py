@@ -9,9 +9,10 @@ from typing import NamedTuple
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
-from edgevpr.mavlink.channel import Channel, Interview
+from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock
 from edgevpr.mavlink.heights import Altitudes, Heights
+from edgevpr.mavlink.interview import Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Use
 from edgevpr.mavlink.receivers import GPS_REPORTS, Receivers

@@ -1,6 +1,7 @@
 """An autopilot that is worked by hand, in a conversation without a port."""
 
 import math
+import struct
 
 from fakes import FakeClock
 
@@ -125,6 +126,34 @@ class Autopilot:
         self._listen()
         packets, self.packets = self.packets, []
         return list(PacketReader().feed(b"".join(packets)))
+
+    def reply(self, parameters, is_lost=lambda message: False, errors=False):
+        """Answer the questions among them, and return all. About a parameter that it does not have it is silent, or
+        says so (`errors`); a question or answer that `is_lost` does not arrive."""
+        told = self.told()
+        for message in told:
+            if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
+                nothing = [bytes(8)] * 3
+                version = mavlink.MAVLink_autopilot_version_message(0, 1 << 24 | 17 << 16, 0, 0, 0, *nothing, 0, 0, 0)
+                self.say(version)
+            if message.get_type() != "PARAM_REQUEST_READ" or is_lost(message):
+                continue
+            if message.param_id in parameters:
+                answer = self.parameter(message.param_id, parameters[message.param_id])
+            elif errors:
+                answer = mavlink.MAVLink_param_error_message(255, 0, message.param_id.encode(), -1, 1)
+            else:
+                continue
+            if not is_lost(answer):
+                self.say(answer)
+        return told
+
+    def parameter(self, name, value):
+        """Its message for a parameter: PX4 sends the bytes of a whole number."""
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+        if isinstance(value, int) and self.firmware == mavlink.MAV_AUTOPILOT_PX4:
+            value = struct.unpack("<f", struct.pack("<i", value))[0]
+        return mavlink.MAVLink_param_value_message(name.encode(), value, kind, 1000, 65535)
 
     def questions(self):
         """The commands among them."""

@@ -6,6 +6,7 @@ import pytest
 from conversing import Autopilot
 
 from edgevpr.mavlink.channel import Channel, Choice
+from edgevpr.mavlink.choice import Decision
 from edgevpr.mavlink.clock import AutopilotClock
 from edgevpr.mavlink.messages import MotionState, Severity, status_text
 from edgevpr.mavlink.peer import Listener
@@ -28,7 +29,7 @@ class Still(Listener):
 def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
     autopilot = Autopilot(firmware, booted_s=600.0, listener=Still())
-    autopilot.conversation.autopilot.interview.choice = Choice(channel, "for a test", 1, lag_s)
+    autopilot.conversation.autopilot.interview._decision = Decision(Choice(channel, "for a test", 1, lag_s))
     autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
     return autopilot
 
@@ -78,7 +79,7 @@ def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_f
     autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Still())
     sent_after_s = []
     for step in range(80):
-        autopilot.conversation.autopilot.interview.choice = Choice(channel, "for a test", 1)
+        autopilot.conversation.autopilot.interview._decision = Decision(Choice(channel, "for a test", 1))
         autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
         autopilot.wait(0.1)
         autopilot.put_fix()

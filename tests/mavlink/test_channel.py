@@ -1,7 +1,6 @@
 """The channel by which an autopilot is told positions: asked for, chosen, and used."""
 
 import math
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +9,13 @@ from conversing import Autopilot
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
+from edgevpr.lab.simulate.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
+from edgevpr.lab.simulate.firmware import PX4 as PX4_PARAMETERS
 from edgevpr.mavlink.channel import Channel, Kind, ardupilot_choice, px4_choice
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.wire import mavlink
 
-INT8 = mavlink.MAV_PARAM_TYPE_INT8
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 STATE = MotionState(
     t_mono_s=0.0,
@@ -80,22 +80,15 @@ class Ear(Listener):
         return self.between and replace(self.between, t_frame_s=now_s)
 
 
-def interviewed(firmware=ARDUPILOT, parameters=None, seconds=10, **settings):
-    """An autopilot that is asked where it is, and answers but for parameters that it does not have; the listener."""
+def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
+    """An autopilot with `parameters` beside those of its firmware, once it has answered; and the listener."""
     ear = Ear()
-    autopilot = Autopilot(firmware, listener=ear, **settings)
+    autopilot = Autopilot(firmware, listener=ear, origin=origin)
     autopilot.conversation.want_position()
-    for _ in range(seconds):
-        autopilot.wait(1.0)
+    for _ in range(seconds * 4):
+        autopilot.wait(0.25)
         autopilot.beat()
-        for message in autopilot.told():
-            if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-                version = 1 << 24 | 17 << 16
-                nothing = [bytes(8)] * 3
-                autopilot.say(mavlink.MAVLink_autopilot_version_message(0, version, 0, 0, 0, *nothing, 0, 0, 0))
-            if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in (parameters or {}):
-                value, kind = parameters[message.param_id]
-                autopilot.say(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
+        autopilot.reply((PX4_PARAMETERS if firmware == PX4 else ARDUPILOT_PARAMETERS) | parameters)
     return autopilot, ear
 
 
@@ -109,9 +102,8 @@ def sent(autopilot, name, seconds=1.0):
 
 
 def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second():
-    parameters = {"GPS1_TYPE": (1.0, INT8), "GPS2_TYPE": (14.0, INT8), "VISO_TYPE": (0.0, INT8)}
-    autopilot, ear = interviewed(ARDUPILOT, parameters)
-    assert ear.channels == [Channel.GPS_INPUT]
+    autopilot, ear = interviewed(GPS2_TYPE=14)
+    assert ear.channels == [Channel.NONE, Channel.GPS_INPUT]
     positions = sent(autopilot, "GPS_INPUT", 2.0)
     assert len(positions) == pytest.approx(20, abs=1)
     assert {(each.gps_id, each.lat, each.time_week, each.fix_type) for each in positions} == {(1, 470_000_000, 0, 3)}
@@ -127,8 +119,8 @@ def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second():
 
 
 def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
-    autopilot, ear = interviewed(parameters={"VISO_TYPE": (1.0, INT8)}, seconds=6, origin=Position(46.5, 7.5, 400.0))
-    assert ear.channels == [Channel.ODOMETRY]
+    autopilot, ear = interviewed(VISO_TYPE=1, EK3_SRC2_POSXY=6, origin=Position(46.5, 7.5, 400.0))
+    assert ear.channels == [Channel.NONE, Channel.ODOMETRY]
     assert sent(autopilot, "ODOMETRY", 2.0) == []
     for _ in range(2):
         autopilot.beat()
@@ -141,7 +133,7 @@ def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
 
 
 def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
-    autopilot, ear = interviewed(parameters={"VISO_TYPE": (1.0, INT8)}, seconds=6, origin=Position(46.5, 7.5))
+    autopilot, ear = interviewed(VISO_TYPE=1, seconds=6, origin=Position(46.5, 7.5))
     asked = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
     for _ in range(4):
         autopilot.beat()
@@ -171,7 +163,6 @@ def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
 
 def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
     autopilot, ear = interviewed()
-    assert autopilot.conversation.channel is Channel.COMMAND, "it answers nothing"
     autopilot.say(mavlink.MAVLink_scaled_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
     assert ear.forces == []
     autopilot.attitude(roll_deg=28.65)
@@ -181,19 +172,8 @@ def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
     assert roll_deg == pytest.approx(28.65, abs=0.01)
 
 
-def test_a_px4_says_whole_numbers_as_the_bytes_of_a_float():
-    one = struct.unpack("<f", struct.pack("<i", 1))[0]
-    autopilot, _ = interviewed(PX4, {"EKF2_AGP0_CTRL": (one, mavlink.MAV_PARAM_TYPE_INT32)})
-    assert autopilot.conversation.channel is Channel.SENSOR
-
-
-def px4_that_fuses(name="EKF2_AGP0_CTRL", **settings):
-    one = struct.unpack("<f", struct.pack("<i", 1))[0]
-    return interviewed(PX4, {name: (one, mavlink.MAV_PARAM_TYPE_INT32)}, **settings)
-
-
 def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_known():
-    autopilot, ear = px4_that_fuses()
+    autopilot, ear = interviewed(PX4)
     said = sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0)
     assert len(said) == pytest.approx(30, abs=1)
     assert said[0].lat == round(STATE.lat_deg * 1e7)
@@ -202,7 +182,7 @@ def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_k
 
 
 def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position_beside_it():
-    autopilot, _ = px4_that_fuses(name="EKF2_EV_CTRL", origin=Position(46.5, 7.5, 400.0))
+    autopilot, _ = interviewed(PX4, EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1, origin=Position(46.5, 7.5, 400.0))
     assert sent(autopilot, "ODOMETRY", 3.0) == []
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
     wanted = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
@@ -230,7 +210,7 @@ ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS,
 
 
 def test_what_a_px4_uses_of_ours_is_counted_by_its_reports():
-    autopilot, _ = px4_that_fuses()
+    autopilot, _ = interviewed(PX4)
     assert autopilot.conversation.autopilot.px4.used_share is None
     for flags in (GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL):
         sent(autopilot, "GLOBAL_POSITION_SENSOR", 0.5)
@@ -240,7 +220,7 @@ def test_what_a_px4_uses_of_ours_is_counted_by_its_reports():
 
 def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
     """With EKF2_GPS_CTRL=0 the receiver goes on, near where the aircraft is."""
-    autopilot, ear = px4_that_fuses()
+    autopilot, ear = interviewed(PX4)
     ear.state = None
 
     def has_gps_after(seconds, flags):
@@ -263,7 +243,7 @@ def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
 
 def test_a_px4_is_left_to_a_receiver_whose_velocity_it_takes():
     """It does not reset to GPS while positions of ours are active, so they have to stop first."""
-    autopilot, _ = px4_that_fuses()
+    autopilot, _ = interviewed(PX4, EKF2_AGP0_CTRL=1)
 
     def has_gps_after(seconds, flags, vel_ratio, sends):
         for _ in range(round(seconds * 5)):
@@ -295,7 +275,7 @@ def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():
 
 
 def test_an_autopilot_whose_velocity_follows_a_fix_gets_none_between_matches():
-    autopilot, ear = interviewed(PX4)
+    autopilot, ear = interviewed(PX4, EKF2_AGP0_CTRL=0)
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
     assert sent(autopilot, "COMMAND_INT", 4.0) == []

@@ -45,6 +45,8 @@ def text(words: str):
 
 def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, clock):
     flight, autopilot, _, station = two
+    flight.send_fix(Fix(50.0, 14.0, 25.0, clock()))
+    autopilot.expect("COMMAND_INT")
     flight.want_position()
     flight.send(text("wake up"))
     autopilot.expect("COMMAND_LONG")
@@ -52,12 +54,11 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     figures = named_values(1.0, vpr_place=5, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0)
     flight.send(*figures, computer_status(1.0, [0.5], 2**20, 2**30, None))
     flight.send(position_fix(Fix(1.0, 2.0, 3.0, clock()), clock(), 7))  # not even where it is queued as a message
-    flight.send_fix(Fix(50.0, 14.0, 25.0, clock()))
     flight.send(text("end"))
     mirrored = ["NAMED_VALUE_INT", *["NAMED_VALUE_FLOAT"] * 3, "ONBOARD_COMPUTER_STATUS"]
     assert [message.get_type() for message in station.expect_text("end")] == mirrored
     names = [message.get_type() for message in autopilot.expect_text("end")]
-    assert names.count("COMMAND_INT") == 2
+    assert names.count("COMMAND_INT") == 1
 
 
 def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):

@@ -5,6 +5,7 @@ from conversing import Autopilot
 from test_autopilot_clock import Still
 
 from edgevpr.core.types import Position
+from edgevpr.lab.simulate.firmware import ARDUPILOT
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.wire import mavlink
 
@@ -65,9 +66,9 @@ class Aircraft(Autopilot):
         return texts
 
     def obey(self, message):
-        if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
-            value, kind = self.parameters[message.param_id], mavlink.MAV_PARAM_TYPE_INT8
-            self.say(mavlink.MAVLink_param_value_message(message.param_id.encode(), value, kind, 1, 0))
+        known = ARDUPILOT | self.parameters
+        if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in known:
+            self.say(self.parameter(message.param_id, known[message.param_id]))
         elif message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self.rates.add(int(message.param1))
         elif message.get_type() == "COMMAND_LONG" and message.param1 == VERSION:
@@ -124,7 +125,7 @@ def test_what_stays_the_same_is_said_and_asked_for_again():
         assert IMU in aircraft.rates
         often = "" if restarts == 1 else " 2 times"
         assert texts == [f"edgevpr: autopilot has restarted{often}"]
-        assert aircraft.ear.channels[-2:] == [Channel.COMMAND, Channel.ODOMETRY]
+        assert aircraft.ear.channels[-2:] == [Channel.NONE, Channel.ODOMETRY]
     assert aircraft.conversation.autopilot.identity.foreign_messages == 0
 
 
@@ -137,8 +138,8 @@ def test_an_outage_without_a_restart_resets_nothing(outage_s):
     aircraft.received = []
     texts = aircraft.live(20)
     assert aircraft.conversation.autopilot.clock is before
-    assert (aircraft.ear.autopilots, aircraft.ear.channels) == (1, [Channel.ODOMETRY])
-    assert not {"PARAM_REQUEST_READ", "SET_GPS_GLOBAL_ORIGIN"} & set(aircraft.names())
+    assert (aircraft.ear.autopilots, aircraft.ear.channels) == (1, [Channel.NONE, Channel.ODOMETRY])
+    assert "SET_GPS_GLOBAL_ORIGIN" not in aircraft.names()
     assert aircraft.names().count("ODOMETRY") > 150, "at once"
     assert not any("restarted" in text for text in texts)
 

@@ -31,10 +31,11 @@ _PICTURE = np.zeros((8, 8), np.uint8)
 
 class ClosedLoop:
     """A flight of a `vehicle` of the flight controller with its `parameters`, that hovers or cruises by a velocity.
+
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
     the truth. `stride_scale` is by what strides are too long, `time_error_s` by how much frames carry too late a time,
-    and `mount_tilt_deg` by how much the camera looks east of straight down. `away_m` and `error_m` are, step by step, the
-    true distance from the target, and that of the autopilot's estimate from the truth; `sent` is all that edgevpr
+    and `mount_tilt_deg` by how much the camera looks east of straight down. `away_m` and `error_m` are, step by step,
+    the true distance from the target, and that of the autopilot's estimate from the truth; `sent` is all that edgevpr
     sends, with the times."""
 
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, **parameters):

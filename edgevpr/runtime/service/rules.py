@@ -6,35 +6,35 @@ were flown in simulation with GPS taken away, with PX4 1.17.0 and 1.18-beta1.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_RULES
 from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import (
-    ARDUPILOT_PARAMETERS,
     CONTROL,
     FUSES_POSITION,
     MAVLINK_GPS,
-    PX4_PARAMETERS,
+    RECEIVERS,
     SECOND,
     VISION_CONTROL,
     Channel,
     Choice,
     Kind,
     ardupilot_choice,
+    own_name,
     px4_choice,
-    receiver_name,
 )
-from edgevpr.mavlink.messages import SENSOR_ID
+from edgevpr.mavlink.choice import TABLES
+from edgevpr.mavlink.parameters import ParameterRule, find_faults
+from edgevpr.mavlink.px4_parameters import PX4_RULES
+from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.finding import Finding, fine, judged, wrong
 
 Parameters = Mapping[str, float | int]
 
-_USE_BEST, _PRIMARY_WHILE_FIXED = 1, 4  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
-_FROM_GPS, _FROM_FLOW, _FROM_VISION = 3, 5, 6  # values of EK3_SRCn_...
-_SWITCH = f"GPS_AUTO_SWITCH={_USE_BEST}"
+_SWITCHES = (1, 4)  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
+_FROM_FLOW, _FROM_VISION = 5, 6  # values of EK3_SRCn_...
 _SOURCE_SETS = (1, 2, 3)
-_VISION_SET = tuple(f"EK3_SRC2_{what}={value}" for what, value in (("POSXY", 6), ("VELXY", 0), ("POSZ", 1), ("YAW", 1)))
-_MOST_DELAY_MS = 50  # edgevpr sends its position for the moment of sending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,15 +52,11 @@ class FirmwareRules:
 
 
 def _ardupilot_findings(reading: AutopilotReading, sends_fixes: bool) -> Iterator[Finding]:
-    parameters, choice = reading.parameters, ardupilot_choice(reading.kind, reading.parameters)
-    wanted = (("EK3_ENABLE", 1), ("AHRS_EKF_TYPE", 3))
-    changes = [f"{name}={value}" for name, value in wanted if parameters.get(name, value) != value]
-    good, bad = "the filter that takes fixes is in use", "Only the third EKF takes fixes: use it, and reboot."
-    yield judged("EKF3", not changes, good, bad, *changes)
+    choice = ardupilot_choice(reading.kind, reading.parameters)
     if choice.channel.is_continuous and not sends_fixes:
         yield _dry(choice, reading)
     elif choice.channel is Channel.GPS_INPUT:
-        yield _by_gps(choice, parameters)
+        yield fine("channel", _sentence(choice.reason))
     elif choice.channel is Channel.ODOMETRY:
         yield _by_odometry(choice, reading)
     else:
@@ -69,7 +65,18 @@ def _ardupilot_findings(reading: AutopilotReading, sends_fixes: bool) -> Iterato
             needs = f"The first flight with fixes on needs {' and '.join(channel.changes)}: {channel.message}"
             channel = fine("channel", f"A dry run (`send_fixes: false`) needs no change. {needs}")
         yield channel
+    yield from _parameters(ARDUPILOT_RULES, choice, reading)
     yield _port(reading, "SERIALn_PROTOCOL=2")
+
+
+def _parameters(rules: tuple[ParameterRule, ...], choice: Choice, reading: AutopilotReading) -> Iterator[Finding]:
+    """Check the parameters that change what our messages do: one finding for each row of the table that is broken."""
+    faults = find_faults(rules, choice, reading.parameters)
+    for fault in faults:
+        stops = " Until then edgevpr sends nothing." if fault.rule.is_dangerous else ""
+        yield wrong(fault.rule.label, f"{fault.rule.why}{stops}", *fault.changes)
+    if not faults:
+        yield fine("parameters", "those that change what positions of edgevpr do are right")
 
 
 def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
@@ -86,7 +93,7 @@ def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
     end = "falls back to QHOVER or QLAND" if hovers else "stops" if kind is Kind.ROVER else "lands"
     while_it = " while it hovers (Q_ENABLE=1)" if hovers else ""
     unused = " FLOW_TYPE is set, but no EK3_SRCn_VELXY is 5, so the flow is not used." if flow else ""
-    second = receiver_name(parameters, SECOND)
+    second = own_name(parameters, RECEIVERS[SECOND])
     if taken := parameters.get(second, 0):
         unused += f" It takes the place of the second receiver (type {taken:g})."
     return wrong(
@@ -94,37 +101,16 @@ def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
         f"This {reading.vehicle} has nothing that carries it from one fix to the next{while_it}: without GPS it {end} "
         f"by its EKF failsafe after some 9 s.{unused} Let it take edgevpr for a second GPS receiver, and reboot.",
         f"{second}={MAVLINK_GPS}",
-        *(() if _switches(parameters.get("GPS_AUTO_SWITCH")) else (_SWITCH,)),
+        *(() if parameters.get("GPS_AUTO_SWITCH") in _SWITCHES else ("GPS_AUTO_SWITCH=1",)),
     )
 
 
-def _by_gps(choice: Choice, parameters: Parameters) -> Finding:
-    changes = []
-    if choice.receiver == SECOND and not _switches(parameters.get("GPS_AUTO_SWITCH", _USE_BEST)):
-        changes.append(_SWITCH)
-    if not _sets_with(parameters, "POSXY", _FROM_GPS):
-        changes.append(f"EK3_SRC1_POSXY={_FROM_GPS}")
-    unused = f"{choice.reason}, but it would not be used."
-    return judged("channel", not changes, _sentence(choice.reason), unused, *changes)
-
-
 def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
-    sets = _sets_with(reading.parameters, "POSXY", _FROM_VISION)
-    if not sets:
-        no_set = f"{choice.reason}, but no source set of the filter takes its position: prepare the second one."
-        return wrong("channel", no_set, *_VISION_SET)
-    # VISO_VEL_M_NSE: the filter assumes that the velocity is good to 0.1 m/s, whatever accuracy edgevpr sends.
-    if fused := [n for n in sets if n in _sets_with(reading.parameters, "VELXY", _FROM_VISION)]:
-        return wrong(
-            "channel",
-            f"{choice.reason}, but its velocity, which comes from the same matches as the position, must not be fused: "
-            "the filter would trust it more than its gyros.",
-            *(f"EK3_SRC{n}_VELXY=0" for n in fused),
-        )
     if reading.origin is None:
         no_origin = f"{choice.reason}, but the filter has no origin: it cannot be placed on the Earth."
         return wrong("channel", no_origin, "wait for a GPS fix, or set the EKF origin from the ground station")
-    switch = "" if 1 in sets else f"; when GPS is lost, the operator switches to source set {sets[0]}"
+    sets = _sets_with(reading.parameters, "POSXY", _FROM_VISION)
+    switch = "" if not sets or 1 in sets else f"; when GPS is lost, the operator switches to source set {sets[0]}"
     return fine("channel", _sentence(f"{choice.reason}{switch}"))
 
 
@@ -133,7 +119,7 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
     without positions on every channel that is set up."""
     change = "VISO_TYPE=0"
     if choice.channel is Channel.GPS_INPUT:
-        change = f"{receiver_name(reading.parameters, choice.receiver)}={0 if choice.receiver == SECOND else 1}"
+        change = f"{own_name(reading.parameters, RECEIVERS[choice.receiver])}={0 if choice.receiver == SECOND else 1}"
     return wrong(
         "channel",
         f"{choice.reason}. A dry run (`send_fixes: false`) sends no position that way, so this {reading.vehicle} would "
@@ -143,28 +129,20 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
 
 
 def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Finding]:
-    yield _px4_channel(px4_choice(reading.kind, reading.parameters), reading)
+    choice = px4_choice(reading.kind, reading.parameters)
+    if choice.channel is not Channel.COMMAND:
+        yield fine("channel", _sentence(choice.reason))
+    elif CONTROL in reading.parameters:
+        choice = replace(choice, channel=Channel.SENSOR)  # for the other parameters that it will need
+        yield wrong(
+            "channel",
+            "PX4 can take positions as measurements (message 296), but is not set for it: change this, and reboot.",
+            f"{CONTROL}={FUSES_POSITION}",
+        )
+    else:
+        yield _px4_single_fixes(choice, reading)
+    yield from _parameters(PX4_RULES, choice, reading)
     yield _port(reading, "MAV_PROTO_VER=2")
-
-
-def _px4_channel(choice: Choice, reading: AutopilotReading) -> Finding:
-    parameters = reading.parameters
-    is_vision = choice.channel is Channel.VISION
-    if CONTROL not in parameters and not is_vision:
-        return _px4_single_fixes(choice, reading)
-    by_296 = (
-        (choice.channel is not Channel.COMMAND, f"{CONTROL}={FUSES_POSITION}"),
-        (parameters.get("EKF2_AGP0_ID", SENSOR_ID) == SENSOR_ID, f"EKF2_AGP0_ID={SENSOR_ID}"),
-        (parameters.get("EKF2_AGP0_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_AGP0_DELAY=0"),
-    )
-    by_odometry = (
-        (parameters.get("EKF2_EV_NOISE_MD", 0) == 0, "EKF2_EV_NOISE_MD=0"),
-        (parameters.get("EKF2_EV_DELAY", 0) <= _MOST_DELAY_MS, "EKF2_EV_DELAY=0"),
-    )
-    changes = [change for is_so, change in (by_odometry if is_vision else by_296) if not is_so]
-    message = "ODOMETRY" if is_vision else "message 296"
-    unset = f"PX4 can take positions as measurements ({message}), but is not set for it as edgevpr sends them"
-    return judged("channel", not changes, _sentence(choice.reason), f"{unset}: change this, and reboot.", *changes)
 
 
 def _px4_single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
@@ -191,10 +169,6 @@ def _sentence(words: str) -> str:
     return f"{words[0].upper()}{words[1:]}."
 
 
-def _switches(how: float | None) -> bool:
-    return how in (_USE_BEST, _PRIMARY_WHILE_FIXED)
-
-
 def _sets_with(parameters: Parameters, what: str, source: int) -> list[int]:
     return [n for n in _SOURCE_SETS if parameters.get(f"EK3_SRC{n}_{what}") == source]
 
@@ -203,21 +177,16 @@ RULES = {
     "ardupilot": FirmwareRules(
         name="ArduPilot",
         knows_fixes=(4, 5),  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
-        parameters=(
-            *ARDUPILOT_PARAMETERS, "GPS_AUTO_SWITCH", "FLOW_TYPE", "Q_ENABLE", "AHRS_EKF_TYPE", "EK3_ENABLE",
-            *(f"EK3_SRC{n}_{what}" for n in _SOURCE_SETS for what in ("POSXY", "VELXY")),
-        ),
+        parameters=(*TABLES[mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA].names, "FLOW_TYPE", "Q_ENABLE"),
         findings=_ardupilot_findings,
         port_changes=lambda baud: ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={baud // 1000}"),
     ),
     "px4": FirmwareRules(
         name="PX4",
         knows_fixes=(1, 15),
-        parameters=(
-            *PX4_PARAMETERS, "EKF2_AGP0_ID", "EKF2_AGP0_DELAY", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD",
-        ),
+        parameters=TABLES[mavlink.MAV_AUTOPILOT_PX4].names,
         findings=_px4_findings,
         # TELEM 2, the usual port for a companion.
         port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),
     ),
-}  # fmt: skip
+}

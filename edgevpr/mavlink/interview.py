@@ -1,0 +1,225 @@
+"""The interview: what an autopilot is asked about itself for as long as the flight lasts, and the channel that follows
+from its answers. Used by the conversation in flight."""
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+
+from edgevpr.mavlink import messages
+from edgevpr.mavlink.channel import Channel, Choice, Kind, kind_of
+from edgevpr.mavlink.choice import TABLES, Decision, ParameterTable
+from edgevpr.mavlink.ground import News
+from edgevpr.mavlink.messages import Severity
+from edgevpr.mavlink.parameters import name_alternative
+from edgevpr.mavlink.wire import Message, mavlink, parameter_value
+
+ASKED_AT_ONCE_MAX = 10  # ArduPilot drops what comes on top of 20 (GCS_Param.cpp, param_requests)
+ROUND_S = 1.0
+NEXT_ROUND_S = 0.1  # after a round in which all was answered
+SILENT_ROUNDS = 4  # rounds without any answer, after which the pauses grow
+PAUSE_MAX_S = 30.0
+AGAIN_EVERY_S = 2.0  # one known parameter is asked for again, so that a change in flight is noticed
+ROUNDS_TO_ABSENT, ALL_LOST_PROBABILITY = 4, 1e-4
+REPORTED_AFTER_S = 10.0
+VERSION_ASKS_MAX = 4
+TOPIC = "parameters"
+
+_OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
+
+log = logging.getLogger(__name__)
+
+
+class Interview:
+    """Asks an autopilot for its version and for the parameters of its table, and chooses the channel.
+
+    What is not answered is asked again, a second later and, while nothing at all is answered, after growing pauses.
+    Known parameters are asked for again, one every two seconds, and values that arrive unasked are taken too; after a
+    change the channel is chosen anew. Old firmware is silent about a parameter that it does not have: it is taken to be
+    absent after four rounds in which others were answered, or more on a link that loses messages.
+
+    - `choice`: the channel. Until the first questions it is command 43003: that is for programs that send fixes by
+      themselves and want no reports. Then it is `Channel.NONE` until all that it depends on is known.
+    - `parameters`: the values that were read, by name.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[str, float] = {}
+        self.parameters: Mapping[str, float] = MappingProxyType(self._values)
+        self._decision = Decision(_OF_ANY)
+        self._reported: Decision | None = None
+        self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), Kind.OTHER
+        self._version: tuple[int, int] | None = None
+        self._version_asks = 0
+        self._absent: set[str] = set()
+        self._asks: Counter[str] = Counter()
+        self._unanswered: Counter[str] = Counter()  # rounds without an answer for this name, but with one for another
+        self._waiting: set[str] = set()  # asked for in the last round, and not answered
+        self._answers = 0
+        self._silent_rounds = self._again = 0
+        self._asked_s = self._due_s = -math.inf
+        self._is_begun = self._is_asking = False  # since the first questions; as long as an answer is missing
+        self._missing_since_s: float | None = None
+        self._has_reported_missing = False
+        self._news: list[News] = []
+
+    @property
+    def choice(self) -> Choice:
+        return self._decision.choice
+
+    def take_news(self) -> list[News]:
+        """Return the texts for the ground station since the last call."""
+        news, self._news = self._news, []
+        return news
+
+    def hear(self, message: Message) -> None:
+        """Process a message from the autopilot; most kinds are ignored."""
+        match message.get_type():
+            case "HEARTBEAT":
+                before = self._autopilot, self._kind
+                self._autopilot, self._kind = message.autopilot, kind_of(message.type)
+                if before != (self._autopilot, self._kind):
+                    self._decide()
+            case "AUTOPILOT_VERSION":
+                self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
+            case "PARAM_VALUE" if message.param_id in self._all_names():
+                value = parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
+                if value is not None:
+                    self._hear_value(message.param_id, value)
+            case "PARAM_ERROR" if message.error == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
+                if message.param_id in self._all_names() and message.param_id not in self._values:
+                    self._note_answer(message.param_id)
+                    self._absent.add(message.param_id)
+                    self._decide()
+
+    def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
+        """Yield the requests that are due at `now_s`."""
+        if not self._is_begun:
+            self._is_begun = True
+            self._decide()
+        self._report_missing(now_s)
+        if now_s < self._due_s:
+            return
+        if self._silent_rounds == 0 and self._waiting:
+            self._unanswered.update(self._waiting)
+            self._find_absent()
+        missing = self._find_missing()
+        names = missing[: ASKED_AT_ONCE_MAX - 1]
+        names += self._find_again(is_alone=not missing)
+        wants_version = self._version is None and self._version_asks < VERSION_ASKS_MAX
+        self._is_asking = bool(missing) or wants_version
+        self._waiting, self._asked_s = set(names), now_s
+        self._asks.update(names)
+        self._silent_rounds += 1
+        doublings = min(8, max(0, self._silent_rounds - SILENT_ROUNDS))
+        pause_s = min(PAUSE_MAX_S, ROUND_S * 2**doublings)
+        self._due_s = now_s + (pause_s if self._is_asking else AGAIN_EVERY_S)
+        if wants_version:
+            self._version_asks += 1
+            yield messages.message_request(target_system, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        for name in names:
+            yield messages.parameter_request(target_system, name)
+
+    def _hear_value(self, name: str, value: float) -> None:
+        self._note_answer(name)
+        before = self._values.get(name)
+        self._values[name] = value
+        self._absent.discard(name)
+        if value != before:
+            self._decide()
+
+    def _note_answer(self, name: str) -> None:
+        """Note that the autopilot answered for one parameter: so it hears us, and may not have the others."""
+        self._version_asks *= bool(self._values)
+        self._silent_rounds = 0
+        self._answers += name in self._waiting
+        self._waiting.discard(name)
+        if self._is_asking:
+            self._due_s = min(self._due_s, self._asked_s + (ROUND_S if self._waiting else NEXT_ROUND_S))
+
+    def _find_absent(self) -> None:
+        """Take those for absent that were asked for in vain so often that a loss of all answers is next to impossible,
+        by the share of answers that arrive. Of others that may be absent too, one answer counts as lost."""
+        unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
+        lost = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
+        arrives = (self._answers + 1) / (self._answers + lost + 2)
+        rounds = max(ROUNDS_TO_ABSENT, math.log(ALL_LOST_PROBABILITY) / math.log(1 - arrives))
+        absent = {name for name in unknown - self._absent if self._unanswered[name] >= rounds}
+        if absent:
+            self._absent |= absent
+            self._decide()
+
+    def _table(self) -> ParameterTable | None:
+        return TABLES.get(self._autopilot)
+
+    def _all_names(self) -> frozenset[str]:
+        table = self._table()
+        return table.all_names if table else frozenset()
+
+    def _is_known(self, name: str) -> bool:
+        names = {name, name_alternative(name) or name}
+        return not names.isdisjoint(self._values) or names <= self._absent
+
+    def _find_missing(self) -> list[str]:
+        """Return the names to ask for: first those that decide the channel, then those that it needs, then the rest; of
+        these first those that were asked for least. An alternative name is asked for once the first had no answer."""
+        if not (table := self._table()):
+            return []
+        needed = table.name_needed(table.choose(self._kind, self._values))
+        rank = dict.fromkeys(needed, 1) | dict.fromkeys(table.deciding, 0)
+        missing: list[tuple[int, int, str]] = []
+        for name in table.names:
+            if not self._is_known(name):
+                other = name_alternative(name)
+                names = (name, other) if other and self._asks[name] else (name,)
+                missing += [(rank.get(name, 2), self._asks[each], each) for each in names if each not in self._absent]
+        return [name for *_, name in sorted(missing)]
+
+    def _find_again(self, is_alone: bool) -> list[str]:
+        """Return the name to be asked for again, if any: a known one or, if it `is_alone`, an absent one, since all its
+        answers may have been lost."""
+        names = list(self._values)
+        if is_alone:
+            names += [name for name in self._absent if name_alternative(name) not in self._values]
+        self._again += 1
+        return [sorted(names)[self._again % len(names)]] if names else []
+
+    def _decide(self) -> None:
+        """Choose the channel anew, and report it if anything about it has changed."""
+        if not self._is_begun:
+            return
+        table = self._table()
+        decision = table.decide(self._kind, self._values, self._is_known) if table else Decision(_OF_ANY)
+        self._decision = decision
+        if not decision.missing and decision != self._reported:
+            self._report(decision, table.name if table else "unknown firmware")
+            self._reported = decision
+
+    def _report(self, decision: Decision, firmware: str) -> None:
+        version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
+        who, choice = f"{firmware}{version} on a {self._kind.value}", decision.choice
+        faults = list(decision.faults)
+        if choice.channel is Channel.NONE:
+            log.warning("%s: %s", who, choice.reason)
+            self._news.append((Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC))
+        else:
+            log.info("%s: positions go to it by %s", who, choice.reason)
+            if faults:
+                self._news.append((Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC))
+            elif self._reported or self._has_reported_missing:
+                self._news.append((Severity.INFO, f"positions go by {choice.channel.name}", TOPIC))
+        for fault in faults:
+            log.warning("%s: %s", fault.advice, fault.rule.why)
+
+    def _report_missing(self, now_s: float) -> None:
+        missing = self._decision.missing
+        if not missing:
+            self._missing_since_s = None
+        elif self._missing_since_s is None:
+            self._missing_since_s, self._has_reported_missing = now_s, False
+        elif not self._has_reported_missing and now_s - self._missing_since_s >= REPORTED_AFTER_S:
+            self._has_reported_missing = True
+            log.warning("%s", self._decision.choice.reason)
+            more = f" and {len(missing) - 1} more" if missing[1:] else ""
+            self._news.append((Severity.WARNING, f"no answer for {missing[0]}{more}", TOPIC))

@@ -1,0 +1,195 @@
+"""What an autopilot is asked about its parameters in flight, and what follows from late, lost and changed answers."""
+
+import random
+from itertools import pairwise
+
+import pytest
+from conversing import Autopilot
+
+from edgevpr.lab.simulate.firmware import ARDUPILOT, PX4
+from edgevpr.mavlink.channel import OLD_NAMES, Channel
+from edgevpr.mavlink.messages import Fix, Severity
+from edgevpr.mavlink.wire import mavlink
+
+COPTER = ARDUPILOT | {"GPS2_TYPE": 14}
+STEP_S = 0.1
+
+
+class Asked(Autopilot):
+    """An autopilot that is asked where it is, and notes which parameters, when."""
+
+    def __init__(self, parameters, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, **link):
+        super().__init__(firmware)
+        self.parameters, self.link = dict(parameters), link
+        self.requests, self.sent, self.begin_s = [], [], self.clock.now_s
+        self.conversation.want_position()
+
+    def answer_for(self, seconds, channel=None):
+        """Answer for so long, or until the channel is this one; returns for how long it took."""
+        start_s = self.clock.now_s
+        while self.clock.now_s - start_s < seconds - STEP_S / 2:
+            self.wait(STEP_S)
+            self.beat()
+            for message in self.reply(self.parameters, **self.link):
+                if message.get_type() == "PARAM_REQUEST_READ":
+                    self.requests.append((self.clock.now_s, message.param_id))
+                self.sent.append(message)
+            if channel and self.conversation.channel is channel:
+                break
+        return self.clock.now_s - start_s
+
+    def set(self, **parameters):
+        """Set parameters, and broadcast them as autopilots do."""
+        self.parameters |= parameters
+        for name, value in parameters.items():
+            self.say(self.parameter(name, value))
+
+    def sentences(self):
+        sent, self.sent = self.sent, []
+        return [(each.severity, each.text) for each in sent if each.get_type() == "STATUSTEXT"]
+
+    @property
+    def interview(self):
+        return self.conversation.autopilot.interview
+
+
+def loses(share, seed=1):
+    dice = random.Random(seed)
+    return lambda message: dice.random() < share
+
+
+def test_questions_end_with_all_parameters_known():
+    autopilot = Asked(COPTER)
+    assert autopilot.answer_for(10, Channel.GPS_INPUT) < 5
+    autopilot.answer_for(10)
+    known = autopilot.interview.parameters
+    assert {known[name] for name in ("GPS2_TYPE", "VISO_SCALE", "EK3_SRC3_YAW")} == {14, 1.0, 0}
+    assert not set(OLD_NAMES.values()).intersection(known)
+    with pytest.raises(TypeError):
+        known["GPS2_TYPE"] = 0
+
+
+def test_questions_are_ten_at_most_at_once():
+    autopilot = Asked(COPTER, is_lost=lambda message: True)
+    autopilot.answer_for(60)
+    times = [t_s for t_s, _ in autopilot.requests]
+    assert max(times.count(t_s) for t_s in times) <= 10
+    assert {name for t_s, name in autopilot.requests if t_s == times[0]} > {"GPS1_TYPE", "GPS2_TYPE", "VISO_TYPE"}
+
+
+def test_questions_come_after_growing_pauses_for_as_long_as_nothing_is_answered():
+    autopilot = Asked(COPTER, is_lost=lambda message: True)
+    autopilot.answer_for(300)
+    times = sorted({t_s for t_s, _ in autopilot.requests})
+    pauses = [round(after - before) for before, after in pairwise(times)]
+    assert pauses[:8] == [1, 1, 1, 1, 2, 4, 8, 16]
+    assert set(pauses[8:]) == {30}
+
+
+def test_answers_after_eight_seconds_of_silence_choose_the_channel():
+    autopilot = Asked(COPTER)
+    autopilot.link["is_lost"] = lambda message: autopilot.clock.now_s - autopilot.begin_s < 8
+    autopilot.answer_for(8)
+    assert autopilot.conversation.channel is Channel.NONE
+    assert autopilot.answer_for(30, Channel.GPS_INPUT) < 10
+
+
+@pytest.mark.parametrize("firmware", ["old", "without vision"])
+def test_parameters_that_it_does_not_have_are_absent_after_some_rounds(firmware):
+    parameters = {name: value for name, value in COPTER.items() if not name.startswith("VISO")}
+    if firmware == "old":
+        parameters = {OLD_NAMES.get(name, name): value for name, value in parameters.items()}
+    autopilot = Asked(parameters)
+    autopilot.answer_for(2)
+    assert autopilot.conversation.channel is Channel.NONE, "VISO_TYPE may have been lost"
+    assert autopilot.answer_for(30, Channel.GPS_INPUT) < 15
+
+
+def test_a_parameter_that_does_not_exist_is_absent_at_once():
+    px4 = {name: value for name, value in PX4.items() if "AGP" not in name}
+    autopilot = Asked(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True)
+    assert autopilot.answer_for(10, Channel.COMMAND) < 2
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
+def test_a_parameter_whose_answers_are_lost_is_not_absent(share):
+    """What is asked for in vain is on a link that loses as much else no proof that it is not there."""
+    for seed in range(5):
+        autopilot = Asked(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=loses(share, seed))
+        autopilot.answer_for(40)
+        assert autopilot.conversation.channel is Channel.NONE
+        assert "GPS_PRIMARY=0" in autopilot.interview.choice.reason
+        assert not [message for message in autopilot.sent if message.get_type() == "GPS_INPUT"]
+
+
+def test_missing_answers_are_reported_once_and_withhold_fixes():
+    autopilot = Asked(COPTER, is_lost=lambda message: message.param_id not in ("GPS1_TYPE", "AHRS_EKF_TYPE"))
+    autopilot.answer_for(1)
+    autopilot.link["is_lost"] = lambda message: True
+    autopilot.answer_for(30)
+    assert [text for _, text in autopilot.sentences()] == ["edgevpr: no answer for GPS2_TYPE and 1 more"]
+    sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
+    autopilot.answer_for(1)
+    assert (sending.sent, sending.why) == (False, autopilot.interview.choice.reason)
+    assert "GPS2_TYPE, VISO_TYPE" in sending.why
+    autopilot.link = {}
+    autopilot.answer_for(60, Channel.GPS_INPUT)
+    autopilot.answer_for(10)
+    assert (Severity.INFO, "edgevpr: positions go by GPS_INPUT") in autopilot.sentences()
+
+
+def test_a_dangerous_change_in_flight_stops_the_channel_at_once_and_its_end_starts_it():
+    autopilot = Asked(COPTER)
+    autopilot.answer_for(10)
+    autopilot.set(GPS_PRIMARY=1)
+    assert autopilot.conversation.channel is Channel.GPS_INPUT
+    autopilot.set(GPS_AUTO_SWITCH=4)
+    assert autopilot.conversation.channel is Channel.NONE
+    autopilot.sent.clear()
+    autopilot.answer_for(10)
+    assert "GPS_INPUT" not in {message.get_type() for message in autopilot.sent}
+    assert (Severity.WARNING, "edgevpr: nothing sent: set GPS_PRIMARY=0") in autopilot.sentences()
+    autopilot.set(GPS_PRIMARY=0)
+    assert autopilot.conversation.channel is Channel.GPS_INPUT
+
+
+def test_a_change_that_is_not_broadcast_is_noticed_within_two_minutes():
+    autopilot = Asked(COPTER)
+    autopilot.answer_for(10)
+    autopilot.parameters["EK3_AFFINITY"] = 1
+    assert autopilot.answer_for(130, Channel.NONE) < 125
+    autopilot.requests.clear()
+    autopilot.answer_for(20)
+    assert len(autopilot.requests) == pytest.approx(10, abs=1)
+
+
+def test_a_change_of_channel_in_flight_is_reported():
+    autopilot = Asked(COPTER)
+    autopilot.answer_for(10)
+    autopilot.set(GPS2_TYPE=0, VISO_TYPE=1, EK3_SRC2_POSXY=6)
+    autopilot.answer_for(6)
+    assert autopilot.conversation.channel is Channel.ODOMETRY
+    assert autopilot.sentences()[-1] == (Severity.INFO, "edgevpr: positions go by ODOMETRY")
+
+
+def test_what_makes_us_weak_is_reported_once():
+    autopilot = Asked(PX4 | {"EKF2_GPS_CTRL": 0}, mavlink.MAV_AUTOPILOT_PX4)
+    autopilot.answer_for(120)
+    assert autopilot.conversation.channel is Channel.SENSOR
+    assert autopilot.sentences() == [(Severity.WARNING, "edgevpr: set EKF2_GPS_CTRL=7: see the log")]
+
+
+def test_an_unknown_firmware_keeps_the_command_at_once():
+    autopilot = Asked({}, mavlink.MAV_AUTOPILOT_GENERIC)
+    autopilot.answer_for(60)
+    assert autopilot.conversation.channel is Channel.COMMAND
+    assert autopilot.requests == []
+
+
+def test_another_autopilot_in_its_place_is_asked_anew():
+    autopilot = Asked(COPTER)
+    autopilot.answer_for(10)
+    autopilot.conversation.autopilot._forget()
+    autopilot.answer_for(STEP_S)
+    assert autopilot.conversation.channel is Channel.NONE
+    assert autopilot.answer_for(10, Channel.GPS_INPUT) < 5
