@@ -241,7 +241,7 @@ class Conversation:
             if why := pause or self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
-                self.fixes.drop_stale(now_s)
+                self.fixes.drop_stale(now_s, "the autopilot's clock was not known")
             elif sending := self.fixes.next(now_s) or self._between(now_s):
                 return messages.position_fix(sending.fix, now_s, system_id, stamp_s), sending
         else:

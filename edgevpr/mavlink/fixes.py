@@ -110,10 +110,11 @@ class Fixes:
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
-    def drop_stale(self, now_s: float) -> None:
+    def drop_stale(self, now_s: float, lack: str = "no autopilot was there to take it") -> None:
+        """Give up the fixes that have waited too long, for a `lack`."""
         for sending in self._waiting:
             if now_s > sending.due_s:
-                self._drop(sending, f"no autopilot was there to take it within {self._max_wait_s:g} s")
+                self._drop(sending, f"{lack} within {self._max_wait_s:g} s")
         self._waiting = deque(sending for sending in self._waiting if sending.sent is None)
 
     def withhold(self, why: str) -> None:

@@ -188,3 +188,11 @@ def test_stamps_of_others_that_are_not_in_the_autopilots_time_are_reported_once(
     px4 = Autopilot(PX4)
     px4.say(foreign(kind, 1.7e9), component_id=191)
     assert px4.texts() == [], "which converts each sender's own clock"
+
+
+def test_a_fix_that_waited_in_vain_for_the_time_says_so():
+    autopilot = Autopilot(timesync_s=None)
+    sending = autopilot.put_fix()
+    autopilot.wait(1.1)
+    autopilot.told()
+    assert (sending.sent, sending.why) == (False, "the autopilot's clock was not known within 1 s")
