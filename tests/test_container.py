@@ -1,5 +1,4 @@
-"""The container: what its Dockerfile copies is enough, what it tells BlueOS is true, and where Docker works it is built
-and says its version."""
+"""The container: what its Dockerfile copies is enough, and what flies is no root."""
 
 import json
 import shutil
@@ -14,7 +13,6 @@ from edgevpr import __version__
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "deploy" / "Dockerfile"
-REPOSITORY = "https://github.com/edgevpr/edgevpr"
 
 
 @pytest.fixture(scope="module")
@@ -58,40 +56,3 @@ def test_what_flies_is_no_root_and_installs_nothing(dockerfile, flown):
     assert "apt" not in flown["RUN"]
     assert json.loads(flown["ENTRYPOINT"]) == ["edgevpr"]
     assert json.loads(flown["CMD"]) == ["run", "--config", f"{flown['WORKDIR']}/config.yaml"]
-
-
-def test_what_blueos_reads_is_json_and_true(dockerfile, flown):
-    labels = dockerfile.labels
-    assert labels["version"] == __version__
-    permissions, links = json.loads(labels["permissions"]), json.loads(labels["links"])
-    host = permissions["HostConfig"]
-    assert host["NetworkMode"] == "host", "the router of the autopilot listens on the loopback of the board"
-    assert {bind.split(":")[1] for bind in host["Binds"]} == {flown["WORKDIR"], "/dev"}
-    assert all({"name", "email"} <= author.keys() for author in json.loads(labels["authors"]))
-    assert json.loads(labels["company"])["name"]
-    assert labels["type"] in ("device-integration", "example", "theme", "other", "tool", "education")
-    tags = json.loads(labels["tags"])
-    assert len(tags) <= 10
-    assert all(tag == tag.lower() and tag.replace("-", "").isalnum() for tag in tags)
-    raw = REPOSITORY.replace("github.com", "raw.githubusercontent.com") + "/main/"
-    for link in (labels["readme"], *links.values()):
-        assert link.startswith((REPOSITORY, raw)), link
-        assert (ROOT / link.removeprefix(raw).removeprefix(REPOSITORY).removeprefix("/tree/main/")).exists(), link
-
-
-@pytest.mark.slow
-@pytest.mark.process
-@pytest.mark.network
-def test_it_is_built_and_starts_from_a_disk_that_cannot_be_written():
-    docker = shutil.which("docker")
-    if docker is None or subprocess.run([docker, "info"], capture_output=True).returncode:
-        pytest.skip("no Docker runs here")
-    pulled = subprocess.run([docker, "pull", "python:3.11-slim-bookworm"], capture_output=True, text=True)
-    if pulled.returncode:
-        pytest.skip(f"the image of Python cannot be had: {pulled.stderr.strip()[:200]}")
-    built = subprocess.run([docker, "build", "-q", "-f", FILE, ROOT], capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    image = built.stdout.strip()
-    run = [docker, "run", "--rm", "--read-only", "--network", "none", image, "--version"]
-    assert subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip() == f"edgevpr {__version__}"
-    subprocess.run([docker, "image", "rm", image], capture_output=True)

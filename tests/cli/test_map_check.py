@@ -125,12 +125,6 @@ def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
     assert main(["map", "check", str(valley)]) == 0
 
 
-@pytest.mark.parametrize("command", ["info", "check", "repair"])
-def test_a_name_that_no_file_can_have_is_exit_code_2(command, capsys):
-    assert main(["map", command, ""]) == 2
-    assert "cannot be the name of a map" in capsys.readouterr().err
-
-
 def run_full(arguments, bytes_at_most):
     """Run a command on a disk that takes files of so many bytes at most."""
     with no_file_larger_than(bytes_at_most):

@@ -1,7 +1,6 @@
 """Networks and forms through the commands: one map for all forms, and what cannot be used stops nothing else."""
 
 import json
-from dataclasses import replace
 
 import cv2
 import pytest
@@ -13,7 +12,7 @@ from edgevpr.core.config import FORMS, load_config
 from edgevpr.core.errors import ConfigError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.recognise.opening import made_for, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create, vectors
 
 
@@ -94,18 +93,3 @@ def test_a_map_of_a_network_that_is_not_here_says_how_to_get_it(models, flight, 
     said = capsys.readouterr().err
     assert "with `tiny`" in said
     assert "models add" in said
-
-
-@pytest.mark.usefixtures("models")
-def test_a_network_takes_as_many_threads_as_the_board_spares(monkeypatch, flight):
-    asked = []
-    monkeypatch.setattr("edgevpr.techniques.create", lambda name, settings: asked.append((name, settings)))
-    board = replace(load_board("rpi-4b"), threads=3)
-    made_for(board.threads, "calc", {"model": "tiny"})
-    made_for(board.threads, "calc", {"model": "tiny", "threads": 1})
-    made_for(board.threads, "hog")
-    assert asked == [
-        ("calc", {"threads": 3, "model": "tiny"}),
-        ("calc", {"threads": 1, "model": "tiny"}),
-        ("hog", {}),
-    ]

@@ -119,13 +119,6 @@ def test_a_wrong_flight_is_one_sentence(tmp_path, ground, track, capsys, flags, 
     assert error.count("\n") == 1
 
 
-def test_a_track_elsewhere_names_the_extent(tmp_path, ground, capsys):
-    track = tmp_path / "t.csv"
-    track.write_text("file,lat,lon,height_m\na,-35.36,149.16,80\n")
-    assert run("simulate", "flight", tmp_path / "flight", "--orthophoto", ground, "--track", track) == 2
-    assert "49.9985..50.0015" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_without_rasterio_the_sentence_says_what_to_install(tmp_path, ground):
     script = (

@@ -26,7 +26,6 @@ from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.mapmaking import calibrate
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings
-from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.mapfile import PlaceMap
 
 building = pytest.importorskip("edgevpr.fleet.building", reason="needs the extra `fleet`")
@@ -148,15 +147,6 @@ def test_the_index_shows_the_tiles_in_any_program(tiled):
     assert (bounds[2] > east - 0.001, bounds[1] < south + 0.001) == (True, True)
 
 
-def test_the_index_is_made_anew_of_the_tiles_where_it_is_lost(tiled):
-    out, _, _ = tiled
-    before = index.tiles_in(out)
-    (out / index.INDEX).unlink()
-    assert index.tiles_in(out) == before
-    index.write(out, before.values())
-    assert index.tiles_in(out) == before
-
-
 def test_a_second_run_maps_nothing_and_one_over_changed_ground_what_has_changed(cluster, orthophoto, tmp_path):
     path, out = tmp_path / "o.tif", tmp_path / "maps"
     path.write_bytes(orthophoto.read_bytes())
@@ -167,15 +157,6 @@ def test_a_second_run_maps_nothing_and_one_over_changed_ground_what_has_changed(
         raster.write(np.full((1, 20, 20), 255, np.uint8), window=rasterio.windows.Window(30, 30, 20, 20))
     again = mapped(cluster, out, tasks)
     assert 1 <= sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
-
-
-def test_a_larger_area_maps_the_tiles_again_that_get_more_places(cluster, orthophoto, tmp_path):
-    middle = Orthophoto(orthophoto).middle
-    for radius_m, places in ((60, 9), (100, 21)):
-        area = f"{middle.lat_deg},{middle.lon_deg},{radius_m}"
-        tasks = building.tasks_of_orthophoto(replace(cuttings(orthophoto), area=area), PER_TILE, None)
-        mapped(cluster, tmp_path / "maps", tasks)
-        assert sum(map(len, places_of(tmp_path / "maps").values())) == places
 
 
 def test_a_tile_is_calibrated_with_the_ground_around_it_which_it_does_not_keep(orthophoto, tmp_path, monkeypatch):
@@ -226,31 +207,6 @@ def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
     assert len(names) == cuttings(orthophoto).open().total
     assert {path: path.stat().st_ino for path in made} == made, "what was done is not done again"
     assert not list(out.glob(".*.gpkg.*"))
-
-
-def test_a_run_whose_scheduler_dies_says_so_and_the_next_goes_on(orthophoto, tmp_path):
-    out, tasks = tmp_path / "maps", building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
-    cluster, second = Cluster(tmp_path), Cluster(tmp_path / "second")
-    try:
-        cluster.add_worker()
-        cluster.wait_for_workers(1)
-        done = []
-        for each in building.build(order(out), tasks, cluster.address, None, unshown):
-            done.append(each)
-            if each.tile and cluster.scheduler.poll() is None:
-                cluster.scheduler.kill()
-                cluster.scheduler.wait()
-        second.add_worker()
-        second.wait_for_workers(1)
-        again = mapped(second, out, tasks)
-    finally:
-        cluster.stop()
-        second.stop()
-    assert len(done) == len(tasks)
-    assert any("scheduler" in each.problem for each in done if each.problem)
-    assert not [each.problem for each in again if each.problem]
-    assert 0 < sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
-    assert sum(map(len, places_of(out).values())) == cuttings(orthophoto).open().total
 
 
 def photographs(folder, names, first):
@@ -384,17 +340,6 @@ def test_a_worker_of_another_version_maps_nothing(tiled, cluster, tmp_path):
     done = mapped(cluster, tmp_path / "maps", tasks[:2], version="99.0")
     assert [each.tile for each in done] == [None, None]
     assert "99.0 asks: install the same on all machines" in done[0].problem
-
-
-def test_where_there_is_no_scheduler_a_sentence_says_how_to_start_one(tmp_path, orthophoto):
-    tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
-    with pytest.raises(UsageError, match=r"There is no Dask scheduler at tcp://127\.0\.0\.1:9"):
-        list(building.build(order(tmp_path / "maps"), tasks, "tcp://127.0.0.1:9", None, unshown))
-
-
-def test_photographs_at_a_pole_are_refused(tmp_path):
-    with pytest.raises(UsageError, match="tiles end at"):
-        building.tasks_of_photos([photos.Photo("/p.jpg", GeoTag(position=Position(89.0, 0.0)))], 10, None)
 
 
 def test_photographs_on_both_sides_of_the_date_line_have_neighbours_across_it():

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
-from fakes import FakeClock, FakeSource
+from distorted_cameras import SIZE_PX, fisheye, wide
 
 from edgevpr.core.errors import EdgevprError, ImageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.chequerboard import LEAST_VIEWS, BoardViews, calibrated, live_frames, write_lens
+from edgevpr.frames.chequerboard import LEAST_VIEWS, BoardViews, calibrated, write_lens
 from edgevpr.frames.lens import read_lens
 
 BOARD = 9, 6
@@ -29,9 +28,7 @@ def off_px(lens, camera):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "camera", [wide(), fisheye(), DistortedCamera(493.0, (0.05, -0.1, 0.001, 0.0))], ids=["wide", "fisheye", "narrow"]
-)
+@pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "fisheye"])
 def test_a_lens_that_is_known_comes_out(camera, tmp_path):
     views = looked(camera.photographs_of_board(30))
     found = calibrated(views, str(tmp_path / "lens.yaml"), camera.fisheye)
@@ -74,22 +71,8 @@ def test_another_board_or_none_is_said(images, board):
         calibrated(looked(shown, board), "lens.yaml", False)
 
 
-def test_views_that_fit_no_lens_are_refused(images):
-    views = looked(images)
-    rng = np.random.default_rng(0)
-    views.found = [each + rng.normal(0, 6, each.shape).astype(np.float32) for each in views.found]
-    with pytest.raises(EdgevprError, match="pixels away"):
-        calibrated(views, "lens.yaml", False)
-
-
 def test_pictures_of_another_size_are_left_out(images):
     views = looked(images[:1])
     with pytest.raises(ImageError, match="640x240"):
         views.look(Frame(image=images[1][:240], name="small.png", t_mono_s=0.0))
     assert (views.pictures, views.size_px) == (1, SIZE_PX)
-
-
-def test_a_live_camera_is_looked_through_for_so_long():
-    clock = FakeClock()
-    source = FakeSource([np.zeros((16, 16), np.uint8)] * 100, clock, work=lambda: clock.sleep(1.0))
-    assert len(list(live_frames(source, 5.0, clock))) == 5

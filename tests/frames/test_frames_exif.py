@@ -33,11 +33,6 @@ def test_a_photograph_with_everything(tmp_path):
     assert tag.t_utc_s == 1466699519.5  # date -u -d '2016-06-23 16:31:59' +%s
 
 
-def test_south_and_east_and_below_the_sea(tmp_path):
-    tag = tag_of(tmp_path, GPS | {LAT_REF: "S", LON_REF: "E", ALT_REF: b"\x01", ALT: 3.0})
-    assert tag.position == Position(-46.8425, 91.995, -3.0)
-
-
 def test_a_height_above_the_ellipsoid_and_a_magnetic_heading_are_not_taken_for_what_they_are_not(tmp_path):
     assert tag_of(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == POSITION
     assert tag_of(tmp_path, {DIRECTION_REF: "M", DIRECTION: 10.0}).heading_deg is None
@@ -104,10 +99,6 @@ def test_a_file_that_is_missing_or_no_image_has_no_tag(tmp_path, capfd):
 )
 def test_a_time_that_cannot_be_is_unknown(gps, taken, tmp_path):
     assert tag_of(tmp_path, gps, camera=taken and {TAKEN: taken}).t_utc_s is None
-
-
-def test_a_position_without_its_height_is_still_one(tmp_path):
-    assert tag_of(tmp_path, GPS | {ALT_REF: b"\x00", ALT: 4e9}).position == POSITION
 
 
 @pytest.mark.parametrize(

@@ -179,12 +179,6 @@ def test_a_frame_lies_between_two_lines_and_turns_the_shorter_way(track):
     assert found.tag_at(11.5).position.lon_deg == pytest.approx(-179.9995)
 
 
-def test_on_a_line_the_tag_is_that_of_the_line_to_the_last_bit(track):
-    found = track("time,lat,lon,yaw_deg,file\n-3,1.1,2.2,,\n0.3333,50.123456789,8.7,350,a.jpg\n")
-    tag = GeoTag(position=Position(50.123456789, 8.7), heading_deg=350.0)
-    assert found.tag_at(0.3333) == found.tag_at(0.333) == tag, "Matroska rounds to milliseconds"
-
-
 def test_nothing_is_made_up_outside_the_table_and_in_wide_gaps(track):
     found = track("time,lat,lon\n1,50,8\n2,,\n6,50.1,8\n11.1,50.2,8\n12,0,0\n13,50.3,8\n")
     assert [found.tag_at(t_s).position is not None for t_s in (0.9, 1, 3, 6, 8, 11.1, 12, 13, 13.1)] == [

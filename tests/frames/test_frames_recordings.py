@@ -127,18 +127,6 @@ def test_a_folder_tells_the_steps_of_its_times_where_all_have_one_in_order(folde
     assert told == [*steps_s, *[None] * (len(times) - len(steps_s))]
 
 
-def test_what_is_no_folder_has_no_steps(video):
-    assert recorded_steps(None) == recorded_steps(str(video)) == recorded_steps("rtsp://127.0.0.1/x") == []
-
-
-def test_positions_named_by_the_user_count_before_those_that_lie_there(folder, tmp_path):
-    write_picture(folder / "a.jpg")
-    (folder / "positions.csv").write_text("file,lat,lon\na.jpg,1,2\n")
-    (tmp_path / "better.csv").write_text("file,lat,lon\na.jpg,3,4\n")
-    source = open_source(str(folder), positions=tmp_path / "better.csv", live=False)
-    assert source.read(1.0).position == Position(3.0, 4.0)
-
-
 def test_positions_that_cannot_be_meant_for_the_source_are_refused(folder, video, tmp_path):
     write_picture(folder / "a.jpg")
     (tmp_path / "other.csv").write_text("file,lat,lon\nb.jpg,3,4\n")
@@ -205,30 +193,6 @@ def test_of_a_recording_only_the_frames_that_are_asked_for_are_read(folder, vide
     assert [frame.name for frame in frames] == named
     assert shades_of(frames) == [3, 7]
     assert all_frames(open_source(str(folder), live=False, only=[])) == []
-
-
-def test_a_reader_in_a_hurry_gets_the_same_frames_of_a_video(video):
-    seconds = iter(range(10_000))
-    hurried = open_source(str(video), step_s=0.5, live=False, clock=lambda: next(seconds))
-    turns, frames = 0, []
-    while not hurried.ended:
-        frame = hurried.read(1.5)
-        turns += 1
-        if frame:
-            frames.append(frame)
-    assert turns > len(frames) + 1  # some turns gave nothing
-    patient = all_frames(open_source(str(video), step_s=0.5, live=False))
-    assert [frame.name for frame in frames] == [frame.name for frame in patient]
-    for one, other in zip(frames, patient, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
-
-
-def test_a_video_without_time_stamps_is_timed_by_its_frame_rate(tmp_path):
-    path = tmp_path / "bare.mjpeg"
-    path.write_bytes(b"".join(photographs.encoded(".jpg", shade(value)) for value in SHADES))
-    frames = all_frames(open_source(str(path), step_s=0.2, live=False))  # FFmpeg takes such a file for 25 Hz
-    assert shades_of(frames) == [0, 5, 10, 15, 20]
-    assert frames[1].name == "frame 000005 t=0.200 s"
 
 
 def frames_and_complaints(path):

@@ -5,7 +5,6 @@ import json
 import cv2
 import numpy as np
 import pytest
-from films import film_of
 
 from edgevpr.cli.main import main
 
@@ -67,16 +66,6 @@ def test_a_camera_that_looks_down_must_be_said_to(folder, view, pitch_deg, code)
     assert (here / "m.gpkg").exists() == (code == 0)
 
 
-@pytest.mark.parametrize("camera", ["nadir", "forward"])
-def test_what_is_said_of_the_camera_is_believed(folder, camera):
-    assert build(folder(down), "--camera", camera) == 0
-
-
-def test_a_film_that_looks_down_is_noticed_too(tmp_path):
-    film_of(tmp_path / "flight.mkv", [cv2.cvtColor(down(number), cv2.COLOR_GRAY2BGR) for number in range(8)], 1)
-    assert build(tmp_path, images="flight.mkv") == 2
-
-
 def warnings_of(caplog):
     return [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
 
@@ -88,16 +77,6 @@ def test_what_a_map_will_lack_is_said_before_it_is_made(folder, caplog):
     assert "8 lines are at 0, 0" in at_zero
     assert "no position was found" in nowhere
     assert "8 places at most" in few
-
-
-def test_a_film_at_full_rate_is_said_to_make_many_places(tmp_path, caplog):
-    film_of(
-        tmp_path / "flight.mkv", [cv2.cvtColor(ahead(number // 10), cv2.COLOR_GRAY2BGR) for number in range(60)], 20
-    )
-    assert build(tmp_path, "--camera", "forward", "--no-calibrate", images="flight.mkv") == 0
-    many, nowhere = warnings_of(caplog)
-    assert "60 in 3 s: --rate-hz 1 makes 3" in many
-    assert "no position was found" in nowhere
 
 
 def test_the_ground_of_a_map_is_measured(folder, capsys):

@@ -225,12 +225,3 @@ def test_the_part_that_shows_ground_moves_with_the_picture():
         followed.append(apart(seen, now))
         left.append(apart(seen, shown))
     assert np.mean(followed) > 1.5 * np.mean(left)
-
-
-@pytest.mark.parametrize(
-    ("size", "becomes"), [((960, 1280), (480, 640)), ((480, 640), (480, 640)), ((90, 120), (90, 120))]
-)
-def test_large_pictures_are_changed_at_the_size_of_the_sets(size, becomes):
-    shown = np.ones(size, bool)
-    image, mask = changed(np.full((*size, 3), 90, np.uint8), np.random.default_rng(1), True, shown)
-    assert image.shape == mask.shape == becomes

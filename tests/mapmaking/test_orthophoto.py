@@ -17,7 +17,6 @@ from edgevpr.mapmaking.orthophoto import Orthophoto
 pytestmark = pytest.mark.slow
 
 FOOTPRINT_M, SIDE_PX = 80.0, 400
-PIXEL_M = FOOTPRINT_M / SIDE_PX
 
 
 def cut(path, footprint_m=FOOTPRINT_M, at=HOME):
@@ -61,17 +60,6 @@ def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, turned_de
     assert picture[..., 2].mean() > 1.1 * picture[..., 0].mean(), "red comes last"
 
 
-def test_longitudes_may_count_from_0_to_360(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", "EPSG:4326", side_px=720)
-    with rasterio.open(path, "r+") as data:
-        there = data.transform
-        data.transform = rasterio.Affine(there.a, there.b, there.c + 360, there.d, there.e, there.f)
-    picture, valid = cut(path)
-    assert valid.all()
-    require_marks(picture)
-    assert Orthophoto(path).extent_deg[1] == pytest.approx(11.9, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("crs", "west"), [("EPSG:4326", 179.999), ("EPSG:4326", -180.001), ("EPSG:3857", 20037398.0), ("EPSG:32660", None)]
 )
@@ -91,20 +79,12 @@ def test_a_file_over_the_antimeridian_is_one_picture(tmp_path, crs, west):
         assert valid.all()
 
 
-@pytest.mark.parametrize("pixel_m", [0.05, 0.07, 0.45])
+@pytest.mark.parametrize("pixel_m", [0.07, 0.45])
 def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
     path = marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
     picture, valid = cut(path)
     assert valid.all()
     require_marks(picture, within_px=0.2)
-
-
-def test_fine_stripes_become_grey_and_no_pattern(tmp_path):
-    to_crs, _, _ = grid("EPSG:32632", 0.02, 1600)
-    stripes = np.zeros((1, 1600, 1600), np.uint8)
-    stripes[:, :, ::2] = 200
-    picture, _ = cut(write_raster(tmp_path / "o.tif", stripes, "EPSG:32632", to_crs), 30.0)
-    assert abs(picture.astype(int) - 100).max() <= 3
 
 
 def test_what_lies_beyond_the_edge_has_no_data(tmp_path):
@@ -175,7 +155,7 @@ def tiles(folder, zoom, side_px=256, end="png", skip=()):
     return folder
 
 
-@pytest.mark.parametrize(("zoom", "side_px", "end"), [(19, 256, "png"), (18, 512, "png"), (20, 128, "jpg")])
+@pytest.mark.parametrize(("zoom", "side_px", "end"), [(19, 256, "png"), (20, 128, "jpg")])
 def test_a_folder_of_tiles_is_read_at_its_highest_zoom(tmp_path, zoom, side_px, end):
     folder = tiles(tmp_path, zoom, side_px, end)
     (folder / str(zoom - 3) / "1").mkdir(parents=True)

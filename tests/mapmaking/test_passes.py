@@ -9,10 +9,9 @@ from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import distance_m
 from edgevpr.mapmaking.making import FlownPictures, MapOrder, make_map
 from edgevpr.mapmaking.passes import FADES_AFTER, SPOT, history_of
-from edgevpr.places.examine import check, merge, select, shrink
+from edgevpr.places.examine import check, select
 from edgevpr.places.history import counts_of, removed_from, write_history
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
 
 pytestmark = pytest.mark.slow
 
@@ -118,23 +117,6 @@ def test_what_nobody_finds_again_fades_after_so_many_flights_and_the_newer_place
         assert faded == (["03.png"] if count == FADES_AFTER else [])
 
 
-def test_ground_that_was_found_again_under_older_snow_does_not_fade(tmp_path):
-    flights = [OTHER, SAME, SAME, SAME, OTHER]
-    history, path = compared(tmp_path, flown(tmp_path / "p", *flights))
-    assert None not in history.removed.values()
-    assert spots(left(path)) == list("01233")
-    assert [each.to_image for each in history.changes] == ["13.png"]
-
-
-def test_a_chain_of_near_places_does_not_become_one(tmp_path):
-    names = [f"{number}{spot}.png" for number in range(6) for spot in (0, 2)]
-    for number in range(6):  # each as far beside the one before that both show one spot
-        fly(tmp_path / "p", SAME, number, START_S + number * DAY_S, (9.0 * number, 0.0), (0, 2))
-    history, path = compared(tmp_path, {name: f"/of/flight{name[0]}" for name in names})
-    assert 4 <= len(left(path)) <= 8
-    require_near(tmp_path / "all.gpkg", history)
-
-
 @pytest.mark.parametrize(("pause_s", "passes", "places"), [(600.0, 0, 8), (4 * 3600.0, 2, 4)])
 def test_one_flight_is_not_compared_and_a_pause_of_hours_makes_two(tmp_path, pause_s, passes, places):
     fly(tmp_path / "p", SAME, 0, START_S)
@@ -145,34 +127,9 @@ def test_one_flight_is_not_compared_and_a_pause_of_hours_makes_two(tmp_path, pau
         assert (counts_of(place_map).passes, len(removed_from(place_map))) == (passes, 8 - places)
 
 
-def test_without_times_places_become_one_and_nothing_else_is_said(tmp_path):
-    folders = flown(tmp_path / "p", OTHER, *[SAME] * FADES_AFTER, days=False)
-    history, path = compared(tmp_path, folders)
-    assert spots(left(path)) == list("01233")
-    assert history.changes == ()
-
-
 def test_only_places_inside_are_judged_and_those_around_are_asked(tmp_path):
     folders = flown(tmp_path / "p", SAME, SAME)
     inside = {"00.png", "10.png", "01.png"}
     history, _ = compared(tmp_path, folders, inside)
     (name,) = history.removed
     assert name in ("00.png", "10.png")
-
-
-def test_a_camera_that_looks_ahead_is_not_compared(tmp_path):
-    history, path = compared(tmp_path, flown(tmp_path / "p", SAME, SAME), camera="forward")
-    assert (history.passes, len(left(path))) == ((), 8)
-
-
-def test_other_commands_take_a_map_with_its_history_and_one_without(tmp_path):
-    _, path = compared(tmp_path, flown(tmp_path / "p", SAME, OTHER))
-    with PlaceMap.open(path) as place_map:
-        assert (counts_of(place_map).merged, counts_of(place_map).changed, info_of(place_map).places) == (3, 1, 5)
-    assert shrink(path, tmp_path / "small.gpkg", 2) == (2, 5)
-    assert merge([str(path), str(tmp_path / "all.gpkg")], tmp_path / "both.gpkg")[0] == [(5, 0), (3, 5)]
-    for copy in ("small.gpkg", "both.gpkg", "all.gpkg"):
-        assert check(tmp_path / copy).is_whole
-        with PlaceMap.open(tmp_path / copy) as place_map:
-            assert counts_of(place_map).passes == 0
-    assert {name for name, _ in pyogrio.list_layers(path)} >= {"places", "changes", "passes", "removed"}

@@ -287,35 +287,3 @@ def test_a_place_that_cannot_be_read_is_left_alone(map_path):
         found = refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
     assert found.places == 27
     assert found.refined >= 25
-
-
-def test_what_is_learnt_beside_refined_places_lies_by_them(flown, map_path):
-    from edgevpr.core.config import load_config
-    from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.learn import Learner
-    from edgevpr.runtime.recognise.opening import open_learning
-
-    folder, poses = flown
-    assert main(["map", "refine", str(map_path), "--images", str(folder / "images")]) == 0
-    shot_of, _ = photographer(9)
-    seen = dataclasses.replace(poses[5], east_m=poses[5].east_m + 10, heading_deg=140.0, height_m=90.0)
-    shot = shot_of(seen)
-    true = to_position(seen)
-    noisy = Position(*moved(true.lat_deg, true.lon_deg, 6.0, -4.0), true.alt_m)
-    # Each picture counts alone: a flight that is followed would not learn the second one at all.
-    config = load_config(None, {"map": str(map_path), "match.follow": False})
-    recogniser, growing = open_learning(config, load_board("this"), None)
-    with recogniser.place_map:
-        learner = Learner(recogniser, growing, spacing_m=5.0, gap_m=100.0)
-        place = learner.learn(recogniser.step(Frame(image=shot, name="new", t_mono_s=1.0, position=noisy)))
-        far = Position(*moved(true.lat_deg, true.lon_deg, 90.0, 0.0))
-        contradicted = learner.learn(recogniser.step(Frame(image=shot, name="far", t_mono_s=99.0, position=far)))
-    with PlaceMap.open(map_path) as place_map:
-        place, contradicted = place_map.places([place.place_id, contradicted.place_id])
-    assert abs((place.pose.up_deg - 140 + 180) % 360 - 180) < 8
-    assert place.pose.footprint_m == pytest.approx(FOOTPRINT_M * 90 / 80, rel=0.15)
-    assert place.pose.recorded == Position(noisy.lat_deg, noisy.lon_deg)
-    off_m = distance_m(true.lat_deg, true.lon_deg, place.position.lat_deg, place.position.lon_deg)
-    assert off_m < np.hypot(6, 4)
-    assert contradicted.pose is None, "the pictures and the position contradict each other"
-    assert contradicted.position == far

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
@@ -84,12 +83,6 @@ def test_places_in_a_polygon_are_taken_and_those_deep_in_its_hole_are_not(tiles,
     assert "22" in names_in(tmp_path / "g.gpkg")
 
 
-def test_only_tiles_near_the_mission_are_read(tiles, tmp_path):
-    found = subset(tiles, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
-    assert found.maps < len(list(tiles.glob("[0-3]*.gpkg")))
-    assert names_in(tmp_path / "f.gpkg") == ["00"]
-
-
 def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path):
     area = path_over((0, 0), (400, 400))
     whole = subset(tiles, area, 1000.0, tmp_path / "whole.gpkg", None, unwatched)
@@ -125,18 +118,6 @@ def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
     with pytest.raises(MapError, match="no folder of maps"):
         subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_says_what_is_left_out(tiles, tmp_path, capsys):
-    (tmp_path / "m.kml").write_text(
-        '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><LineString><coordinates>'
-        f"8.0,47.0,120 {at(0, 400)[1]},{at(0, 400)[0]},120</coordinates></LineString></Placemark></kml>"
-    )
-    words = ["map", "subset", str(tiles), "--mission", str(tmp_path / "m.kml"), "--out", str(tmp_path / "f.gpkg")]
-    assert main([*words, "--margin-m", "150"]) == 0
-    assert "10 places of" in capsys.readouterr().out
-    assert main(words) == 1
-    assert "is there already" in capsys.readouterr().err
 
 
 def test_polygons_and_points_of_kml_are_read(tmp_path):

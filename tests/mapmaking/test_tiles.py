@@ -132,29 +132,6 @@ def test_a_cache_of_many_places_is_read_where_it_is_wanted_at_the_zoom_that_cove
     assert np.array_equal(found, cut(folder(tmp_path / "folder", around()))[0])
 
 
-def test_of_several_maps_one_must_be_named(tmp_path):
-    path = mission_planner(tmp_path / "Data.gmdb", around())
-    mission_planner(path, around(reach=1), kind=5)
-    said = refused(path)
-    assert "47626774 (25 tiles), 5 (9 tiles)" in said
-    assert "#47626774" in said
-    assert cut(f"{path}#5")[1].any()
-    cache = qgroundcontrol(tmp_path / "qgcMapCache.db", around())
-    qgroundcontrol(cache, around(reach=1), kind=9, name="Streets")
-    assert "Bing Satellite (25 tiles), Streets (9 tiles)" in refused(cache)
-    assert cut(f"{cache}#Bing Satellite")[1].all()
-    assert "Streets" in refused(f"{cache}#Roads")
-
-
-def test_what_crosses_the_antimeridian_is_one_picture(tmp_path):
-    fiji = Position(-17.0, 179.9999)
-    path = folder(tmp_path / "fiji", around(at=fiji))
-    ground = ground_of([(fiji.lat_deg, 179.9995), (fiji.lat_deg, -179.9999)], 100.0)
-    assert ground.extent_deg[3] > 180
-    assert cut(path, ground, fiji)[1].all()
-    assert "--area" in refused(path, None)
-
-
 def test_files_that_are_damaged_locked_foreign_or_empty_get_a_sentence(tmp_path):
     with contextlib.closing(sqlite3.connect(tmp_path / "foreign.db")) as db, db:
         db.execute("CREATE TABLE notes (text TEXT)")
@@ -170,27 +147,6 @@ def test_files_that_are_damaged_locked_foreign_or_empty_get_a_sentence(tmp_path)
         x, y = middle()
         db.execute("UPDATE TilesData SET Tile = x'00' WHERE id IN (SELECT id FROM Tiles WHERE X = ? AND Y = ?)", (x, y))
     assert 0 < cut(holed)[1].mean() < 1
-
-
-@pytest.mark.slow
-def test_a_locked_cache_names_the_program_to_close(tmp_path, monkeypatch):
-    monkeypatch.setattr("edgevpr.mapmaking.tilefiles._WAIT_S", 0.1)
-    path = mission_planner(tmp_path / "Data.gmdb", around())
-    with contextlib.closing(sqlite3.connect(path)) as db:
-        db.execute("BEGIN EXCLUSIVE")
-        assert "locked" in refused(path)
-
-
-def test_pmtiles_without_pictures_get_a_sentence(tmp_path):
-    assert "vector tiles" in refused(pmtiles(tmp_path / "v.pmtiles", around(), kind="MVT"))
-    for name, data in (("nothing", b""), ("foreign", b"x" * 200), ("short", b"PMTiles\x03")):
-        (tmp_path / f"{name}.pmtiles").write_bytes(data)
-        assert "no PMTiles file" in refused(tmp_path / f"{name}.pmtiles")
-    path = pmtiles(tmp_path / "e.pmtiles", around())
-    data = bytearray(path.read_bytes())
-    data[16:24] = bytes(8)  # the length of the directory
-    path.write_bytes(data)
-    assert "no tiles" in refused(path)
 
 
 def capabilities(port: int) -> bytes:

@@ -56,21 +56,3 @@ def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
 def test_more_words_than_descriptors_allow_are_refused(folder, own_models):
     with pytest.raises(UsageError, match=r"at most \d+ words"):
         train(folder, own_models, "--kind", "vlad", "--count", "5000")
-
-
-def test_a_round_of_kmeans_is_the_textbooks():
-    """Against a loop over points and centres."""
-    points = np.random.default_rng(2).normal(size=(200, 3)).astype(np.float32)
-    before, after = (each.copy() for each in train_words.kmeans(points, 7, 2, np.random.default_rng(3)))
-    own = [min(range(7), key=lambda k: float(np.square(point - before[k]).sum())) for point in points]
-    wanted = [
-        np.mean([point for point, k in zip(points, own, strict=True) if k == number], axis=0) for number in range(7)
-    ]
-    np.testing.assert_allclose(after, wanted, atol=1e-5)
-
-
-def test_no_centre_is_left_without_points():
-    rng = np.random.default_rng(4)
-    points = np.repeat(rng.normal(size=(10, 4)).astype(np.float32), 30, axis=0)  # starts mostly coincide
-    *_, found = train_words.kmeans(points, 10, 12, rng)
-    assert np.square(points[:, None] - found).sum(axis=2).min(axis=1).mean() < 1e-6

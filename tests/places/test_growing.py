@@ -156,8 +156,3 @@ def test_a_place_damaged_since_it_was_read_is_left_out_when_all_is_packed_anew(e
     assert_same(again.index, growing.index)
     learn(empty_map, again, [16])
     assert again.index.place_ids.tolist() == [1, 2, *range(4, 18)]
-
-
-def test_a_budget_that_holds_no_place_is_refused(empty_map):
-    with pytest.raises(MapError, match="budget"):
-        GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=bytes_per_place(Signs.spec) - 1, room=10)

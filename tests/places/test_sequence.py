@@ -10,8 +10,7 @@ from map_writer import SPEC
 from edgevpr.core.contract import FineMatch
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import SequenceSearch, bytes_beside_place, length_of
-from edgevpr.techniques import create
+from edgevpr.places.sequence import SequenceSearch, bytes_beside_place
 
 FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
 OTHERS = [quarter / 4 for quarter in range(-10, 13) if quarter != 4]
@@ -155,14 +154,3 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 1.02 * places * bytes_beside_place(length) == 1.02 * places * 44
-
-
-def test_the_length_is_what_is_asked_for_or_the_techniques_own():
-    own, other = create("seqslam"), create("hog")
-    assert [
-        length_of(own.spec, None),
-        length_of(own.spec, 3),
-        length_of(other.spec, None),
-        length_of(other.spec, 7),
-    ] == [10, 3, 1, 7]
-    assert bytes_beside_place(1) == 0

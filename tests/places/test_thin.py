@@ -27,15 +27,6 @@ def test_of_two_places_side_by_side_the_one_that_says_more_stays():
     assert 2 in best_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)
 
 
-def test_age_does_not_matter():
-    rng = np.random.default_rng(1)
-    lat, lon = track(np.sort(rng.random(200)) * 1000)
-    quality = rng.random(200)
-    kept = best_places(lat, lon, quality, 50)
-    backwards = best_places(lat[::-1], lon[::-1], quality[::-1], 50)
-    assert set(kept) == {199 - at for at in backwards}
-
-
 @pytest.mark.parametrize("capacity", [1, 2, 7])
 def test_places_without_positions_are_thinned_along_their_order(capacity):
     nowhere = np.full(20, np.nan)

@@ -91,21 +91,6 @@ def test_an_x86_machine_is_named_by_its_firmware(tree):
     assert detect(tree(x86(sys_vendor="", product_name="")))["model"] is None
 
 
-def test_a_control_group_limits_what_the_profile_may_take(tree):
-    groups = {
-        "proc/self/cgroup": "0::/system.slice/edgevpr.service\n",
-        "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "300000000\n",
-        "sys/fs/cgroup/system.slice/edgevpr.service/cpu.max": "40000 100000\n",
-    }
-    root = tree(arm("Raspberry Pi 4 Model B Rev 1.5", *["0xd08"] * 4) | groups)
-    found = detect(root)
-    assert (found["cores"], found["usable_cores"]) == (4, 0.4)
-    assert (found["ram_mb"], found["ram_limit_mb"]) == (4096.0, 300.0)
-    board = written(root)
-    assert (board.ram_mb, board.memory_max_mb, board.budget_mb) == (4096.0, 300.0, 150.0)
-    assert (board.cores, board.cpu_share, board.threads) == (4, 0.1, 1)
-
-
 @pytest.mark.parametrize("model", ['Board: "X" #1', "- [a, {b", "Bård ÅÄ\x07\x85 ½", "null", "'", "\\n %YAML"])
 def test_whatever_a_board_calls_itself_the_file_can_be_read(tree, model):
     root = tree(arm(model, "0xd03"))

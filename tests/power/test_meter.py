@@ -1,6 +1,5 @@
 """Stages and whole flights metered with a clock that says what the test wants, and with the real one."""
 
-import os
 import threading
 import time
 
@@ -10,7 +9,7 @@ from fakes import FakeClock
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack, parse_pack
-from edgevpr.power.meter import OwnLoad, OwnMemory, QueryMeter, machine_load, query_cost, stage
+from edgevpr.power.meter import OwnLoad, OwnMemory, QueryMeter, query_cost, stage
 
 
 def clock(*readings):
@@ -86,18 +85,6 @@ def test_a_signal_between_a_step_and_the_setting_of_its_cost_is_not_masked():
     with pytest.raises(Ended), meter.step("encode"):
         pass
     assert meter.steps().encode == NO_COST
-
-
-def test_a_busy_core_is_seen():
-    machine_load()
-    until_s = time.monotonic() + 0.3
-    while time.monotonic() < until_s:
-        pass
-    load = machine_load()
-    assert len(load.core_shares) == os.cpu_count()
-    assert max(load.core_shares) > 0.5
-    assert all(0 <= share <= 1 for share in load.core_shares)
-    assert 0 < load.ram_used_bytes < load.ram_total_bytes
 
 
 class Working(FakeClock):

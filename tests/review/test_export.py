@@ -47,12 +47,6 @@ def test_a_fix_between_matches_is_a_point_too(tmp_path):
     assert not flight.remarks
 
 
-def test_a_name_of_any_characters_is_written(tmp_path):
-    name = 'a\x00\x1b<b>&"\ud800'
-    features = features_of(read_flight(write_log(tmp_path / "log", ("query", query(name)))))
-    assert json.loads(written(write_geojson, features))["features"][0]["properties"]["query"] == name
-
-
 def test_a_flight_without_positions_has_no_points(tmp_path):
     nowhere = query("a", located=None, position=None, fix=None)
     features = features_of(read_flight(write_log(tmp_path / "log", ("query", nowhere))))

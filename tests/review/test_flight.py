@@ -8,9 +8,7 @@ from logs import query, write_log
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.review.logged import FixOutcome, read_flight
-from edgevpr.review.queries import steps_of
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.recognise.evidence import kind_of
 
 
 def outcomes(flight):
@@ -108,34 +106,6 @@ def test_values_of_a_wrong_type_are_unknown(tmp_path):
     assert known == (None,) * 6
 
 
-def test_tiles_are_those_that_were_ever_in_ram(tmp_path):
-    lines = [
-        ("tiles", {"held": ["120", "121"]}),
-        ("tiles", {"held": ["121", "123"]}),
-        ("tiles", {}),
-        ("tiles", {"held": 5}),
-    ]
-    assert read_flight(write_log(tmp_path / "log", *lines)).tiles == {"120", "121", "123"}
-
-
-def test_lines_of_note_are_kept_in_their_words(tmp_path):
-    lines = [
-        ("camera", {"said": "camera shows nothing"}),
-        ("gap", {"lost_lines": 3}),
-        ("unusable", {"problem": "cut short"}),
-        ("command", {"wish": "PAUSE", "said": "paused"}),
-        ("governor", {"from": {"rate_hz": 2, "form": "bits"}, "to": {"rate_hz": 1, "form": "bits"}, "why": "too hot"}),
-    ]
-    flight = read_flight(write_log(tmp_path / "log", *lines))
-    assert flight.remarks == [
-        (1, "camera", "camera shows nothing"),
-        (2, "gap", "lost_lines 3"),
-        (4, "command", "paused"),
-        (5, "governor", "rate_hz 2 to 1: too hot"),
-    ]
-    assert flight.unusable == [3]
-
-
 def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "empty").touch()
     with pytest.raises(EdgevprError, match="no line"):
@@ -143,13 +113,3 @@ def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
         with pytest.raises(UsageError, match="no such"):
             read_flight(missing)
-
-
-@pytest.mark.parametrize(
-    "figures", [{"likeness": 0.9, "proof": 0.0}, {"likeness": 0.9, "proof": 0.4}, {"landmarks": 2.0}, {}]
-)
-def test_the_kind_of_evidence_has_the_name_of_its_model(tmp_path, figures):
-    """The page's precision looks up what a match of this kind needs."""
-    line = query("a", reason="confidence 0.99, 0.98 needed: it is so", evidence={"lead": 1.0, **figures})
-    (step,) = steps_of((), read_flight(write_log(tmp_path / "log", ("query", line))))
-    assert step.judged.kind == kind_of(line["evidence"])

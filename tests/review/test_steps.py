@@ -52,10 +52,6 @@ def spots(page):
     return page.eval_on_selector_all(".spot", "all => all.map(each => each.getAttribute('class'))")
 
 
-def box_of(page):
-    return [float(each) for each in page.get_attribute(".view svg", "viewBox").split()]
-
-
 def test_the_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
     steps = known(made)["steps"]
     page.focus("#step")
@@ -110,33 +106,6 @@ def test_the_precision_slider_counts_what_the_judge_would_accept(page, made, pre
         assert "3.3 m from GPS" in page.inner_text("#others li")
         page.click("#others button >> nth=0")
         assert page.inner_text(".now h3").endswith("refused")
-
-
-def test_wheel_and_drag_move_the_ground_and_a_click_chooses_a_query(page):
-    frame = page.locator(".view").bounding_box()
-    middle = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
-    page.mouse.move(*middle)
-    page.mouse.wheel(0, -300)
-    assert box_of(page)[0] == 0, "until it has the focus, the wheel scrolls the page"
-    page.evaluate("scrollTo(0, 0)")
-    page.focus(".view")
-    frame = page.locator(".view").bounding_box()
-    middle = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
-    page.mouse.move(*middle)
-    page.mouse.wheel(0, -500)
-    page.evaluate("() => new Promise(requestAnimationFrame)")
-    before = box_of(page)
-    assert before[2] < 500
-    page.mouse.down()
-    page.mouse.move(middle[0] - 40, middle[1], steps=4)
-    page.mouse.up()
-    assert box_of(page)[0] > before[0]
-    page.keyboard.press("0")
-    page.eval_on_selector("#step", "each => {each.value = 5; each.oninput()}")
-    x, y = page.evaluate("JSON.parse(document.getElementById('steps').textContent).steps[3].at.accepted")
-    _, _, wide, high = box_of(page)
-    page.mouse.click(frame["x"] + x / wide * frame["width"], frame["y"] + y / high * frame["height"])
-    assert "place found: 03.png" in page.inner_text(".now"), "the nearest query"
 
 
 def test_no_name_of_a_log_becomes_code(browser, tmp_path):

@@ -68,15 +68,3 @@ def test_what_is_masked_changes_nothing_of_what_is_not():
     assert found is not dim
     np.testing.assert_array_equal(found[allowed], other[allowed])
     assert not np.array_equal(stretched(changed, None, PIXEL_PX, *DOUBLED)[allowed], found[allowed])
-
-
-@pytest.mark.parametrize("size", [(1, 1), (2, 4000), (4000, 1), (13, 17)])
-def test_a_picture_of_any_shape_is_stretched_or_left(size):
-    for camera in CAMERAS:
-        quality = create("cohog", {"camera": camera}).encode(noisy(np.full(size, 40), 9)).quality
-        assert 0 <= quality <= 1
-
-
-def test_nothing_allowed_is_nothing_stretched():
-    dim = ramp(0, 20)
-    assert stretched(dim, np.zeros((512, 512), bool), PIXEL_PX, *DOUBLED) is dim

@@ -1,8 +1,5 @@
 """The short cuts of encoding give what the long way gives: strips, octants for angles, bounds for whole maps."""
 
-import os
-from pathlib import Path
-
 import cv2
 import literal
 import numpy as np
@@ -11,7 +8,6 @@ from pictures import textured
 
 from edgevpr.techniques import entropy, gradients
 
-DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[3] / "shared/data")
 ENTROPIES = ("filled_bins", "shannon")
 
 
@@ -73,17 +69,6 @@ def test_good_blocks_are_those_of_the_whole_map(name, cell_px, which):
     _assert_same_goodness(PICTURES[name], which, cell_px)
 
 
-@pytest.mark.data
-@pytest.mark.parametrize("which", ENTROPIES)
-@pytest.mark.parametrize("set_name", ["corridor", "grief_stromovka_seasons", "aerial_caliterra"])
-def test_good_blocks_of_photographs_are_those_of_the_whole_map(set_name, which):
-    paths = sorted((DATA / set_name / "query").glob("*.*"))
-    if not paths:
-        pytest.skip(f"no image set {set_name} in {DATA}: name the folder of the sets in EDGEVPR_DATA")
-    photograph = cv2.imread(str(paths[len(paths) // 2]), cv2.IMREAD_GRAYSCALE)
-    _assert_same_goodness(cv2.resize(photograph, (256, 256)), which, 16)
-
-
 @pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("name", PICTURES)
 def test_no_entropy_leaves_its_bounds_and_the_exact_one_is_exact(name, which):
@@ -94,14 +79,6 @@ def test_no_entropy_leaves_its_bounds_and_the_exact_one_is_exact(name, which):
     assert (bounds.blocks(bounds.high) >= means - 1e-6).all()
     exact = bounds.exact(np.ones(bounds.low.shape, bool)).reshape(bounds.low.shape)
     np.testing.assert_allclose(bounds.blocks(exact), means, atol=1e-6)
-
-
-def test_most_blocks_are_decided_by_bounds_alone():
-    grey = cv2.resize(textured(8, 256, 256), (512, 512))
-    for which, threshold in (("shannon", 0.4), ("filled_bins", 0.5)):
-        bounds = entropy._BOUNDS[which](grey, 16)
-        decided = (bounds.blocks(bounds.low) >= threshold) | (bounds.blocks(bounds.high) < threshold)
-        assert decided.mean() > 0.5
 
 
 def test_octants_vote_like_angles_in_every_direction():

@@ -89,22 +89,6 @@ def test_masked_pixels_do_not_count(name):
     assert it.encode(image, mask).coarse.tobytes() != it.encode(image).coarse.tobytes()
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_map_knows_model_and_head_but_not_the_form(name):
-    specs = [technique(name, form=form).spec for form in FORMS]
-    assert specs[0].parameters == {"model": "calc", **create(name, SETTINGS[name]).spec.parameters}
-    assert SETTINGS[name].items() <= specs[0].parameters.items()
-    assert len({(spec.coarse, spec.fine, spec.model_sha256) for spec in specs}) == 1
-    assert len(specs[0].model_sha256) == 64
-    assert specs[0].row.nbytes > specs[1].row.nbytes > specs[2].row.nbytes
-
-
-def test_amosnet_and_hybridnet_differ_by_their_weights_alone():
-    amosnet, hybridnet = technique("amosnet", levels=4), technique("hybridnet")
-    assert amosnet.encode(textured(1)).coarse.tobytes() == hybridnet.encode(textured(1)).coarse.tobytes()
-    assert (amosnet.spec.name, hybridnet.spec.name) == ("amosnet", "hybridnet")
-
-
 @pytest.mark.parametrize(
     ("name", "settings", "error", "says"),
     [

@@ -2,7 +2,6 @@
 
 import cv2
 import numpy as np
-import pytest
 from pictures import textured
 
 from edgevpr.techniques.card import InputRule
@@ -29,13 +28,6 @@ def test_calc_sees_the_picture_as_its_paper_says():
     assert found.shape == (1, 1, 120, 160)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found[0, 0], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("equalise", [False, True])
-def test_a_grey_picture_is_one_without_colour(equalise):
-    grey = textured(2)
-    it = rule(equalise=equalise)
-    np.testing.assert_allclose(prepare(grey, it), prepare(np.dstack([grey] * 3), it), atol=1.01 / 255)
 
 
 def test_colours_come_in_the_order_of_the_card():

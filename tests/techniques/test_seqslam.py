@@ -4,11 +4,9 @@ import math
 
 import cv2
 import numpy as np
-import pytest
 from pictures import textured
 
-from edgevpr.core.errors import UsageError
-from edgevpr.techniques.seqslam import SeqSlam, enhanced
+from edgevpr.techniques.seqslam import SeqSlam
 
 
 def literal_levels(picture, patch=8):
@@ -91,23 +89,3 @@ def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
     assert scores.argmax() == 17
     assert scores.min() >= 0
     assert scores.max() <= 1
-
-
-def test_a_long_map_costs_the_enhancement_no_precision():
-    differences = 500_000 + np.random.default_rng(0).integers(0, 3, 20_000).astype(np.int32)
-    np.testing.assert_allclose(enhanced(differences)[-50:], literal_enhanced(differences[-60:])[-50:], atol=1e-9)
-
-
-@pytest.mark.parametrize("places", [1, 2, 5])
-def test_a_map_smaller_than_the_window_is_searched(places):
-    technique = SeqSlam()
-    scores, _ = technique.coarse_scores(technique.encode(textured(places - 1)), rows_of(technique, places), None)
-    assert scores.shape == (places,)
-    assert np.isfinite(scores).all()
-    assert scores.argmax() == places - 1
-
-
-@pytest.mark.parametrize("wrong", [{"patch": 7}, {"width": 60}, {"height": 4}])
-def test_parameters_that_make_no_sense_are_refused(wrong):
-    with pytest.raises(UsageError, match="seqslam cannot"):
-        SeqSlam(**wrong)

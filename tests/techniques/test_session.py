@@ -1,13 +1,12 @@
 """Networks that work, and one sentence for each that does not: none of them may fly."""
 
-import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from pictures import textured
-from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_card, write_network
+from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.session import open_backbone
@@ -24,11 +23,6 @@ def test_both_outputs_of_a_network_and_their_shapes(models):
     np.testing.assert_allclose(descriptor.run(image), pooled.ravel(), rtol=1e-5)
     assert len(features.sha256) == 64
     assert features.sha256 == descriptor.sha256 != features.card.sha256
-
-
-def test_one_session_serves_all_techniques_of_a_file(models):
-    write_network(models)
-    assert open_backbone("tiny", "features").session is open_backbone("tiny", "descriptor").session
 
 
 def test_a_batch_of_any_size_counts_as_one(models):
@@ -138,29 +132,3 @@ def test_without_onnxruntime_the_others_fly(models):
     assert done.stdout.startswith("onnxruntime cannot be imported (")
     assert done.stdout.endswith("hog, cohog and seqslam fly without it.\n")
     assert done.stdout.count("\n") == 1
-
-
-@pytest.mark.process
-def test_onnxruntime_leaves_nothing_at_home_and_reports_nothing(models, tmp_path):
-    write_network(models)
-    script = "from edgevpr.techniques.session import open_backbone as o; o('tiny', 'features')"
-    home = tmp_path / "home"
-    home.mkdir()
-    variables = {
-        name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", script], env={**variables, "HOME": str(home)}, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert not list(home.rglob("*"))
-
-
-@pytest.mark.process
-def test_a_card_alone_imports_no_onnxruntime(models):
-    write_card(models / "tiny.yaml", {"sha256": "0" * 64})
-    script = "import sys; from edgevpr import techniques as t; t.names(); t.parameters('calc'); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    loaded = done.stdout.split()
-    assert "edgevpr.techniques.network" in loaded
-    assert "onnxruntime" not in loaded

@@ -74,12 +74,6 @@ def test_a_map_of_one_place_or_of_the_same_place_has_finite_scores(form):
         assert ((scores >= 0) & (scores <= 1)).all()
 
 
-def test_sizes_of_a_place_in_ram():
-    assert [Given(form).spec.row.nbytes for form in FORMS] == [262, 139, 24]
-    assert Given("float").spec.packed is None
-    assert {(Given(form).spec.coarse, Given(form).spec.model_sha256) for form in FORMS} == {(Given().spec.coarse, None)}
-
-
 def test_a_form_may_have_its_own_rule():
     assert [Given(form).min_margin for form in FORMS] == [0.1, 0.2, 0.3]
     with pytest.raises(UsageError, match="2bit"):
@@ -119,11 +113,3 @@ def test_scoring_takes_little_beside_the_rows(form, similarity):
     tracemalloc.stop()
     np.testing.assert_array_equal(scores[:16], scores[-16:])
     assert peak < 12e6
-
-
-def test_a_long_binary_vector_is_counted_in_full():
-    technique, coarse, mean, rows = made("1bit", "cosine", places(4, length=142_884))  # that of hog
-    scores, _ = technique.coarse_scores(technique.encode(-coarse[0].astype(np.float32)), rows, mean)
-    assert scores.max() < 0.7
-    same, _ = technique.coarse_scores(technique.encode(coarse[1].astype(np.float32)), rows, mean)
-    assert same[1] == 1

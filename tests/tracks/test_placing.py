@@ -171,16 +171,3 @@ def test_subtitles_place_their_video_and_the_table_is_found_beside_it(capsys, ca
     built = json.loads(run(capsys, *build, "--json").out)
     assert (built["places"], built["without_position"]) == (5, 0)
     assert "video" in refused(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", folder)
-
-
-def test_a_track_places_a_video_by_when_it_was_begun(capsys, film, tmp_path):
-    write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(-5, 15)])
-    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", film, "--json").out)
-    assert found["offset_s"] == -3600, "the camera shows the time of another zone"
-    assert read_track(tmp_path / "DJI_0001.csv").tag_at(2.0).position.lat_deg == pytest.approx(50 + 2e-5)
-
-
-def test_positions_that_are_rounded_to_metres_are_named(capsys, film, tmp_path):
-    lines = [f"{t}\n00:00:0{t},000 --> 00:00:0{t + 1},000\nGPS(8.1234,50.123{t},9) BAROMETER:30\n" for t in range(6)]
-    (tmp_path / "DJI_0001.SRT").write_text("".join(lines))
-    assert "11 m" in run(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", film).out

@@ -7,7 +7,6 @@ import pytest
 from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
 
 from edgevpr.core.errors import UsageError
-from edgevpr.tracks import record
 from edgevpr.tracks.record import read_record
 
 HAS_FILMS, NO_FILMS = find_spec("telemetry_parser") is not None, "telemetry-parser has no wheel for this Python"
@@ -74,12 +73,6 @@ def test_a_log_of_px4_is_told_the_time_by_its_receiver(tmp_path):
         assert tag.position.lon_deg == pytest.approx(8.5)
 
 
-def test_without_the_estimate_of_px4_its_receiver_says_where(tmp_path):
-    write_ulog(tmp_path / "flight.ulg", px4(position=""))
-    track = read_record(tmp_path / "flight.ulg").track
-    assert (track.tags[0].position.lat_deg, track.tags[0].position.alt_m) == pytest.approx((47.1234567, 450))
-
-
 def test_a_gpx_track_goes_by_the_time_and_one_without_times_is_refused(tmp_path):
     path = tmp_path / "walk.gpx"
     write_gpx(path, [(t, 50 + 1e-4 * t, 8) for t in range(4)])
@@ -140,13 +133,6 @@ def test_subtitles_of_each_form_are_read(tmp_path, form):
     assert told == (pytest.approx(turned, abs=1e-6) if turned and turned[1] is not None else turned or (None,) * 3)
 
 
-def test_of_subtitles_that_repeat_a_position_one_a_second_is_kept(tmp_path):
-    lines = [f"{at}\n00:00:0{at // 10},{at % 10}00 --> 00:00:09,000\n[latitude: 50.{at // 15}] [longitude: 8]\n\n"
-             for at in range(40)]  # fmt: skip
-    (tmp_path / "film.srt").write_text("".join(lines))
-    assert read_record(tmp_path / "film.srt").track.t_s == (0.0, 1.0, 1.5, 2.5, 3.0)
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -165,17 +151,6 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
     at = record.named["a.JPG"].position
     assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
     assert "between them" in record.kind
-
-
-def test_the_gimbal_of_a_table_counts_before_the_nose(tmp_path):
-    names = "SourceFile,GPSLatitude,GPSLongitude,RelativeAltitude,FlightYawDegree,GimbalYawDegree,GimbalPitchDegree"
-    rows = "a.jpg,50,8,+30.5,20,100,-80,0\nb.jpg,250,325,+30.5,20,,,\n"
-    (tmp_path / "table.csv").write_text(f"{names},GimbalRollDegree\n{rows}")
-    named = read_record(tmp_path / "table.csv").named
-    tag = named["a.jpg"]
-    assert (tag.heading_deg, tag.pitch_deg, tag.height_m) == pytest.approx((100, 10, 30.5))
-    assert named["b.jpg"].position is None, "an impossible position is none"
-    assert named["b.jpg"].heading_deg == 20
 
 
 @pytest.mark.parametrize(
@@ -203,11 +178,3 @@ def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
         read_record(tmp_path / name)
     with pytest.raises(UsageError, match="no file"):
         read_record(tmp_path / "nothing.bin")
-
-
-@pytest.mark.parametrize("ending", [".gpx", ".ulg", ".mp4"])
-def test_without_its_reader_the_sentence_says_what_to_install(tmp_path, monkeypatch, ending):
-    monkeypatch.setattr(record, "find_spec", lambda name: None)
-    (tmp_path / f"t{ending}").write_bytes(b"")
-    with pytest.raises(UsageError, match="pip install"):
-        read_record(tmp_path / f"t{ending}")

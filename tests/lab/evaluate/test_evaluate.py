@@ -84,7 +84,7 @@ def test_a_broken_image_stops_the_measurement(folder):
         evaluate("hog", dataset, HOG)
 
 
-@pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir"})])
+@pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])
 def test_a_place_takes_as_many_bytes_as_profile_says(folder, name, settings):
     result, costs = evaluate(name, load(folder), settings), probe(create(name, settings))
     assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)

@@ -93,18 +93,6 @@ def test_vpr_tutorial_has_matrices_and_what_is_soft_does_not_count(tmp_path):
         open_folder(tmp_path, RULE)
 
 
-@pytest.mark.parametrize("content", [b"", b"rubbish", {"GThard": np.eye(2)}, {"GThard": [[None]], "GTsoft": [[None]]}])
-def test_matrices_that_are_none_are_said(tmp_path, content):
-    pictures(tmp_path / "day", ["a.jpg", "b.jpg"])
-    pictures(tmp_path / "night", ["x.jpg", "y.jpg"])
-    if isinstance(content, bytes):
-        (tmp_path / "GT.npz").write_bytes(content)
-    else:
-        np.savez(tmp_path / "GT.npz", **content)
-    with pytest.raises(UsageError, match="VPR_Tutorial"):
-        open_folder(tmp_path, RULE)
-
-
 @pytest.mark.parametrize("inside", ["", "images/test"])
 def test_file_names_with_utm(tmp_path, inside):
     pictures(tmp_path / inside / "database", ["@0500000.00@4100000.00@10@S@.jpg", "@0500020@4100000@.jpg"])

@@ -5,8 +5,7 @@ from generated_sets import make_set
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress
-from edgevpr.lab.evaluate.many import measure
-from edgevpr.lab.evaluate.plan import RowPlan, read_plan
+from edgevpr.lab.evaluate.plan import read_plan
 
 
 def plan(tmp_path, text):
@@ -35,11 +34,6 @@ def test_a_plan_names_sets_beside_its_file_and_rows(tmp_path):
     assert found.rows["byte"].exact
 
 
-def test_a_parameter_of_a_row_comes_before_the_camera_of_the_set():
-    row = RowPlan(technique="cohog", parameters={"camera": "forward"})
-    assert row.settings("nadir") == {"camera": "forward"}
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -64,19 +58,3 @@ def test_a_wrong_plan_gets_one_sentence(tmp_path, text, said):
         plan(tmp_path, text)
     assert said in str(wrong.value)
     assert "\n" not in str(wrong.value)
-
-
-@pytest.mark.parametrize(
-    ("row", "said"),
-    [
-        ("technique: cohogg", "There is no technique `cohogg`"),
-        ("technique: hog, parameters: {w: 3}", "no parameter `w`"),
-        ("technique: hog, parameters: {w1: [3]}", "it must be a whole number"),
-        ("technique: hog, form: 4bit", "no form `4bit`"),
-        ("technique: cohog, form: 8bit", "no parameter `form`"),
-    ],
-)
-def test_a_row_that_cannot_be_is_refused_before_the_work(tmp_path, row, said):
-    make_set(tmp_path / "meadow")
-    with pytest.raises(UsageError, match=said):
-        measure(plan(tmp_path, SETS + f"rows: {{a: {{{row}}}}}"), tmp_path / "out", 1, progress)

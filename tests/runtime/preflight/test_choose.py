@@ -13,7 +13,6 @@ from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import StageCost
-from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight import pick
@@ -120,20 +119,6 @@ def test_what_other_programs_take_does_not_count():
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
-@pytest.mark.slow
-def test_the_peak_is_the_most_that_was_resident_not_what_is_left():
-    class Greedy(TinyTechnique):
-        def encode(self, image, mask=None):
-            np.ones(100_000_000, np.uint8).sum()
-            return super().encode(image, mask)
-
-    if not machine.forget_peak():
-        pytest.skip("this kernel does not forget peaks")
-    costs = probe(Greedy(fine=True))
-    assert costs.process_mb > machine.rss_mb() + 50
-    assert probe(TinyTechnique(fine=True)).process_mb < costs.process_mb - 50, "the peak of another is forgotten"
-
-
 def test_the_most_accurate_is_taken_where_it_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
     assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "the order says nothing"
@@ -161,12 +146,6 @@ def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
     why = nothing_to_choose(wanted(board(), COSTS, 100), board())
     assert "regions accepted 1 " in why
     assert "vector accepted 2 " in why
-
-
-def test_a_wrong_place_beside_the_right_one_is_no_objection(accuracies):
-    accuracies["regions"] = {**found(0.9), "accepted_wrong": 1}
-    assert chosen(board(), COSTS, 100) == "regions"
-    assert str(accuracy_of("regions", None)).endswith(" 0 wrong (+1 beside)")
 
 
 def test_what_was_never_measured_is_chosen_only_where_the_board_names_it(accuracies):

@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -14,9 +13,8 @@ from pathlib import Path
 import pytest
 from tiny_networks import CARD, write_card, write_network
 
-from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, ModelError
-from edgevpr.runtime.preflight.networks import add, list_models, verify, verify_here
+from edgevpr.runtime.preflight.networks import add, list_models, verify_here
 from edgevpr.techniques.card import load_card
 
 
@@ -54,22 +52,6 @@ def test_verifying_says_shapes_time_and_memory(models):
     assert found.file_mb == pytest.approx((models / "mine.onnx").stat().st_size / 1e6)
     write_network(models, "backbone", card={"outputs": {"features": "features"}})
     assert verify_here(load_card("backbone")).vector_length is None
-
-
-def test_the_commands_list_and_verify_all_networks(models, capsys, monkeypatch):
-    monkeypatch.setattr("edgevpr.runtime.preflight.networks.verify", verify_here)
-    for room in ("core.files", "techniques.card"):
-        monkeypatch.setattr(f"edgevpr.{room}.model_folders", lambda: (models,))
-    write_network(models, "mine")
-    write_network(models, "wrong", fault="zeros")
-    assert main(["models", "list"]) == 0
-    assert "source             made by a test\n" in capsys.readouterr().out
-    assert main(["models", "verify"]) == 1
-    said = capsys.readouterr().out
-    assert "features           4, 10, 14\n" in said
-    assert "wrong:\n  wrong " in said
-    assert main(["models", "verify", "mine", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["works"][0]["vector_length"] == 16
 
 
 @pytest.fixture
@@ -141,21 +123,6 @@ def test_nothing_of_another_network_is_overwritten(models, download):
         add(download / "mine.onnx", download / "mine.yaml")
 
 
-@pytest.mark.usefixtures("tried_here")
-def test_a_file_or_card_that_is_not_there_is_one_sentence(models, download, capsys):
-    for words, code in ((("none.onnx", "mine.yaml"), 1), (("mine.onnx", "none.yaml"), 2)):
-        file, card = (str(download / word) for word in words)
-        assert main(["models", "add", file, "--card", card]) == code
-        assert "none." in capsys.readouterr().err
-
-
-@pytest.mark.process
-def test_a_network_without_an_end_is_given_up_in_the_process_that_tries_it(models):
-    write_network(models, "endless", fault="endless")
-    with pytest.raises(EdgevprError, match="2 s"):
-        verify(load_card("endless"), limit_s=2)
-
-
 def processes_that_try() -> dict[int, str]:
     found = {}
     for path in Path("/proc").glob("[0-9]*/cmdline"):
@@ -203,13 +170,6 @@ def test_devices_and_pipes_are_no_networks(models, tmp_path):
     os.truncate(tmp_path / "vast.onnx", 2**31 + 1)
     with pytest.raises(ModelError, match=r"2,147\.5 MB"):
         add(tmp_path / "vast.onnx", tmp_path / "download" / "mine.yaml")
-
-
-def test_a_card_that_names_itself_is_not_added(models, download):
-    write_card(download / "same.yaml", {"file": "same.yaml", "sha256": ""})
-    with pytest.raises(ModelError, match=r"same\.yaml"):
-        add(download / "mine.onnx", download / "same.yaml")
-    assert not list(models.iterdir())
 
 
 @pytest.mark.usefixtures("tried_here")

@@ -8,7 +8,6 @@ import pytest
 from edgevpr.core.errors import UsageError
 from edgevpr.power import calibrate
 from edgevpr.power.boards import MachineSpeed, load_board
-from edgevpr.power.calibrate import Meter, MeterError
 from edgevpr.runtime.preflight import own_board
 from edgevpr.runtime.preflight.own_board import scaled_from, write_profile
 
@@ -55,22 +54,6 @@ def test_the_watts_of_a_meter_are_fitted_and_written_into_a_profile_that_names_i
     assert board.benchmark_score == SCORE
     assert said.startswith("Power: 2 W idle, 6.5 W ")
     assert "load 100%" in capsys.readouterr().err
-
-
-def test_without_a_meter_the_power_is_that_of_a_shipped_profile_and_it_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(calibrate, "find_meters", tuple)
-    assert write_profile(tmp_path / "mine.yaml") == calibrate.NO_METER
-    assert load_board(str(tmp_path / "mine.yaml")).benchmark_score == SCORE
-
-
-def test_a_meter_that_says_nonsense_leaves_no_file(monkeypatch, tmp_path):
-    for name in ("in1_input", "curr1_input"):
-        (tmp_path / name).write_text("nan")
-    monkeypatch.setattr(calibrate, "find_meters", lambda: (Meter(tmp_path, 1, "VDD_IN"),))
-    monkeypatch.setattr(calibrate.time, "sleep", lambda seconds: None)
-    with pytest.raises(MeterError, match="nan W"):
-        write_profile(tmp_path / "mine.yaml")
-    assert not (tmp_path / "mine.yaml").exists()
 
 
 def test_a_file_is_never_overwritten(tmp_path):

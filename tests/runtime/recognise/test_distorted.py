@@ -88,8 +88,7 @@ def off_m(map_path, camera, ground, **source):
     return found
 
 
-@pytest.mark.parametrize("of", CAMERAS)
-@pytest.mark.parametrize("by", CAMERAS)
+@pytest.mark.parametrize(("of", "by"), [("straight", "wide"), ("wide", "fisheye"), ("fisheye", "straight")])
 def test_every_camera_finds_its_position_in_every_cameras_map(maps, lenses, ground, of, by):
     assert max(off_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
 

@@ -215,46 +215,6 @@ def test_what_is_no_virtual_environment_is_left_alone(system, packages):
     assert (system / "opt/edgevpr/mine").exists()
 
 
-def test_without_the_venv_module_the_package_is_named(system, packages, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ensurepip", None)
-    with pytest.raises(EdgevprError, match="python3-venv"):
-        lines_of(system)
-    assert (system / "var/lib/edgevpr").is_dir(), "what is done stays"
-
-
-def test_a_package_that_cannot_be_had_is_named(system, packages, monkeypatch, tmp_path):
-    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
-    with pytest.raises(EdgevprError, match=r"^python: .*tiny[.-]one==1\.0"):
-        lines_of(system)
-    assert not (system / "opt/edgevpr/unfinished").exists(), "pip has tidied up"
-
-
-def test_a_program_of_the_system_that_fails_or_is_missing_is_one_sentence(installed):
-    (installed / "no-udev").touch()
-    (installed / "run/systemd/system").rename(installed / "run/off")
-    with pytest.raises(EdgevprError, match=r"^systemd"):
-        lines_of(installed)
-    (installed / "run/off").rename(installed / "run/systemd/system")
-    with pytest.raises(EdgevprError, match=r"^udevadm: no udev; "):
-        lines_of(installed)
-    (installed / "no-udev").unlink()
-
-
-def test_a_file_that_cannot_be_written_is_one_sentence(system, packages):
-    """A limit of the size of files stands for a full disk."""
-    script = (
-        "import resource, sys; from pathlib import Path\n"
-        "from edgevpr.core.errors import EdgevprError; from edgevpr.runtime.service.install import install\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))\n"
-        f"try: install(None, False, lambda _: None, Path({str(system)!r}))\n"
-        "except EdgevprError as error: sys.exit(str(error))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("configuration in /etc/edgevpr/config.yaml: File too large; ")
-    assert list((system / "etc/edgevpr").iterdir()) == []
-
-
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_only_root_may_change_the_system():
     script = (
@@ -265,15 +225,3 @@ def test_only_root_may_change_the_system():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert [line.split()[:2] for line in done.stdout.splitlines()] == 2 * [["Only", "root"]]
-
-
-def test_the_program_that_was_installed_installs_itself_elsewhere_without_a_network(installed, system, packages):
-    """From the wheel's layout, where the shipped folders lie inside, as from a checkout."""
-    script = (
-        "from pathlib import Path; from edgevpr.runtime.service import program\n"
-        f"venv = Path({str(system)!r}) / program.VENV\n"
-        "program.make_environment(venv); program.copy_edgevpr(venv)\n"
-    )
-    (python,) = installed.glob("opt/edgevpr/bin/python")
-    subprocess.run([python, "-I", "-c", script], cwd="/", check=True)
-    assert version_of(system) == f"edgevpr {__version__}\n"

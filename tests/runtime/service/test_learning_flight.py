@@ -93,18 +93,6 @@ def test_kill_9_costs_no_place_that_the_log_calls_learnt_and_the_next_flight_goe
         assert sorted(place.source_image for place in whole.places()) == [f"{n:02d}.png" for n in range(PLACES)]
 
 
-def test_a_small_budget_bounds_the_memory_while_the_file_keeps_all(recording, tmp_path):
-    flags = (*QUICK, "--budget-mb", "1")  # 286 KB a place: three of them
-    (tmp_path / "m.gpkg.new").write_bytes(b"what was left when the power went while a map was made")
-    lines, _ = flown(tmp_path / "m.gpkg", recording / "seen" / "images", tmp_path / "f.jsonl", *flags)
-    assert not (tmp_path / "m.gpkg.new").exists()
-    assert lines[-1]["learnt"]["places"] == PLACES
-    with PlaceMap.open(tmp_path / "m.gpkg") as place_map:
-        assert len(place_map) == PLACES
-    told_mb = [line["costs"]["rss_mb"] for line in of_kind(lines, "query")]
-    assert max(told_mb) < told_mb[9] + 3, "twenty places more would be 5.7 MB"
-
-
 def test_after_a_fix_that_may_be_taken_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
     """The autopilot says to be where no place is; the frames show places of the map."""
     pictures = [cv2.imread(str(path)) for path in sorted((recording / "seen" / "images").iterdir())]

@@ -70,12 +70,6 @@ def test_the_whole_process_takes_60_mb_of_its_own_and_140_with_the_libraries(fli
     assert largest["VmHWM"] < 140
 
 
-def test_the_log_tells_the_memory_that_the_kernel_counts(flight):
-    lines, largest, _ = flight
-    told_mb = max(line["costs"]["rss_mb"] for line in lines if line["kind"] == "query")
-    assert 0.7 * largest["VmHWM"] < told_mb <= largest["VmHWM"] + 1
-
-
 def test_memory_does_not_grow_from_query_to_query(flight):
     told_mb = [line["costs"]["rss_mb"] for line in flight[0] if line["kind"] == "query"]
     assert max(told_mb[WARM_AFTER:]) < told_mb[WARM_AFTER - 1] + 4
@@ -101,13 +95,3 @@ def test_the_index_stays_within_its_budget_and_loading_takes_little_beside_it(bi
     assert len(index) == share * PLACES
     assert index.nbytes <= budget_bytes
     assert peak_bytes < budget_bytes + beside_bytes
-
-
-def test_a_flight_with_a_map_beyond_the_budget_says_so_and_uses_what_fits(tmp_path):
-    make_big_map(tmp_path / "m.gpkg", create("hog").spec, 4)  # 286 KB a place
-    write_frames(tmp_path / "frames", 1)
-    process = start(tmp_path / "m.gpkg", tmp_path / "frames", tmp_path / "flight.jsonl", "--budget-mb", "1")
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 0, said
-    assert "the budget is 1 MB" in said
-    assert "0.9 of 1.0 MB" in said

@@ -114,19 +114,3 @@ def terminal(*command):
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     finally:
         os.close(descriptor)
-
-
-def test_on_a_terminal_it_draws_over_what_it_drew_and_within_its_size(fly, tmp_path):
-    with terminal("top", "--file", str(tmp_path / "status.json")) as wait_for_words:
-        wait_for_words("No flight tells")
-        run = fly()
-        seen = wait_for_words("charge", times=3)
-        run.terminate()
-        run.communicate(timeout=PATIENCE_S)
-        wait_for_words("No flight tells", times=seen.count("No flight tells") + 1)
-    blocks = re.split(r"\x1b\[H\x1b\[J", seen)
-    assert len(blocks) > 3
-    assert "\x1b" not in "".join(blocks)
-    for block in blocks:
-        assert len(block.splitlines()) <= 11
-        assert all(len(line) < 60 for line in block.splitlines())
