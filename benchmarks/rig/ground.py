@@ -96,7 +96,7 @@ def place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Pat
             (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
             where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
             table.writerow((name, *where, f"{pose.heading_deg % 360:.2f}"))
-    unfinished = work / "unfinished.gpkg"
+    unfinished = work / f"unfinished-{os.getpid()}.gpkg"
     unfinished.unlink(missing_ok=True)
     pictures = ("--images", folder / "images", "--positions", folder / "positions.csv", "--camera", "nadir")
     command = ("map", "build", *pictures, "--fov-deg", FOV_DEG, "--technique", "cohog", unfinished)

@@ -15,7 +15,7 @@ COLUMNS = ("t_s", "east_m", "north_m", "est_east_m", "est_north_m", "error_m", "
 
 class Recorder:
     """Writes a line for every GLOBAL_POSITION_INT while it `is_on`, and keeps the texts: time, component, text.
-    `has_warned`: edgevpr has sent a text that a ground station shows as a warning."""
+    `warnings` are those of edgevpr that a ground station shows as such."""
 
     def __init__(self, truth: Truth, path: Path) -> None:
         self._truth, self._lock = truth, threading.Lock()
@@ -24,7 +24,7 @@ class Recorder:
         self.is_on = False
         self._mode = 0
         self.texts: list[tuple[float, int, str]] = []
-        self.has_warned = False
+        self.warnings: list[str] = []
 
     def close(self) -> None:
         with self._lock:
@@ -36,7 +36,8 @@ class Recorder:
         name, sender = message.get_type(), message.get_srcComponent()
         if name == "STATUSTEXT":
             self.texts.append((now_s, sender, message.text))
-            self.has_warned |= sender == EDGEVPR and message.severity <= mavlink.MAV_SEVERITY_WARNING
+            if sender == EDGEVPR and message.severity <= mavlink.MAV_SEVERITY_WARNING:
+                self.warnings.append(message.text.removeprefix("edgevpr: "))
         elif name == "HEARTBEAT" and sender == 1:
             self._mode = message.custom_mode
         elif name == "GLOBAL_POSITION_INT" and sender == 1 and (true := self._truth.at(now_s)):

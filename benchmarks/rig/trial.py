@@ -41,6 +41,7 @@ class Trial(Run):
         with ExitStack() as stack:
             try:
                 self._equip(stack)
+                self._recorder.is_on = True
                 self._start_edgevpr()
                 for action, values in self._event.before:
                     self._act(action, values)
@@ -58,7 +59,7 @@ class Trial(Run):
             "marks_s": self._marks_s,
             "path_m": getattr(self, "_path_m", None),
             "texts": self._recorder.texts,
-            "has_warned": self._recorder.has_warned,
+            "warnings": self._recorder.warnings,
         }
         (self._folder / "run.json").write_text(json.dumps(run))
         shutil.rmtree(self._folder / "simulator", ignore_errors=True)  # the autopilot's own logs are large
@@ -90,7 +91,6 @@ class Trial(Run):
         is_plane = self._scenario.vehicle == "plane"
         while is_plane and time.monotonic() < give_up_s and abs(self._from_centre_m() - RADIUS_M) > 40.0:
             time.sleep(_STEP_S)
-        self._recorder.is_on = True
         time.sleep(_SETTLED_S)
         if is_plane:
             radius_m = self._from_centre_m()

@@ -39,30 +39,31 @@ _COLUMNS = {
 def figures_of(folder: Path, flight: Flight) -> Row:
     """Return the figures of a flight, from its folder: of the watched time, the largest distances; and the texts."""
     run, event = json.loads((folder / "run.json").read_text()), EVENTS[flight.event]
-    edgevprs = [text.removeprefix("edgevpr: ") for _, sender, text in run["texts"] if sender == EDGEVPR]
-    row: Row = {"commit": run["commit"], "cannot": run["cannot"], "has_warned": run["has_warned"], "texts": edgevprs}
-    started_s, began_s = (run["marks_s"].get(name, math.inf) for name in ("started", "event"))
-    if (folder / "sent.csv").exists():
+    marks_s, track = run["marks_s"], read_table(folder / "track.csv")
+    texts = [text.removeprefix("edgevpr: ") for _, sender, text in run["texts"] if sender == EDGEVPR]
+    row: Row = {"commit": run["commit"], "cannot": run["cannot"], "warnings": run["warnings"], "texts": texts}
+    if run["cannot"]:  # all counts from when on the autopilot had found its place
+        found_s = track["t_s"][(track["error_m"] < _ON_GPS_M) & (track["t_s"] >= marks_s.get("started", math.inf))]
+        began_s = float(found_s[0]) if len(found_s) else math.inf
+        row["error_m"] = float(track["error_m"][track["t_s"] >= began_s].max(initial=0.0))
+    else:
+        began_s = marks_s["event"]
+        track = track[(track["t_s"] >= began_s) & (track["t_s"] <= began_s + WATCHED_S)]
+        after_s, error_m, height_m = track["t_s"] - began_s, track["error_m"], track["height_m"]
+        row["strayed_m"] = float(distances(np.stack((track["east_m"], track["north_m"]), 1), run["path_m"]).max())
+        row["sank_m"] = float(height_m[0] - height_m.min())
+        row["error_m"] = float(error_m.max())
+        if event.gps_back_s is not None:
+            row["on_gps_s"] = seconds_until_near(after_s - event.gps_back_s, error_m)
+    if flight.has_edgevpr:
         sent_s = read_table(folder / "sent.csv")["t_s"]
-        after_s = sent_s[sent_s >= began_s] - began_s
-        row["sent"] = int((after_s <= WATCHED_S).sum())
+        row["sent"] = int(((sent_s >= began_s) & (run["cannot"] or sent_s <= began_s + WATCHED_S)).sum())
         if event.before:
-            due_s = started_s if SET_UPS[flight.set_up].sends_beside_gps else began_s
-            first_s = sent_s[sent_s >= due_s] - due_s
-            row["first_s"] = round(float(first_s[0]), 1) if len(first_s) else None
+            due_s = marks_s.get("started", math.inf) if SET_UPS[flight.set_up].sends_beside_gps else began_s
+            row["first_s"] = next((round(float(each - due_s), 1) for each in sent_s if each >= due_s), None)
         if event.silent_s is not None:
-            row["sent_though_silent"] = int((after_s >= event.silent_s).sum())
+            row["sent_though_silent"] = int((sent_s >= began_s + event.silent_s).sum())
         row["accepted"] = _accepted(folder / "flight.jsonl")
-    if run["cannot"]:
-        return row
-    track = read_table(folder / "track.csv")
-    track = track[(track["t_s"] >= began_s) & (track["t_s"] <= began_s + WATCHED_S)]
-    after_s, error_m, height_m = track["t_s"] - began_s, track["error_m"], track["height_m"]
-    row["strayed_m"] = float(distances(np.stack((track["east_m"], track["north_m"]), 1), run["path_m"]).max())
-    row["sank_m"] = float(height_m[0] - height_m.min())
-    row["error_m"] = float(error_m.max())
-    if event.gps_back_s is not None:
-        row["on_gps_s"] = seconds_until_near(after_s - event.gps_back_s, error_m)
     return row
 
 
@@ -95,10 +96,10 @@ def faults(flown: Row, control: Row) -> list[str]:
     """Return what is wrong with a flight, by the figures and those of its control."""
     if control["cannot"]:
         return [f"no control: {control['cannot']}"]
-    if flown["cannot"]:
-        return [] if is_refused(flown) else [f"without a warning: {flown['cannot']}"]
-    found = []
-    if not is_refused(flown):
+    found = [flown["cannot"]] if flown["cannot"] and not is_refused(flown) else []
+    if flown["cannot"] and flown["error_m"] > control["error_m"] + WORSE_M:
+        found.append(_DISTANCES["error_m"].format(flown["error_m"]))
+    if not flown["cannot"] and not is_refused(flown):
         worse = [key for key in _DISTANCES if flown[key] > control[key] + WORSE_M]
         found += [_DISTANCES[key].format(flown[key]) for key in worse]
         back_s, control_s = flown.get("on_gps_s", 0.0), control.get("on_gps_s", 0.0)
@@ -113,8 +114,8 @@ def faults(flown: Row, control: Row) -> list[str]:
 
 
 def is_refused(flown: Row) -> bool:
-    """Tell whether edgevpr sent nothing in the watched time, and warned of something."""
-    return flown["has_warned"] and not flown.get("sent")
+    """Tell whether edgevpr sent nothing in the watched time, and warned of something else than a busy computer."""
+    return not flown.get("sent") and any(not text.startswith("held to ") for text in flown["warnings"])
 
 
 def judged(rows: Mapping[str, Row]) -> list[Row]:

@@ -12,7 +12,7 @@ import verdicts
 from cells import CELLS, EVENTS, MATCHES, SET_UPS, Flight
 from trial import Trial
 
-ALONE = {"cannot": None, "has_warned": False, "strayed_m": 0.1, "sank_m": 0.2, "error_m": 0.5, "on_gps_s": 1.0}
+ALONE = {"cannot": None, "warnings": [], "strayed_m": 0.1, "sank_m": 0.2, "error_m": 0.5, "on_gps_s": 1.0}
 FLOWN = ALONE | {"commit": "abc", "sent": 1200, "accepted": "0 of 60", "texts": ["map left"]}
 
 
@@ -49,9 +49,10 @@ def test_controls_are_shared():
         ({"on_gps_s": None}, "not on GPS again"),
         ({"first_s": None}, "no position in time"),
         ({"sent_though_silent": 280}, "280 positions though paused"),
-        ({"sent": 0, "has_warned": True, "error_m": 9.0}, "refused"),
-        ({"cannot": "never ready", "has_warned": True, "sent": 0}, "refused"),
-        ({"cannot": "never ready"}, "without a warning: never ready"),
+        ({"sent": 0, "warnings": ["GPS_PRIMARY=1: not sent"], "error_m": 9.0}, "refused"),
+        ({"cannot": "never ready", "warnings": ["GPS_PRIMARY=1: not sent"], "sent": 0}, "refused"),
+        ({"cannot": "never ready", "error_m": 40.0}, "never ready; estimate 40 m off"),
+        ({"cannot": "never ready", "warnings": ["held to 10 of 30 candidates"], "sent": 0}, "never ready"),
     ],
 )
 def test_judged_by_the_control(changed, verdict):
@@ -80,7 +81,7 @@ def test_figures_of_a_flight(tmp_path):
         "".join(f'{{"kind": "query", "accepted": {each}}}\n' for each in ("true", "false"))
     )
     texts = [[1003.0, 1, "EKF Failsafe"], [1004.0, 197, "edgevpr: map left"]]
-    run = {"commit": "abc", "cannot": None, "has_warned": True, "texts": texts, "marks_s": {"event": 1000.0}}
+    run = {"commit": "abc", "cannot": None, "warnings": [], "texts": texts, "marks_s": {"event": 1000.0}}
     (tmp_path / "run.json").write_text(json.dumps(run | {"path_m": [(600, 450), (600, 450)]}))
 
     found = verdicts.figures_of(tmp_path, Flight("gps_input", "gps_back", "right"))
