@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space bench-fleet service-faults soak test-arm64 sites sweeps peers clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space bench-fleet service-faults soak test-arm64 sites sweeps clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -57,12 +57,6 @@ sites: $(VENV)/installed
 # How far an aircraft may be off its map, one change at a time, into benchmarks/results/. It goes on in sweeps_work/.
 sweeps: $(VENV)/installed
 	$(BIN)/python benchmarks/sweeps.py
-
-# `cohog` beside other ways, into benchmarks/results/: forty minutes. What cannot be installed is left out.
-peers: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check faiss-cpu || echo "faiss-cpu: left out"
-	$(BIN)/python benchmarks/peers/peers.py
 
 # Speed and memory against the published way, into benchmarks/results/.
 bench: $(VENV)/installed

@@ -20,7 +20,6 @@ PAGES = {
     "from_orthophoto": "from_orthophoto",
     "height_and_tilt": "height_and_tilt",
     "hostile": "hostile",
-    "peers": "peers",
     "salience": "bench_salience",
     "sites": "sites",
     "soak": "soak",
@@ -37,11 +36,6 @@ def loaded(name: str):
         if error.name in ("torch", "skimage"):
             pytest.skip(f"{error.name} is not installed")
         raise
-
-
-@pytest.fixture(autouse=True)
-def peers_on_the_path(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS / "peers"))
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))

@@ -164,11 +164,10 @@ def test_a_configuration_of_ones_own_is_taken_and_the_one_before_kept(installed,
     own = tmp_path / "own.yaml"
     own.write_text("board: rpi-5\n")
     lines_of(installed, own)
-    for _ in range(2):  # what is there stays when none is named
-        assert (installed / "etc/edgevpr/config.yaml").read_bytes() == own.read_bytes()
-        assert (installed / "etc/edgevpr/config.yaml.old").read_bytes() == first
-        assert (installed / "etc/systemd/system/edgevpr.service").read_text() == render_unit(load_board("rpi-5"))
-        lines_of(installed)
+    lines_of(installed)  # what is there stays when none is named
+    assert (installed / "etc/edgevpr/config.yaml").read_bytes() == own.read_bytes()
+    assert (installed / "etc/edgevpr/config.yaml.old").read_bytes() == first
+    assert (installed / "etc/systemd/system/edgevpr.service").read_text() == render_unit(load_board("rpi-5"))
 
 
 @pytest.mark.parametrize("case", ["configuration", "32 bits", "running"])
@@ -183,26 +182,6 @@ def test_what_forbids_it_stops_it_before_anything_is_done(system, tmp_path, monk
     with pytest.raises(EdgevprError, match={"configuration": "mapp", "32 bits": "64"}.get(case, "systemctl stop")):
         lines_of(system, own)
     assert tree(system) == before
-
-
-def test_uninstalling_leaves_maps_logs_and_configuration(installed):
-    kept = [installed / name for name in ("var/lib/edgevpr/v.gpkg", "var/log/edgevpr/f.jsonl")]
-    for path in kept:
-        path.write_text("mine")
-    before, said = tree(installed), []
-    uninstall(True, said.append, installed)
-    assert tree(installed) == before
-    for _ in range(2):
-        really: list[str] = []
-        uninstall(False, really.append, installed)
-        assert really == said
-    assert (installed / "disabled").read_text() == "disable --now edgevpr\n"
-    assert not (installed / "opt/edgevpr").exists()
-    assert not (installed / "etc/systemd/system/edgevpr.service").exists()
-    assert not (installed / "etc/udev/rules.d/99-edgevpr.rules").exists()
-    assert all(path.read_text() == "mine" for path in kept)
-    assert (installed / "etc/edgevpr/config.yaml").is_file()
-    lines_of(installed)
 
 
 def test_what_is_no_virtual_environment_is_left_alone(system, packages):
@@ -225,3 +204,23 @@ def test_only_root_may_change_the_system():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert [line.split()[:2] for line in done.stdout.splitlines()] == 2 * [["Only", "root"]]
+
+
+def test_uninstalling_leaves_maps_logs_and_configuration(installed):
+    """The last test: what it leaves is not installed again."""
+    kept = [installed / name for name in ("var/lib/edgevpr/v.gpkg", "var/log/edgevpr/f.jsonl")]
+    for path in kept:
+        path.write_text("mine")
+    before, said = tree(installed), []
+    uninstall(True, said.append, installed)
+    assert tree(installed) == before
+    for _ in range(2):
+        really: list[str] = []
+        uninstall(False, really.append, installed)
+        assert really == said
+    assert (installed / "disabled").read_text() == "disable --now edgevpr\n"
+    assert not (installed / "opt/edgevpr").exists()
+    assert not (installed / "etc/systemd/system/edgevpr.service").exists()
+    assert not (installed / "etc/udev/rules.d/99-edgevpr.rules").exists()
+    assert all(path.read_text() == "mine" for path in kept)
+    assert (installed / "etc/edgevpr/config.yaml").is_file()
