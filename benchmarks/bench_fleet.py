@@ -2,11 +2,11 @@
 
 `edgevpr fleet build` maps two grounds by the workers of Dask on this computer, each a process of one thread: tiles of
 the raster `before` of sat_marash, with places 62 or 31 m apart, and photographs of `fleet_pictures.py`, 1,000 and
-10,000 (--large: 100,000, by two workers; it takes an hour). They are not calibrated, and not refined. The serial part and the
-shared one are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in a small
-job the serial part is mostly the wait for the last tile; an efficiency above 1 is noise of the machine. The projection
-holds for a job of this size, and assumes that nothing else grows with the workers: that the store gives each of them
-its pictures as fast as a local disk gives them to one.
+10,000 (--large: 100,000, by two workers; it takes an hour). They are not calibrated, and not refined. The serial part
+and the shared one are those for which T(w) = serial + shared / w gives the times measured with one and two workers: in
+a small job the serial part is mostly the wait for the last tile; an efficiency above 1 is noise of the machine. The
+projection holds for a job of this size, and assumes that nothing else grows with the workers: that the store gives each
+of them its pictures as fast as a local disk gives them to one.
 Read and written is what the workers asked Linux for, page cache and logs included. RAM is the peak of the largest
 worker.
 """

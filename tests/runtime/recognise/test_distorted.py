@@ -93,9 +93,8 @@ def test_every_camera_finds_its_position_in_every_cameras_map(maps, lenses, grou
     assert max(off_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
 
 
-@pytest.mark.parametrize("by", ["wide", "fisheye"])
-def test_without_its_calibration_positions_would_be_off(maps, ground, by):
-    found = off_m(maps["straight"], CAMERAS[by], ground, fov_deg=SEEN_DEG[by])
+def test_without_its_calibration_positions_would_be_off(maps, ground):
+    found = off_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
     assert max(each or math.inf for each in found) > 5.0
 
 
