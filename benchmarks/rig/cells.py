@@ -119,11 +119,18 @@ class Cell:
 
 MATCHES = {"right": {}, "none": {"is_blind": True}, "displaced": {"map_east_m": 8.0}, "wrong": {"map_east_m": 300.0}}
 
+_WANDER = 0.3  # of the noise of PX4's receiver: at 1 a hover strays by 3 m, as much as a cell may be worse
 _FLOWN_WITH = {
     "copter": {"WPNAV_SPEED_UP": 500, "WPNAV_SPEED": 700, "GPS1_TYPE": 5, "SIM_GPS1_TYPE": 5},  # NMEA: a plain 3D fix
     "plane": {"TKOFF_ALT": 60, "WP_LOITER_RAD": RADIUS_M},
-    "px4_copter": {"MPC_TKO_SPEED": 5.0, "MPC_Z_V_AUTO_UP": 5.0, "MPC_Z_VEL_MAX_UP": 5.0, "MPC_XY_CRUISE": 7.0},
-    "px4_plane": {},
+    "px4_copter": {
+        "MPC_TKO_SPEED": 5.0,
+        "MPC_Z_V_AUTO_UP": 5.0,
+        "MPC_Z_VEL_MAX_UP": 5.0,
+        "MPC_XY_CRUISE": 7.0,
+        "SIM_GPS_WANDER": _WANDER,
+    },
+    "px4_plane": {"SIM_GPS_WANDER": _WANDER},
 }
 _GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
 _ODOMETRY = {

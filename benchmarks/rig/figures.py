@@ -32,9 +32,9 @@ def spread(values: np.ndarray) -> Row:
 
 def read_table(path: Path) -> np.ndarray:
     """Return a file of comma-separated values, its columns by name; all are numbers but `kind`."""
-    names = path.read_text("utf-8").partition("\n")[0].split(",")
-    columns = [(name, "U32" if name == "kind" else float) for name in names]
-    return np.atleast_1d(np.genfromtxt(path, columns, delimiter=",", skip_header=1, encoding="utf-8"))
+    names, *lines = path.read_text("utf-8").splitlines()
+    columns = [(name, "U32" if name == "kind" else float) for name in names.split(",")]
+    return np.atleast_1d(np.genfromtxt(lines, columns, delimiter=",")) if lines else np.empty(0, columns)
 
 
 def figures_of(folder: Path) -> Row:

@@ -20,6 +20,7 @@ from simulator import at_degrees
 from edgevpr.mavlink.wire import mavlink
 
 _STEP_S, _SETTLED_S, _OFF_S = 0.1, 10.0, 6.0
+_ASKED_S = 10.0  # after which edgevpr has asked for all parameters
 _SAVED_S = 3.0  # after which a parameter that was set outlives a loss of power
 _CIRCLE_S = 40.0  # until a plane is on its circle, at the most
 _POINTS = 72  # of a circle
@@ -135,6 +136,12 @@ class Trial(Run):
         command = mavlink.MAV_CMD_DO_REPOSITION
         self._simulator.link.send(mavlink.MAVLink_command_int_message(1, 1, frame, command, *values, up_m))
 
+    def _await_edgevpr(self) -> None:
+        """Wait until edgevpr has begun, and has had the time to ask for parameters."""
+        if not self._is_control and not self._simulator.link.wait_for(f"HEARTBEAT of {EDGEVPR}", lambda _: True, 60):
+            raise RuntimeError("edgevpr does not begin")
+        time.sleep(_ASKED_S)
+
     def _act(self, action: str, values: tuple[float, ...]) -> None:
         self._marks_s.setdefault(action, time.monotonic())
         if action not in _OF_EDGEVPR or not self._is_control:
@@ -178,6 +185,7 @@ class Trial(Run):
 
     def reboot(self) -> None:
         """Take the autopilot's power away and give it back; it keeps its parameters."""
+        self._await_edgevpr()
         self._simulator.kill()
         time.sleep(_OFF_S)
         self._simulator.start(wipe=False)
@@ -186,6 +194,7 @@ class Trial(Run):
 
     def adopt(self) -> None:
         """Give the autopilot the parameters of the set-up, as edgevpr's doctor advises."""
+        self._await_edgevpr()
         for name, value in SET_UPS[self._flight.set_up].parameters.items():
             self._simulator.link.set_parameter(name, value)
         time.sleep(_SAVED_S)

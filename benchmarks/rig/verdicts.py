@@ -57,19 +57,19 @@ def figures_of(folder: Path, flight: Flight) -> Row:
             row["on_gps_s"] = seconds_until_near(after_s - event.gps_back_s, error_m)
     if flight.has_edgevpr:
         sent_s = read_table(folder / "sent.csv")["t_s"]
-        row["sent"] = int(((sent_s >= began_s) & (run["cannot"] or sent_s <= began_s + WATCHED_S)).sum())
+        row["sent"] = int(((sent_s >= began_s) & (bool(run["cannot"]) | (sent_s <= began_s + WATCHED_S))).sum())
         if event.before:
             due_s = marks_s.get("started", math.inf) if SET_UPS[flight.set_up].sends_beside_gps else began_s
             row["first_s"] = next((round(float(each - due_s), 1) for each in sent_s if each >= due_s), None)
         if event.silent_s is not None:
             row["sent_though_silent"] = int((sent_s >= began_s + event.silent_s).sum())
-        row["accepted"] = _accepted(folder / "flight.jsonl")
+        row["accepted"] = _accepted(folder)
     return row
 
 
-def _accepted(log: Path) -> str:
-    """Return how many queries were accepted, of how many."""
-    queries = [line for line in read_log(log) if line["kind"] == "query"] if log.exists() else []
+def _accepted(folder: Path) -> str:
+    """Return how many queries were accepted, of how many: a restart begins another log."""
+    queries = [line for log in folder.glob("flight*.jsonl") for line in read_log(log) if line["kind"] == "query"]
     return f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
 
 
