@@ -9,12 +9,15 @@ edgevpr are flown once. Cells that are named are flown anew.
 """
 
 import argparse
+import fcntl
 import json
-import queue
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -29,7 +32,7 @@ from trial import Trial
 from verdicts import figures_of, judged, page
 
 KEPT = WORK / "never_worse"
-_FIRST_INSTANCE = 1  # of a simulator: the first ports are left to other programs
+_FIRST_INSTANCE = 1  # of a simulator: the first ports are left to rig.py
 
 
 def main() -> None:
@@ -40,10 +43,10 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the names of the cells")
     parser.add_argument("--report", action="store_true", help="write the page of what is kept")
     parser.add_argument("--workers", type=int, default=2, help="flights side by side (2)")
-    parser.add_argument("--flight", nargs=4, help=argparse.SUPPRESS)  # set-up, event, matches, instance
+    parser.add_argument("--flight", nargs=3, help=argparse.SUPPRESS)  # set-up, event, matches
     arguments = parser.parse_args()
     if arguments.flight:
-        fly(Flight(*arguments.flight[:3]), int(arguments.flight[3]))
+        fly(Flight(*arguments.flight))
         return
     if arguments.list:
         print("\n".join(CELLS))
@@ -91,28 +94,35 @@ def fly_all(names: list[str], anew: set[str], workers: int) -> None:
     due = [each for name, each in flights.items() if name in anew or not row_path(each).exists()]
     for height in {each.scenario().mapped_m for each in due}:  # made once, not by two flights at once
         ground.place_map(WORK, 100.0, height)
-    instances: queue.SimpleQueue[int] = queue.SimpleQueue()
-    for number in range(workers):
-        instances.put(_FIRST_INSTANCE + number)
 
     def fly_one(flight: Flight) -> None:
-        instance = instances.get()
-        words = (flight.set_up, flight.event, flight.matches, str(instance))
-        try:
-            subprocess.run([sys.executable, __file__, "--flight", *words], check=False)
-        finally:
-            instances.put(instance)
+        words = (flight.set_up, flight.event, flight.matches)
+        subprocess.run([sys.executable, __file__, "--flight", *words], check=False)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(fly_one, due))
 
 
-def fly(flight: Flight, instance: int) -> None:
+@contextmanager
+def free_instance() -> Iterator[int]:
+    """Take a number of a simulator that no other sweep on this machine has; it is free again after the block."""
+    KEPT.mkdir(parents=True, exist_ok=True)
+    for number in count(_FIRST_INSTANCE):
+        with open(KEPT / f"instance-{number}.lock", "w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield number
+            return
+
+
+def fly(flight: Flight) -> None:
     """Make one flight, and keep its figures."""
     path = row_path(flight)
-    folder = Trial(WORK, KEPT / "flights" / flight.name, flight, instance).fly()
+    with free_instance() as instance:
+        folder = Trial(WORK, path.with_suffix(""), flight, instance).fly()
     row = figures_of(folder, flight)
-    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(base.rounded(row)))
     unfinished.replace(path)
