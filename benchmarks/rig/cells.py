@@ -85,6 +85,8 @@ class Flight:
     def scenario(self) -> Scenario:
         """Return what the rig needs to know of it."""
         set_up, event = SET_UPS[self.set_up], EVENTS[self.event]
+        # A map that is off claims the usual accuracy, not that of the rig, whose places are known to a metre.
+        accuracy = {"min_accuracy_m": 5.0} if self.matches in ("displaced", "wrong") else {}
         homes_m = {"plane": HOME_M, "copter": LEG_M[0] if event.leaves_map else HOVER_M}
         return Scenario(
             vehicle=set_up.vehicle,
@@ -93,7 +95,7 @@ class Flight:
             home_m=homes_m[set_up.vehicle],
             parameters={**_FLOWN_WITH[set_up.alone], **set_up.common},
             with_edgevpr={} if event.parameters_come_late else set_up.parameters,
-            config={**set_up.config, **({} if self.matches not in _OFF_THE_MAP else _WITH_USUAL_ACCURACY)},
+            config={**set_up.config, "mavlink": {**set_up.config.get("mavlink", {}), **accuracy}},
             mapped_m=MAP_END_M if event.leaves_map else None,
             beyond_scale=event.beyond_scale,
             **MATCHES.get(self.matches, {}),
@@ -117,9 +119,6 @@ class Cell:
         return Flight(SET_UPS[self.flight.set_up].alone, flown)
 
 
-# A map that is off is claimed as good as any other, and not as the rig's own, whose places are known to a metre.
-_OFF_THE_MAP = ("displaced", "wrong")
-_WITH_USUAL_ACCURACY = {"mavlink": {"min_accuracy_m": 5.0}}
 MATCHES = {"right": {}, "none": {"is_blind": True}, "displaced": {"map_east_m": 8.0}, "wrong": {"map_east_m": 300.0}}
 
 _WANDER = 0.3  # of the noise of PX4's receiver: at 1 a hover strays by 3 m, as much as a cell may be worse
