@@ -299,5 +299,5 @@ def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tm
 
 def test_a_gps_that_is_led_away_is_found_after_a_mount_was(tmp_path):
     flown = Flown(tmp_path, led(lambda t_s: max(0.0, t_s - 1500), events(eight, 1800, scale=0.0)))
-    assert 1500 < flown.alarms_s[-1] < 1530
+    assert 1500 < min(t_s for t_s in flown.alarms_s if t_s > 1450) < 1530
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"
