@@ -97,7 +97,9 @@ def fly_all(names: list[str], anew: set[str], workers: int) -> None:
 
     def fly_one(flight: Flight) -> None:
         words = (flight.set_up, flight.event, flight.matches)
-        subprocess.run([sys.executable, __file__, "--flight", *words], check=False)
+        ended = subprocess.run([sys.executable, __file__, "--flight", *words], check=False)
+        if ended.returncode:
+            print(f"never_worse: {flight.name} has ended with {ended.returncode}", file=sys.stderr, flush=True)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(fly_one, due))
@@ -118,11 +120,15 @@ def free_instance() -> Iterator[int]:
 
 
 def fly(flight: Flight) -> None:
-    """Make one flight, and keep its figures."""
+    """Make one flight, and keep its figures; a control that another sweep is flying is waited for."""
     path = row_path(flight)
-    with free_instance() as instance:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path.with_suffix(".lock"), "w") as lock, free_instance() as instance:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.exists() and not flight.has_edgevpr:
+            return
         folder = Trial(WORK, path.with_suffix(""), flight, instance).fly()
-    row = figures_of(folder, flight)
+        row = figures_of(folder, flight)
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(base.rounded(row)))
     unfinished.replace(path)
