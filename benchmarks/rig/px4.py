@@ -106,7 +106,7 @@ class Px4(Process):
         self.link.set_parameter("SIM_GPS_USED", count)
 
     def displace_gps(self, north_m: float) -> None:
-        """Let the receiver's positions lie so far north of the truth. README.md names the patch that this takes."""
+        """Let the receiver's positions lie so far north of the truth. README.md says what this takes."""
         self.link.put_parameter("SIM_GPS_OFF_N", float(north_m))
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
