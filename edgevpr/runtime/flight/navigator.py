@@ -26,7 +26,11 @@ from edgevpr.runtime.recognise.recognition import Recognition
 # to some hundredths of a second.
 _ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
 _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
-_LOST_M, _LOST_S = 50.0, 60.0  # a continuous position is sent up to this error, and so long after a fix
+_LOST_M = 50.0  # a position is sent up to this error
+_LOST_S = 60.0  # and, as a single fix, for so long after a match
+# By accelerations alone we know no more than the autopilot, which has them too: without a picture that shows a place or
+# the motion over ground, or GPS, nothing is sent for longer. Sent for half a minute, it led a PX4 copter 246 m away.
+_BLIND_S = 10.0
 _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
@@ -283,7 +287,8 @@ class Navigator(Listener):
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
-        if estimate is None or t_s - self._navigation.known_s > _LOST_S or estimate.accuracy_m > _LOST_M:
+        good_for_s = _BLIND_S if self._channel.is_continuous else _LOST_S
+        if estimate is None or t_s - self._navigation.known_s > good_for_s or estimate.accuracy_m > _LOST_M:
             return None
         return estimate
 

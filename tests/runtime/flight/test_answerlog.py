@@ -32,7 +32,8 @@ class Answering:
         wait_until(lambda: self._heard(message.get_type()) > before)
 
     def beat(self):
-        self.say(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3))
+        # Of a firmware that is asked for no parameter before it gets fixes.
+        self.say(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_GENERIC, 128, 0, 4, 3))
         self.say(mavlink.MAVLink_gps_raw_int_message(0, 3, 0, 0, 0, 0, 0, 0, 0, 9))
 
     def be_seen(self):
@@ -57,6 +58,7 @@ def flown(recording, tmp_path, clock, results):
         peer.expect("HEARTBEAT")
         autopilot = Answering(link, peer, clock, results)
         autopilot.beat()
+        peer.synchronise(link)
         flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
         pictures = [textured(number, 240, 320) for number in range(len(results) + 1)]
         return flight.fly(FakeSource(pictures, clock, work=autopilot.be_seen))

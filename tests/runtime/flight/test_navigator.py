@@ -216,14 +216,14 @@ def test_looking_whether_the_position_is_known_moves_no_continuous_position():
     assert told.states == asked.states
 
 
-def test_a_continuous_position_ends_after_a_minute_without_a_fix():
+def test_continuous_position_by_accelerations_alone_ends_after_ten_seconds():
     air = lost(inertial(Navigator(1.0, 1.0))).fly(60)
     air.sees = False
     seen_s = air.events[-1].frame.t_mono_s
     air.fly(90)
     last_s, last = said_states(air)[-1]
-    assert last_s <= seen_s + 60.1
-    assert last.accuracy_m <= 60 * LIKE_ONE
+    assert last_s <= seen_s + 11.1, "one more was on its way"
+    assert last.accuracy_m <= 20 * LIKE_ONE
     assert air.states[-1][1] is None
     assert not air.navigator.knows_position(air.t_s)
     air.sees = True
@@ -232,7 +232,7 @@ def test_a_continuous_position_ends_after_a_minute_without_a_fix():
 
 
 def test_a_continuous_position_ends_when_it_is_worse_than_fifty_metres(monkeypatch):
-    monkeypatch.setattr(navigator, "_LOST_S", math.inf)
+    monkeypatch.setattr(navigator, "_BLIND_S", math.inf)
     air = lost(inertial(Navigator(1.0, 1.0))).fly(10)
     air.sees = False
     air.fly(120)
