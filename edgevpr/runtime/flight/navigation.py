@@ -75,9 +75,14 @@ class Navigation:
         return self._fixed_s
 
     @property
-    def known_s(self) -> float:
-        """Time of the last fix, stride or GPS position, whichever is the latest; -inf if there was none."""
-        return max(self._fixed_s, self._strode_s, self._gps_s)
+    def shown_s(self) -> float:
+        """Time of the last fix or stride; -inf if there was none."""
+        return max(self._fixed_s, self._strode_s)
+
+    @property
+    def gps_s(self) -> float:
+        """Time of the last GPS position that was used; -inf if there was none."""
+        return self._gps_s
 
     def is_followed_at(self, t_s: float) -> bool:
         """Tell whether the path is followed from frame to frame, by strides that it does not contradict, and queries

@@ -28,9 +28,11 @@ _ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
 _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
 _LOST_M = 50.0  # a position is sent up to this error
 _LOST_S = 60.0  # and, as a single fix, for so long after a match
-# By accelerations alone we know no more than the autopilot, which has them too: without a picture that shows a place or
-# the motion over ground, or GPS, nothing is sent for longer. Sent for half a minute, it led a PX4 copter 246 m away.
+# By accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends so long
+# after the last picture that shows a place or the motion over ground, and so long after GPS, until there is such a
+# picture: sent for half a minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (alone: 25 m).
 _BLIND_S = 10.0
+_GPS_CARRIES_S = 3.0
 _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
@@ -287,10 +289,14 @@ class Navigator(Listener):
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
-        good_for_s = _BLIND_S if self._channel.is_continuous else _LOST_S
-        if estimate is None or t_s - self._navigation.known_s > good_for_s or estimate.accuracy_m > _LOST_M:
+        if estimate is None or estimate.accuracy_m > _LOST_M:
             return None
-        return estimate
+        shown_s, gps_s = self._navigation.shown_s, self._navigation.gps_s
+        if self._channel.is_continuous:
+            is_known = t_s - shown_s <= _BLIND_S or t_s - gps_s <= _GPS_CARRIES_S
+        else:
+            is_known = t_s - max(shown_s, gps_s) <= _LOST_S
+        return estimate if is_known else None
 
     def _improved(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""

@@ -231,6 +231,16 @@ def test_continuous_position_by_accelerations_alone_ends_after_ten_seconds():
     assert air.states[-1][1]
 
 
+def test_blind_camera_gets_no_continuous_position_sent_for_long_after_gps():
+    air = Air(inertial(Navigator(1.0, 1.0)))
+    air.sees = False
+    air.fly(30)
+    air.lose_gps()
+    lost_s = air.t_s
+    air.fly(20)
+    assert lost_s + 1.5 < said_states(air)[-1][0] <= lost_s + 3.1
+
+
 def test_a_continuous_position_ends_when_it_is_worse_than_fifty_metres(monkeypatch):
     monkeypatch.setattr(navigator, "_BLIND_S", math.inf)
     air = lost(inertial(Navigator(1.0, 1.0))).fly(10)
