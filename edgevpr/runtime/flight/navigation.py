@@ -137,7 +137,7 @@ class Navigation:
             if had_gps:
                 self._filter.lose_gps()
             return
-        off_m, sd_m, off_m_s, age_s = off
+        off_m, sd_m, off_m_s, sd_m_s, age_s = off
         expected_m, _, covariance = self._filter.errors(age_s)
         if in_sd(off_m - expected_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _CONTRADICTS_SD:
             self._contradict(receiver, vehicle.t_heard_s)
@@ -145,7 +145,7 @@ class Navigation:
         self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
         if vehicle.t_heard_s - self._gps_s >= _GPS_EVERY_S:
             self._note_gps(vehicle.t_heard_s)
-            self._filter.hear_gps(off_m, sd_m, off_m_s, _GPS_VELOCITY_SD, age_s)
+            self._filter.hear_gps(off_m, sd_m, off_m_s, sd_m_s, age_s)
 
     def _contradict(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: where it goes on and no match proves ours, begin there."""
@@ -156,17 +156,23 @@ class Navigation:
         if self.is_in_doubt and lasts_s >= _OVERRULES_S:
             self.has_gps = self._start_at_receiver(receiver, now_s)
 
-    def _beside_receiver(self, path: Path, receiver: Receiver) -> tuple[Doubles, float, Doubles | None, float] | None:
+    def _beside_receiver(
+        self, path: Path, receiver: Receiver
+    ) -> tuple[Doubles, float, Doubles | None, float, float] | None:
         """Return the offset (2,) from the path to a receiver's position, its standard deviation, by how much the
-        receiver's velocity exceeds the path's (2,; None: unknown), and its age; None if the path then is unknown."""
-        there = path.at(measured_s := receiver.t_s - RECEIVER_LAG_S)
-        if there is None:
+        receiver's velocity exceeds the path's (2,; None: unknown), its standard deviation, and the age of both; None if
+        the path then is unknown."""
+        measured_s = receiver.t_s - RECEIVER_LAG_S
+        there, before = path.at(measured_s), path.at(measured_s - RECEIVER_LAG_SD_S)
+        if there is None or before is None:
             return None
         off_m = path.from_origin(receiver.lat_deg, receiver.lon_deg) - there.at_m
         speed_m_s = float(np.hypot(*there.velocity_m_s))
         sd_m = math.hypot(_GPS_ALIKE * receiver.sd_m, RECEIVER_LAG_SD_S * speed_m_s)
         off_m_s = None if receiver.velocity_m_s is None else np.array(receiver.velocity_m_s) - there.velocity_m_s
-        return off_m, sd_m, off_m_s, path.now.t_s - measured_s
+        # In a turn the velocity of a moment before is another one: that would be taken for an error of the attitude.
+        sd_m_s = math.hypot(_GPS_VELOCITY_SD, *(there.velocity_m_s - before.velocity_m_s))
+        return off_m, sd_m, off_m_s, sd_m_s, path.now.t_s - measured_s
 
     def _start_at_estimate(self, vehicle: Vehicle) -> None:
         if vehicle.position_sd_m is not None:

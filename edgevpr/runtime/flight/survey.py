@@ -21,6 +21,7 @@ from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.consistency import HeardFrame, positioned
 from edgevpr.runtime.flight.navigation import reckons_by_gps
 from edgevpr.runtime.recognise.locate import in_sd
@@ -32,7 +33,6 @@ _MOST = 720  # the newest hour of matches
 _GPS_LASTS_S = 180.0
 _WORST_GPS_M = 5.0  # a receiver that says less of itself is not good enough to hold a map against
 _OURS_S = 60.0  # so long after a fix of ours the autopilot's position may still be that, and the receiver's is taken
-_LAG_S = 0.1  # of a receiver's position when it is reported
 _ATTITUDE_SD, _LEVEL_SD_DEG = math.tan(math.radians(0.5)), 0.3  # for one picture; what all of a flight have in common
 # Before the first match: the standard deviations of offset (2, metres), mount (2, tangents), scale, and of the time
 # between frames and positions (s), which on a straight line does the same as a camera that looks ahead.
@@ -258,5 +258,5 @@ def _beside(vehicle: Vehicle, t_s: float) -> Position:
     if gps is None or t_s - vehicle.t_fix_s > _OURS_S:
         return Position(vehicle.lat_deg, vehicle.lon_deg)
     east_m_s, north_m_s = vehicle.velocity_m_s or (0.0, 0.0)
-    since_s = t_s - gps.t_s + _LAG_S
+    since_s = t_s - gps.t_s + RECEIVER_LAG_S
     return Position(*moved(gps.lat_deg, gps.lon_deg, since_s * east_m_s, since_s * north_m_s))
