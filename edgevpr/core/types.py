@@ -40,7 +40,7 @@ class Pose:
     recorded: Position | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Receiver:
     """The newest report of a GPS receiver: degrees, standard deviation `sd_m` of one axis, and `t_s`, the time of its
     arrival (seconds on the clock of the frames). `velocity_m_s`: over the ground (east, north), None if unknown.

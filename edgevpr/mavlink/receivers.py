@@ -69,10 +69,10 @@ class Receivers:
 
 def _report(message: Message, now_s: float) -> Receiver:
     return Receiver(
-        message.lat / 1e7,
-        message.lon / 1e7,
-        GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
-        now_s,
+        lat_deg=message.lat / 1e7,
+        lon_deg=message.lon / 1e7,
+        sd_m=GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
+        t_s=now_s,
         velocity_m_s=_velocity(message),
         alt_m=message.alt / 1e3,
     )

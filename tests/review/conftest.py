@@ -6,12 +6,12 @@ from dataclasses import replace
 import cv2
 import pytest
 from browser import driven
-from fakes import FakeClock, FakeLink, FakeSource, to_autopilot
+from fakes import FakeClock, FakeLink, FakeSource, receiver_at, to_autopilot
 from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Receiver, Vehicle
+from edgevpr.core.types import Frame, Vehicle
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.aboard import start_fields
 from edgevpr.runtime.flight.flight import Flight
@@ -50,7 +50,7 @@ def flown(tmp_path_factory):
 
     def vehicle() -> Vehicle:
         lat_deg = 50 + STEP_DEG * (clock() - 1000)
-        receiver = Receiver(lat_deg, 8.00126, 1.0, clock())
+        receiver = receiver_at((lat_deg, 8.00126), 1.0, clock())
         return replace(aircraft, lat_deg=lat_deg, t_heard_s=clock(), gps=receiver)
 
     place_map = folder / "map.gpkg"

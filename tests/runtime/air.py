@@ -6,11 +6,11 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from fakes import vehicle_at
+from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Receiver, Steps, Vehicle
+from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
@@ -227,7 +227,7 @@ class Air:
             *here,
             self.t_s,
             has_gps=self.has_gps,
-            gps=Receiver(*there, GPS_SD_M, self.t_s) if self.has_receiver else None,
+            gps=receiver_at(there, GPS_SD_M, self.t_s) if self.has_receiver else None,
             velocity_m_s=tuple(velocity + wrong),
             position_sd_m=None if self.knows_nothing else sd_m,
             height_m=100.0,

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from air import GPS_SD_M, HOME, Air, lengths, match_at
-from fakes import FakeClock, FakeLink, to_autopilot, vehicle_at
+from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import moved
-from edgevpr.core.types import Position, Receiver
+from edgevpr.core.types import Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -232,7 +232,7 @@ def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_rece
                 turn = rng.uniform(0, 2 * math.pi)
                 off_m = 100 * np.array([math.cos(turn), math.sin(turn)])
             gps = moved(*HOME, *(at_m + wander_m))
-            known = {"gps": Receiver(*gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
+            known = {"gps": receiver_at(gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
             seen = Position(*moved(*HOME, *(at_m + off_m)))
             assert integrity.look(match_at(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),))) is None
             assert integrity.off_m is not None
@@ -308,7 +308,7 @@ def test_the_time_between_receiver_and_frame_is_allowed_for():
     for number in range(10):
         t_s = float(number)
         gps = moved(*HOME, speed_m_s * (t_s - 0.8 - RECEIVER_LAG_S), 0.0)
-        vehicle = vehicle_at(*gps, t_s, gps=Receiver(*gps, 0.1, t_s - 0.8), velocity_m_s=(speed_m_s, 0.0))
+        vehicle = vehicle_at(*gps, t_s, gps=receiver_at(gps, 0.1, t_s - 0.8), velocity_m_s=(speed_m_s, 0.0))
         seen = Position(*moved(*HOME, speed_m_s * t_s, 0.0))
         assert integrity.look(match_at(seen, t_s, vehicle, 0.1, (number,))) is None
         assert integrity.off_m < 0.1

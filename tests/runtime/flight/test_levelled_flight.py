@@ -4,12 +4,12 @@ import logging
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import Frame, Position, Receiver
+from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -101,7 +101,7 @@ def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
 
     def vehicle():
         level = {"heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0, "height_m": 80.0}
-        gps = Receiver(50.0, 8.0, 1.0, clock.now_s) if has_gps else None
+        gps = receiver_at((50.0, 8.0), 1.0, clock.now_s) if has_gps else None
         return vehicle_at(50.0, 8.0, clock.now_s, velocity_m_s=(0.0, 0.0), has_gps=has_gps, gps=gps, **level)
 
     source = FakeSource([textured(20, 256, 256)] * 11, clock, is_live=is_live)

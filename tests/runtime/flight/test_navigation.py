@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fakes import vehicle_at
+from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
-from edgevpr.core.types import Position, Receiver
+from edgevpr.core.types import Position
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
 from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
@@ -277,7 +277,7 @@ class Received:
             steady_for_s = self.t_s - self.steady_since_s
             where = moved(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
             known = {"velocity_m_s": velocity_m_s, "steady_for_s": steady_for_s}
-            gps = Receiver(*where, 1.0, self.t_s, **known) if has_gps else None
+            gps = receiver_at(where, 1.0, self.t_s, **known) if has_gps else None
             estimate = moved(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
             self.navigation.hear_vehicle(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)

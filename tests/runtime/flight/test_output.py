@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import pytest
-from fakes import vehicle_at
+from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import moved
-from edgevpr.core.types import Receiver
 from edgevpr.mavlink.messages import TEXT_BYTES
 from edgevpr.runtime.flight.output import Output, OutputWatch
 
@@ -25,7 +24,7 @@ class Watched:
             self.now_s += 0.1
             if sends:
                 self.watch.note_sent(self.now_s)
-            gps = Receiver(*HOME, 1.0, self.now_s, steady_for_s=60.0) if has_gps else None
+            gps = receiver_at(HOME, 1.0, self.now_s, steady_for_s=60.0) if has_gps else None
             vehicle = vehicle_at(*moved(*HOME, off_m, 0.0), self.now_s, has_gps=has_gps, gps=gps)
             self.watch.update(replace(vehicle, innovation_ratio=ratio), fixed_s, has_gps)
         return self.watch.withdrawn

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from air import HOME, match_at
-from fakes import FakeClock, FakeLink, vehicle_at
+from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.types import Position, Receiver
+from edgevpr.core.types import Position
 from edgevpr.frames.level import STRAIGHT_DOWN, Mount, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
@@ -70,7 +70,7 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
         velocity = np.clip((after_m - at_m) / 0.01, -SPEED_M_S, SPEED_M_S)
         told_deg = (heading_deg + compass_deg) % 360
         known = {"heading_deg": told_deg, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
-        known |= {"velocity_m_s": tuple(velocity), "gps": Receiver(*gps, GPS_SD_M, t_s)} | said
+        known |= {"velocity_m_s": tuple(velocity), "gps": receiver_at(gps, GPS_SD_M, t_s)} | said
         event = match_at(
             Position(*moved(*HOME, *fix_m)),
             t_s,
@@ -151,7 +151,7 @@ def test_a_mount_is_told_by_the_turn_of_the_picture_where_the_compass_is_wrong()
         {"roll_deg": None},
         {"velocity_m_s": (math.nan, 0.0)},
         {"gps": None},
-        {"gps": Receiver(*HOME, 8.0, 0.0)},
+        {"gps": receiver_at(HOME, 8.0, 0.0)},
     ],
 )
 def test_without_gps_or_attitude_nothing_is_found(said):
@@ -166,7 +166,7 @@ def test_a_position_that_may_be_ours_is_not_gps():
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
         late = moved(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
         ours = moved(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
-        gps = Receiver(*late, GPS_SD_M, event.frame.t_mono_s)
+        gps = receiver_at(late, GPS_SD_M, event.frame.t_mono_s)
         event.vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
         sightings.take(event)
     found = sightings.result()
