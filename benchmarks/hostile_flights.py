@@ -5,6 +5,7 @@ belongs to one moment: a fix tells when the picture was sent that it was made fr
 """
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -32,8 +33,9 @@ RATE_HZ = 40.0
 # As often as the machine can; few candidates and a coarse technique, so that it can often.
 _FLAGS = ("--rate-hz", "20", "--candidates", "4")
 _TECHNIQUE = ("--technique", "cohog", "--camera", "nadir", "--param", "w1=320")
-# Eight seconds: an autopilot that tells no position is sent fixes from 5 s after its first heartbeat on.
-_WHOLE_AT_FIRST = 320
+# Fourteen seconds: an autopilot that tells no position is sent fixes from 5 s after its first heartbeat on, and once it
+# has answered for its parameters.
+_WHOLE_AT_FIRST = 560
 _HEIGHT_M, _METRES_PER_PIXEL = 80.0, 0.32
 _STEP_M = 6 * _METRES_PER_PIXEL  # a picture of 240 rows passes in a second
 _PICTURES_A_PLACE = 8
@@ -64,7 +66,7 @@ def run(count: int, seed: int, only: Callable[[str], bool] = lambda stream: True
 
 
 class _Noting(FlightController):
-    """A simulated flight controller that keeps the fixes which it has accepted, as they came."""
+    """A simulated flight controller that keeps the fixes which it has accepted, with their time on our clock."""
 
     def __init__(self) -> None:
         super().__init__("arduplane", Motion(), gps=False)
@@ -73,6 +75,7 @@ class _Noting(FlightController):
     def hear(self, message: Message) -> list[Message]:
         answers = super().hear(message)
         if message.get_type() == "COMMAND_INT" and answers[0].result == mavlink.MAV_RESULT_ACCEPTED:
+            message.param1 += time.monotonic() - self.brain.boot_s  # a fix carries the autopilot's time
             self.fixes.append(message)
         return answers
 

@@ -43,10 +43,12 @@ class _Pilot:
         self.say(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3))
 
     def read(self, now_s: float, *, answers: bool) -> None:
-        """Read all that has come, and answer every fix of it if so wished."""
+        """Read all that has come, and answer every TIMESYNC and, if so wished, every fix of it."""
         with suppress(OSError):
             while data := self._sock.recv(65_536):
                 for message in self._receiver.feed(data):
+                    if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                        self.say(mavlink.MAVLink_timesync_message(round(1e9 * now_s) + 1, message.ts1))
                     if message.get_type() == "COMMAND_INT":
                         self.fixes.append((message, now_s))
                         if answers:

@@ -42,8 +42,8 @@ def test_no_damaged_map_gives_a_traceback_or_a_wrong_position_or_loses_a_place()
 
 def test_a_flight_behind_a_damaged_stream_sends_no_fix_from_an_old_picture(monkeypatch):
     monkeypatch.setattr(hostile_flights, "_TECHNIQUE", (*hostile_flights._TECHNIQUE, "--no-calibrate"))  # half a minute
-    damaged, total = hostile_flights.run(count=480, seed=3, only=STREAM.__eq__)
-    assert (damaged["stream"], damaged["sent"], damaged["fixes"] > 0) == (STREAM, 480, True)
+    damaged, total = hostile_flights.run(count=720, seed=3, only=STREAM.__eq__)
+    assert (damaged["stream"], damaged["sent"], damaged["fixes"] > 0) == (STREAM, 720, True)
     assert (damaged["old"], damaged["ahead"], total["old"]) == (0, 0, 0)
 
 
