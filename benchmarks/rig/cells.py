@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from scenarios import Scenario
+from scenarios import AGP, GPS_INPUT, ODOMETRY, Scenario
 
 WATCHED_S, HEIGHT_M = 120.0, 100.0
 MAP_END_M = 500.0  # north: what is flown over beyond it is in no map, where the ground changes its height
@@ -134,36 +134,26 @@ _FLOWN_WITH = {
     },
     "px4_plane": {"SIM_GPS_WANDER": _WANDER},
 }
-_GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
-_ODOMETRY = {
-    "VISO_TYPE": 1,
-    "EK3_SRC2_POSXY": 6,
-    "EK3_SRC2_VELXY": 0,
-    "EK3_SRC2_POSZ": 1,
-    "EK3_SRC2_VELZ": 0,
-    "EK3_SRC2_YAW": 1,
-}
-_SENSOR = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}
 SET_UPS = {
     "copter": SetUp(),
     "plane": SetUp(vehicle="plane"),
     "px4_copter": SetUp(is_px4=True),
     "px4_plane": SetUp(is_px4=True, vehicle="plane"),
-    "gps_input": SetUp(parameters=_GPS_INPUT),
-    "gps_input_never_switched": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 0}),
-    "gps_input_blended": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 2}),
-    "gps_input_if_no_fix": SetUp(parameters={**_GPS_INPUT, "GPS_AUTO_SWITCH": 4}),
-    "gps_primary": SetUp(parameters={**_GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}),
-    "gps_primary_never_switched": SetUp(parameters={**_GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 0}),
-    "affinity": SetUp(parameters={**_GPS_INPUT, "EK3_AFFINITY": 1}),
-    "affinity_ours": SetUp(parameters={**_GPS_INPUT, "EK3_AFFINITY": 1, "EK3_PRIMARY": 1}),
-    "odometry": SetUp(parameters=_ODOMETRY),
-    "odometry_switched": SetUp(parameters=_ODOMETRY, config={"mavlink": {"source_sets": {"gps": 1, "no_gps": 2}}}),
+    "gps_input": SetUp(parameters=GPS_INPUT),
+    "gps_input_never_switched": SetUp(parameters={**GPS_INPUT, "GPS_AUTO_SWITCH": 0}),
+    "gps_input_blended": SetUp(parameters={**GPS_INPUT, "GPS_AUTO_SWITCH": 2}),
+    "gps_input_if_no_fix": SetUp(parameters={**GPS_INPUT, "GPS_AUTO_SWITCH": 4}),
+    "gps_primary": SetUp(parameters={**GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}),
+    "gps_primary_never_switched": SetUp(parameters={**GPS_INPUT, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 0}),
+    "affinity": SetUp(parameters={**GPS_INPUT, "EK3_AFFINITY": 1}),
+    "affinity_ours": SetUp(parameters={**GPS_INPUT, "EK3_AFFINITY": 1, "EK3_PRIMARY": 1}),
+    "odometry": SetUp(parameters=ODOMETRY),
+    "odometry_switched": SetUp(parameters=ODOMETRY, config={"mavlink": {"source_sets": {"gps": 1, "no_gps": 2}}}),
     "plane_command": SetUp(vehicle="plane"),
-    "plane_gps_input": SetUp(vehicle="plane", parameters=_GPS_INPUT),
-    "px4_sensor": SetUp(is_px4=True, parameters=_SENSOR),
+    "plane_gps_input": SetUp(vehicle="plane", parameters=GPS_INPUT),
+    "px4_sensor": SetUp(is_px4=True, parameters=AGP),
     "px4_odometry": SetUp(is_px4=True, parameters={"EKF2_EV_CTRL": 1}),
-    "px4_plane_sensor": SetUp(is_px4=True, vehicle="plane", parameters=_SENSOR),
+    "px4_plane_sensor": SetUp(is_px4=True, vehicle="plane", parameters=AGP),
 }
 
 _GPS_OFF, _GPS_ON = Step(0, "set_gps", (0,)), "set_gps"

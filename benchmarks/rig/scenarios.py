@@ -89,8 +89,8 @@ _FLOW = {  # a flow sensor and a range finder that reaches the ground, as the se
     "EK3_SRC2_VELZ": 0,
     "EK3_SRC2_YAW": 1,
 }
-_GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
-_ODOMETRY = {
+GPS_INPUT = {"GPS2_TYPE": 14, "GPS_AUTO_SWITCH": 1}
+ODOMETRY = {
     "VISO_TYPE": 1,
     "EK3_SRC2_POSXY": 6,
     "EK3_SRC2_VELXY": 0,
@@ -99,7 +99,7 @@ _ODOMETRY = {
     "EK3_SRC2_YAW": 1,
 }
 
-_AGP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}  # PX4: positions of message 296
+AGP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}  # PX4: positions of message 296
 
 SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),
@@ -109,20 +109,20 @@ SCENARIOS = {
     "plane_mjpeg": Scenario(wind_m_s=6.0, is_stamped=False, is_compared=False),
     "plane_mounted": Scenario(wind_m_s=6.0, gps_s=300.0, mount=Mount(7.0, -4.0), is_compared=False),
     "copter_flow": Scenario(vehicle="copter", source_set=2, parameters=_FLOW),
-    "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True),
+    "copter_gps_input": Scenario(vehicle="copter", with_edgevpr=GPS_INPUT, starts_early=True),
     "copter_off_map": Scenario(
-        vehicle="copter", with_edgevpr=_GPS_INPUT, starts_early=True, mapped_m=450.0, is_compared=False
+        vehicle="copter", with_edgevpr=GPS_INPUT, starts_early=True, mapped_m=450.0, is_compared=False
     ),
-    "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=_ODOMETRY, starts_early=True),
+    "copter_odometry": Scenario(vehicle="copter", source_set=2, with_edgevpr=ODOMETRY, starts_early=True),
     "plane_glitch": Scenario(loses_gps=False, glitch_m_s=5.0, off_s=60.0),
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
-    "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=_AGP),
-    "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=_AGP),
+    "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=AGP),
+    "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=AGP),
     "px4_plane_still": Scenario(is_px4=True, is_compared=False),  # by 43003; the simulator of 1.17.0 has no wind
     "px4_copter_unused": Scenario(
         is_px4=True,
         vehicle="copter",
-        with_edgevpr=_AGP,
+        with_edgevpr=AGP,
         loses_gps=False,
         uses_no_gps=True,
         off_s=120.0,

@@ -22,7 +22,8 @@ _YAW_SD = math.radians(5.0)
 # A reserve must never outbid a real receiver that has a 3D fix, which takes four satellites. At the same fix type
 # ArduPilot changes to the one with more satellites, and blends by accuracies (AP_GPS::update_primary, AP_GPS_Blended).
 _RESERVE_SATELLITES = 2
-_RESERVE_SD_M, _RESERVE_SD_M_S = 100.0, 10.0
+_RESERVE_SD_M = 100.0
+_RESERVE_SD_M_S = 10.0
 _SATELLITES = 6  # the smallest number with which a filter starts
 _GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800  # 1980-01-06; leap seconds since then, as of 2017
 

@@ -67,6 +67,13 @@ class Receivers:
         return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
 
 
+def extrapolate(receiver: Receiver, t_s: float) -> tuple[float, float]:
+    """Return latitude and longitude of a receiver at `t_s`: its report, moved on by its velocity and its lag."""
+    since_s = t_s - receiver.t_s + RECEIVER_LAG_S
+    east_m, north_m = (since_s * speed_m_s for speed_m_s in receiver.velocity_m_s or (0.0, 0.0))
+    return moved(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
+
+
 def _report(message: Message, now_s: float) -> Receiver:
     return Receiver(
         lat_deg=message.lat / 1e7,

@@ -8,7 +8,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver, Vehicle
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S, extrapolate
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, HeardFrame, PositionedMatch, Weighed, worst_sd
 from edgevpr.runtime.flight.drift import INERTIAL, Drift, DriftFilter, Strode
 from edgevpr.runtime.flight.output import PROOF_S
@@ -186,9 +186,9 @@ class Navigation:
         velocity_m_s, velocity_sd_m_s = np.zeros(2), _ANY_M_S
         if receiver.velocity_m_s is not None:
             velocity_m_s, velocity_sd_m_s = np.array(receiver.velocity_m_s), _GPS_VELOCITY_SD
-        flown_m = (now_s - receiver.t_s + RECEIVER_LAG_S) * velocity_m_s
-        here = Position(*moved(receiver.lat_deg, receiver.lon_deg, *flown_m.tolist()))
-        self._start(here, _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s)
+        self._start(
+            Position(*extrapolate(receiver, now_s)), _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s
+        )
         self._note_gps(now_s)
         self.is_in_doubt, self._contradicted_since_s = False, None
         return True

@@ -45,7 +45,8 @@ _FARTHEST_BEHIND_M = 40.0
 _OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS may still be where that put it
 # A receiver that has been lost and is steady for so long is left to the autopilot; until the second time "no fix" is
 # sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
-_BACK_S, _TAKEN_BACK_S = 1.0, 3.0
+_BACK_S = 1.0
+_TAKEN_BACK_S = 3.0
 _ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"

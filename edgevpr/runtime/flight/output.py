@@ -6,10 +6,10 @@ come back with a match that proves them, or with GPS."""
 import math
 from enum import Enum
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S
+from edgevpr.mavlink.receivers import extrapolate
 
 PROOF_S = 5.0  # a match of the last seconds proves our position
 _REFUSED_RATIO = 1.0  # of an innovation to the filter's gate
@@ -86,8 +86,6 @@ def _leaves_receiver(vehicle: Vehicle) -> bool:
     receiver = vehicle.gps
     if receiver is None or receiver.steady_for_s < _STEADY_S:
         return False
-    since_s = vehicle.t_heard_s - receiver.t_s + RECEIVER_LAG_S
-    flown_m = (since_s * speed_m_s for speed_m_s in receiver.velocity_m_s or (0.0, 0.0))
-    there = moved(receiver.lat_deg, receiver.lon_deg, *flown_m)
+    there = extrapolate(receiver, vehicle.t_heard_s)
     off_m = float(distance_m(*there, vehicle.lat_deg, vehicle.lon_deg))
     return off_m > max(_LED_AWAY_M, _LED_AWAY_SD * receiver.sd_m)
