@@ -10,6 +10,7 @@ from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.recognise.recognition import Recognition
 
 CONTRADICTION_RATIO = 1.25
+CORRECTION_RATIO = 1.1  # a height that is farther off than this is corrected by; five matches scatter by less
 MATCHES_IN_A_ROW = 5
 LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
 
@@ -17,7 +18,7 @@ LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
 class HeightWatch:
     """Compares the height that accepted matches give with the reported one, and reports once when they contradict each
     other in five matches in a row, and once when five agree again. A match gives a height only if the lens is known.
-    The `autopilot` (None: there is no link) gets the ratio, by which positions claim to be less accurate.
+    The `autopilot` (None: there is no link) gets the ratio, by which motion between pictures is corrected.
 
     `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
 
@@ -30,10 +31,15 @@ class HeightWatch:
 
     @property
     def ratio(self) -> float:
-        """Height by the pictures over that by the autopilot; 1.0 while they agree, or nothing is known."""
-        if self.by_pictures_m is None or self.by_autopilot_m is None:
-            return 1.0
-        return self.by_pictures_m / self.by_autopilot_m
+        """Height by the pictures over that by the autopilot, median of the last five matches; 1.0 unless all five are
+        more than a tenth above it, or below."""
+        ratios = self._ratios
+        is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(CORRECTION_RATIO, ratios)
+        return statistics.median(ratios) if is_off else 1.0
+
+    @property
+    def _ratios(self) -> list[float]:
+        return [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
 
     def tell(self, event: Recognition) -> None:
         """Compare the height of an event's match, if it has one, with the reported height."""
@@ -48,13 +54,13 @@ class HeightWatch:
         self._judge()
 
     def _judge(self) -> None:
-        ratios = [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
+        ratios = self._ratios
         if len(ratios) < MATCHES_IN_A_ROW:
             return
         was_so = self.by_pictures_m is not None
         if all(1 / CONTRADICTION_RATIO <= ratio <= CONTRADICTION_RATIO for ratio in ratios):
             self.by_pictures_m = self.by_autopilot_m = None
-        elif was_so or min(ratios) > CONTRADICTION_RATIO or max(ratios) < 1 / CONTRADICTION_RATIO:
+        elif was_so or _are_beyond(CONTRADICTION_RATIO, ratios):
             self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
         if self._autopilot:
             self._autopilot.correct_height(self.ratio)
@@ -69,3 +75,8 @@ class HeightWatch:
         said = f"height: {self.by_autopilot_m:.0f} m by the autopilot, {self.by_pictures_m:.0f} m by the pictures"
         ground = f"height {self.by_autopilot_m:.0f} m, by pictures {self.by_pictures_m:.0f} m"
         self._herald.tell("height", Severity.WARNING, said, ground=ground, said=said, ratio=round(self.ratio, 2))
+
+
+def _are_beyond(limit: float, ratios: list[float]) -> bool:
+    """Tell whether all ratios are greater than `limit`, or all less than its inverse."""
+    return min(ratios) > limit or max(ratios) < 1 / limit

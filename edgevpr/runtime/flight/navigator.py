@@ -47,6 +47,7 @@ _OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS 
 # sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
 _BACK_S = 1.0
 _TAKEN_BACK_S = 3.0
+_MOST_CORRECTED = 2.0  # beyond this ratio of heights, motion between pictures is not used
 _ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
@@ -99,7 +100,7 @@ class Navigator(Listener):
 
     def correct_height(self, ratio: float) -> None:
         """Set the height above ground by the pictures over that by the autopilot (1.0: they agree). Where they do not,
-        motion between pictures may be wrong by as much, and positions claim that."""
+        motion between pictures is corrected by it. The ground may change back at once, so positions claim as much."""
         with self._lock:
             self._height_ratio = ratio
 
@@ -278,13 +279,16 @@ class Navigator(Listener):
             tilting_m_s = height_m * math.radians(0.0 if self._is_level else vehicle.tilting_deg_s)
             speed_m_s = math.hypot(tilting_m_s, *(vehicle.velocity_m_s or (0.0, 0.0)))
         is_apart = self._is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
+        ratio, stride = self._height_ratio, None
+        if event.stride and 1 / _MOST_CORRECTED < ratio < _MOST_CORRECTED:
+            stride = event.stride.enlarged(ratio)
         tilt_sd = _ATTITUDE_SD if has_attitude else _UNTOLD_ATTITUDE_SD
         return HeardFrame(
             t_s=event.frame.t_mono_s,
             sd_m=math.hypot(tilt_sd * height_m, _TIME_SD_S * speed_m_s),
             lean_s2=0.0 if is_apart else height_m / GRAVITY_M_S2,
-            stride=event.stride,
-            scale_sd=abs(self._height_ratio - 1.0),
+            stride=stride,
+            scale_sd=abs(ratio - 1.0),
             alike_m=_ALIKE_SHARE * (event.view.footprint_m or 0.0),
         )
 
@@ -294,7 +298,9 @@ class Navigator(Listener):
             return None
         shown_s, gps_s = self._navigation.shown_s, self._navigation.gps_s
         if self._channel.is_continuous:
-            is_known = t_s - shown_s <= _BLIND_S or t_s - gps_s <= _GPS_CARRIES_S
+            # Before, a channel beside GPS has carried us too, and ends without a gap; on PX4 ours would only begin.
+            is_carried = self._channel.is_beside_gps and t_s - gps_s <= _GPS_CARRIES_S
+            is_known = t_s - shown_s <= _BLIND_S or is_carried
         else:
             is_known = t_s - max(shown_s, gps_s) <= _LOST_S
         return estimate if is_known else None

@@ -5,7 +5,7 @@ and the point under the camera is known in each. No map is needed. It is for cam
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from edgevpr.core.geodesy import axes_of, shorter_deg
@@ -32,6 +32,11 @@ class Stride:
     sd_m: float
     inliers: int
     zoom: float = 0.0
+
+    def enlarged(self, factor: float) -> "Stride":
+        """Return the motion that the same pictures show from a height that is `factor` times as large."""
+        east_m, north_m = self.moved_m
+        return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m)
 
     def fields(self) -> dict[str, Any]:
         """Return this stride as fields of the flight log."""

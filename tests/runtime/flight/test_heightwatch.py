@@ -62,10 +62,19 @@ def test_heightwatch_bears_a_reported_height_of_zero(watch):
     assert watch.watch.ratio == 100.0
 
 
+def test_heightwatch_corrects_by_less_than_it_reports(watch):
+    assert watch.see(*[115, 120, 118, 120]) == []
+    assert watch.watch.ratio == 1.0
+    assert watch.see(122) == []
+    assert watch.watch.ratio == pytest.approx(1.2)
+    watch.see(105)
+    assert watch.watch.ratio == 1.0
+
+
 @pytest.mark.parametrize(
     ("heights_m", "how"),
     [
-        ([120] * 9, {}),
+        ([105] * 9, {}),
         ([150, 150, 150, 150, 100] * 3, {}),
         ([150, 60] * 9, {}),
         ([150] * 9, {"accepted": False}),

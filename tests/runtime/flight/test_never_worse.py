@@ -75,6 +75,15 @@ def test_px4_is_on_gps_again_after_flight_over_lower_ground(parameters):
     assert not flight.positions_sent(back_s)
 
 
+def test_strides_over_lower_ground_are_right_where_matches_have_shown_its_height():
+    """Strides alone, 1.4 times short: uncorrected they lose 86 m in 20 s."""
+    flight = ClosedLoop("px4-copter", matches=False, velocity_m_s=10j, **SENSOR).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0)
+    flight.stride_scale = 1 / 1.4
+    flight.navigator.correct_height(1.4)
+    assert flight.fly(20).error_m[-1] < 15.0
+
+
 @px4_channels
 @pytest.mark.parametrize("map_off_m", [8, 20])
 def test_px4_is_on_gps_again_after_a_test_without(map_off_m, parameters):
