@@ -33,8 +33,9 @@ class ClosedLoop:
     """A flight of a `vehicle` of the flight controller with its `parameters`, that hovers or cruises by a velocity.
 
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
-    the truth. `stride_scale` is by what strides are too long, `time_error_s` by how much frames carry too late a time,
-    and `mount_tilt_deg` by how much the camera looks east of straight down. `away_m` and `error_m` are, step by step,
+    the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
+    `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
+    straight down. `away_m` and `error_m` are, step by step,
     the true distance from the target, and that of the autopilot's estimate from the truth; `sent` is all that edgevpr
     sends, with the times."""
 
@@ -44,6 +45,7 @@ class ClosedLoop:
         self.controller.brain.is_armed = True
         for name, value in parameters.items():
             self.controller.set(name, value)
+        self.sees_motion = True
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
         self.away_m, self.error_m, self.sent = [], [], []
@@ -151,7 +153,7 @@ class ClosedLoop:
 
     def _stride(self, truth, t_s):
         before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)
-        if before is None:
+        if before is None or not self.sees_motion:
             return None
         was, from_s, tilt = before
         moved_m = self.stride_scale * from_to(was.lat_deg, was.lon_deg, truth.lat_deg, truth.lon_deg)

@@ -233,13 +233,13 @@ class Navigator(Listener):
 
     def _next_output(self, vehicle: Vehicle | None, estimate: Whereabouts | None) -> Output:
         """Decide what is sent now."""
-        if vehicle is None or (estimate is None and self.output is Output.STARTING):
+        if vehicle is None:
             return Output.STARTING
         uses_gps = reckons_by_gps(vehicle)
         if uses_gps and not self._channel.is_beside_gps:
             return Output.GPS_IN_USE
         if estimate is None:
-            return Output.UNKNOWN
+            return Output.STARTING if self.output is Output.STARTING else Output.UNKNOWN
         if self._navigation.is_in_doubt:
             return Output.CONTRADICTS_GPS
         if self._watch.withdrawn:

@@ -5,6 +5,7 @@ from closed_loop import ClosedLoop
 
 from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.runtime.flight.output import Output
 
 pytestmark = pytest.mark.slow
 
@@ -73,6 +74,15 @@ def test_px4_is_on_gps_again_after_flight_over_lower_ground(parameters):
     _, error_m = flight.fly(20).worst_m(back_s)
     assert error_m <= NO_WORSE_M
     assert not flight.positions_sent(back_s)
+
+
+def test_px4_without_gps_or_picture_gets_nothing_and_operator_is_told():
+    flight = ClosedLoop("px4-copter", matches=False, **SENSOR).fly(SETTLED_S)
+    assert flight.navigator.output is Output.GPS_IN_USE
+    flight.sees_motion = False
+    flight.fly(15).set("SIM_GPS1_ENABLE", 0).fly(10)
+    assert flight.navigator.output is Output.UNKNOWN
+    assert not flight.positions_sent(0)
 
 
 def test_strides_over_lower_ground_are_right_where_matches_have_shown_its_height():
