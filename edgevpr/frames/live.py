@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot, coarse
+from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
 from edgevpr.frames.source import Source
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
@@ -40,7 +40,8 @@ class DeviceCapture:
 
 
 class LiveSource(Source):
-    """Gives the newest frame of the camera or stream that `open_capture` opens (None: it could not be opened).
+    """Gives the newest frame of the camera or stream that `open_capture` opens (None, or OpeningError with the cause: it
+    could not be opened).
 
     `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
     Only the capture thread uses the capture, from opening to release: a call into a stream that hangs cannot be
@@ -84,15 +85,18 @@ class LiveSource(Source):
     def _capture(self) -> None:
         wait_s = 0.0
         while not self._closing.is_set():
-            before = self._captured
-            capture = self._open_capture()
+            before, capture, cause = self._captured, None, "nothing there"
+            try:
+                capture = self._open_capture()
+            except OpeningError as error:
+                cause = str(error)
             if capture is not None:
                 self._take_pictures(capture)
                 capture.release()
             has_failed_again = wait_s and self._captured == before
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
             self.condition = Condition.LOST
-            self.state = f"{'lost' if self._captured else 'nothing there'}, reopening in {wait_s:g} s"
+            self.state = f"{'lost' if self._captured else cause}, reopening in {wait_s:g} s"
             self._closing.wait(wait_s)
 
     def _take_pictures(self, capture: Capture) -> None:

@@ -64,6 +64,10 @@ class Shot:
     pixels: Callable[[], Image]
 
 
+class OpeningError(Exception):
+    """A camera or stream cannot be opened at present. The text names the cause in a few words, for `Source.state`."""
+
+
 class Capture(Protocol):
     """An open camera or stream, used by one thread from opening to release."""
 
