@@ -51,6 +51,7 @@ class Trial(Run):
                 self._take_off()
                 self._settle()
                 self._watch(WATCHED_S)
+                self._pose()  # a simulator that has not lasted until here has flown nothing
             except RuntimeError as error:
                 cannot = str(error)
             self._recorder.is_on = False
