@@ -40,8 +40,8 @@ class DeviceCapture:
 
 
 class LiveSource(Source):
-    """Gives the newest frame of the camera or stream that `open_capture` opens (None, or OpeningError with the cause: it
-    could not be opened).
+    """Gives the newest frame of the camera or stream that `open_capture` opens. Where that returns None or raises
+    OpeningError, it could not be opened.
 
     `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
     Only the capture thread uses the capture, from opening to release: a call into a stream that hangs cannot be

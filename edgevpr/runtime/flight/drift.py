@@ -1,7 +1,7 @@
 """The filter of a path's errors: how far the aircraft is from its path by now. `navigation` uses it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,10 +12,11 @@ GRAVITY_M_S2 = 9.80665
 # So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
 # it wandered without end, every fix would be taken for a proof of it.
 _ATTITUDE_LASTS_S = 20.0
-# The error of the attitude wanders up to five times as fast as that of good gyros, as in PX4's simulator. Of the last
-# twenty pictures: the mean square of the leans that they show, over their variances, is .2 in flights of ArduPilot's
-# simulator and 1.3 in those of PX4's.
-_ROUGHEST, _SHOWN_GAIN = 4.0, 0.05
+# The error of the attitude wanders up to nine times as fast as that of good gyros, as in PX4's simulator: by 0.1 in
+# eight seconds after GPS was lost. Of the last twenty pictures: the mean square of the leans that they show, over their
+# variances, is .2 in flights of ArduPilot's simulator and 1.3 in those of PX4's.
+_ROUGHEST = 8.0
+_SHOWN_GAIN = 0.05
 _CALM, _ROUGH = 0.3, 0.8
 # An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times
 # faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
@@ -45,6 +46,9 @@ class Drift:
     velocity_noise: float
     acceleration_noise: float
     is_of_attitude: bool  # the path rests on the attitude, so that an error of it is one of the path's acceleration
+    # The autopilot follows our positions closely, and takes their errors for motion: its attitude errs with them. So it
+    # is taken for poor when GPS is lost, until pictures have shown that it is good.
+    is_led: bool = False
 
 
 # Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
@@ -58,6 +62,7 @@ INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
     is_of_attitude=True,
 )  # fmt: skip
+INERTIAL_LED = replace(INERTIAL, is_led=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +95,8 @@ class DriftFilter:
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
         self._upset = 0.0  # 1 when GPS is lost, then less and less
-        self._shown = 0.0  # mean square of the leans of the last pictures, over their variances
+        # Mean square of the leans of the last pictures, over their variances.
+        self._shown = _ROUGH if drift.is_led else 0.0
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
@@ -128,6 +134,8 @@ class DriftFilter:
         so does that of the attitude of an autopilot that reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._upset = 0.0 if self._drift.is_of_attitude else 1.0
+        if self._drift.is_led:
+            self._shown = max(self._shown, _ROUGH)
 
     def hear_gps(
         self, off_m: Doubles, sd_m: float, off_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0

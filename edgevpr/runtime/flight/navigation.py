@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S, extrapolate
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, HeardFrame, PositionedMatch, Weighed, worst_sd
-from edgevpr.runtime.flight.drift import INERTIAL, Drift, DriftFilter, Strode
+from edgevpr.runtime.flight.drift import Drift, DriftFilter, Strode
 from edgevpr.runtime.flight.output import PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import in_sd
@@ -50,8 +50,8 @@ class Whereabouts:
 
 class Navigation:
     """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
-    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`). `map_sd_m` is the standard
-    deviation, of one axis, of the error that all fixes share.
+    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`, `INERTIAL_LED`). `map_sd_m` is the
+    standard deviation, of one axis, of the error that all fixes share.
 
     Beside accelerations, which go with positions that are sent all the time, the autopilot's estimate may be made of
     those: GPS is then what its receiver reports itself. `has_gps`: there is a GPS that is believed. `is_in_doubt`: a
@@ -97,7 +97,7 @@ class Navigation:
         if vehicle.velocity_m_s is None:
             return
         has_gps = reckons_by_gps(vehicle) and believes_gps
-        if self._drift is INERTIAL:
+        if self._drift.is_of_attitude:
             self._hear_receiver(vehicle, vehicle.gps if has_gps else None, is_estimate_ours)
         else:
             self._hear_estimate(vehicle, has_gps)
@@ -198,7 +198,7 @@ class Navigation:
 
     def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
-        if (path := self._unbroken) and self._drift is INERTIAL:
+        if (path := self._unbroken) and self._drift.is_of_attitude:
             self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
 
     def hear_frame(self, frame: HeardFrame, is_query: bool = True, turn_deg: float | None = None) -> None:
@@ -237,7 +237,7 @@ class Navigation:
 
     def hear_fix(self, fix: ComparedFix, verdict: Weighed = BELIEVED) -> None:
         """Correct our position by a fix of which `Consistency` has given a verdict."""
-        if self._path and verdict.is_lost and self._drift is INERTIAL:
+        if self._path and verdict.is_lost and self._drift.is_of_attitude:
             self.begin(fix.seen.position, worst_sd(fix.seen.scatter_m2), fix.seen.t_s, self._path.now.t_s)
         elif self._path:
             hear = self._filter.trust_fix if verdict.is_against else self._filter.hear_fix
@@ -261,7 +261,7 @@ class Navigation:
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
         frame was taken at `t_s`; `sd_m` is its standard deviation. A path of velocities begins with a report only."""
-        if self._drift is INERTIAL:
+        if self._drift.is_of_attitude:
             sd_m = math.hypot(sd_m, _ANY_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
             self._fixed_s = t_s

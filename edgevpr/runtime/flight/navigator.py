@@ -16,7 +16,7 @@ from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, HeardFrame, positioned, worst_sd
-from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
+from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, INERTIAL_LED, RECKONED, Drift
 from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
 from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import over_ground
@@ -32,12 +32,14 @@ _LOST_S = 60.0  # and, as a single fix, for so long after a match
 # after the last picture that shows a place or the motion over ground, and so long after GPS, until there is such a
 # picture: sent for half a minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (alone: 25 m).
 _BLIND_S = 10.0
+_PX4_BLIND_S = 5.0  # PX4 goes on by itself for as long again: in 10 s by tilted accelerations it was led 70 m away
 _GPS_CARRIES_S = 3.0
 _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 _ALIKE, _PX4_ALIKE, _LEAN_GOOD_FOR_S = math.sqrt(50), 1.5, 5.0
+_PX4_CHANNELS = Channel.SENSOR, Channel.VISION
 _FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
 # A position that is farther behind jumps: a filter refuses it for seven to ten seconds, then begins there, which is
 # sooner than it is caught up with, and meanwhile nothing is sent that is far from what we know.
@@ -109,7 +111,7 @@ class Navigator(Listener):
         positions, and we must not use it: the path is then summed up from accelerations."""
         with self._lock:
             before, self._channel = self._channel, channel
-            if channel.is_continuous != before.is_continuous:
+            if _drift_of(channel) is not _drift_of(before):
                 self._begin()
 
     def begin_anew(self) -> None:
@@ -255,8 +257,7 @@ class Navigator(Listener):
         return Output.RESERVE
 
     def _begin(self) -> None:
-        drift = INERTIAL if self._channel.is_continuous else RECKONED
-        self._navigation, self._consistency = Navigation(drift, self._map_sd_m), Consistency()
+        self._navigation, self._consistency = Navigation(_drift_of(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
@@ -300,7 +301,8 @@ class Navigator(Listener):
         if self._channel.is_continuous:
             # Before, a channel beside GPS has carried us too, and ends without a gap; on PX4 ours would only begin.
             is_carried = self._channel.is_beside_gps and t_s - gps_s <= _GPS_CARRIES_S
-            is_known = t_s - shown_s <= _BLIND_S or is_carried
+            blind_s = _PX4_BLIND_S if self._channel in _PX4_CHANNELS else _BLIND_S
+            is_known = t_s - shown_s <= blind_s or is_carried
         else:
             is_known = t_s - max(shown_s, gps_s) <= _LOST_S
         return estimate if is_known else None
@@ -335,7 +337,7 @@ class Navigator(Listener):
         """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
         how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
         is_apart = self._is_level or t_s - self._lean_s <= _LEAN_GOOD_FOR_S
-        return _PX4_ALIKE if self._channel in (Channel.SENSOR, Channel.VISION) and is_apart else _ALIKE
+        return _PX4_ALIKE if self._channel in _PX4_CHANNELS and is_apart else _ALIKE
 
     def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
@@ -372,6 +374,13 @@ class Slew:
         part = min(1.0, _FASTEST_M_S * step_s / behind_m) if behind_m > 0 else 1.0
         self._said, self._at = estimate, moved(*carried, part * float(east_m), part * float(north_m))
         return *self._at, (1 - part) * behind_m
+
+
+def _drift_of(channel: Channel) -> Drift:
+    """Return the errors of the path beside an autopilot that is told positions by a channel."""
+    if channel in _PX4_CHANNELS:
+        return INERTIAL_LED
+    return INERTIAL if channel.is_continuous else RECKONED
 
 
 def _in_radians(attitude: Attitude) -> tuple[float, float, float]:

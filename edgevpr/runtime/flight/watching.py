@@ -195,7 +195,8 @@ class GpsWatch:
         if seen is None or not vehicle.is_fresh_at(seen.t_s):
             return
         off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, frame.sd_m)
+        tilted_m = (vehicle.height_m or 0.0) * _attitude_error_shown(seen)
+        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, frame.sd_m, tilted_m)
         self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
@@ -321,6 +322,12 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
     side, key = sides[first > 0], f"source.mount_{name}"
     looks = f"looks {abs(first):.1f} degrees {side}"
     return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
+
+
+def _attitude_error_shown(seen: PositionedMatch) -> float:
+    """Return the tangent of the least error of the reported attitude that the picture of a match shows: a match is off
+    GPS by as much of the height."""
+    return max(0.0, math.hypot(*seen.lean.over_height) - seen.lean.sd) if seen.lean else 0.0
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:

@@ -10,7 +10,7 @@ from air import GPS_SD_M, Air, lengths
 
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
-from edgevpr.runtime.flight import drift, navigation, navigator
+from edgevpr.runtime.flight import drift, navigator
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.perspective import Lean
 
@@ -86,8 +86,7 @@ def test_a_claim_as_good_as_the_matches_would_not_hold_where_no_picture_shows_th
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
     monkeypatch.setattr(navigator, "_ALIKE", 1.0)
     trusting = replace(drift.INERTIAL, acceleration_noise=0.02)
-    for module in (navigation, navigator):
-        monkeypatch.setattr(module, "INERTIAL", trusting)
+    monkeypatch.setattr(navigator, "INERTIAL_LED", trusting)
     assert flown(min_accuracy_m, GOOD, shows_lean=False)[0].max() > 20.0
 
 

@@ -17,6 +17,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.flight.watching import GpsWatch
+from edgevpr.runtime.recognise.perspective import Lean
 
 pytestmark = pytest.mark.slow
 
@@ -105,6 +106,21 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     assert [text for _, text in air.link.texts() if "GPS" in text] == [f"edgevpr: {line['said']}" for line in air.news]
     assert len(air.distances()) == len(air.events)
     assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
+
+
+@pytest.mark.parametrize(("shown", "is_wrong"), [(0.09, False), (0.02, True)])
+def test_gps_watch_allows_for_an_attitude_error_that_pictures_show(tmp_path, shown, is_wrong):
+    """A PX4 copter in its simulator, 100 m high: beside a good GPS its attitude was 3.5 degrees wrong for seconds."""
+    clock = FakeClock(0.0)
+    with FlightLog(tmp_path / "log", clock=clock) as flight_log:
+        watch = GpsWatch(MAP_SD_M, Herald(flight_log, FakeLink(clock)), None)
+        for second in range(24):
+            off_m = 8.0 if second >= 15 else 0.0
+            vehicle = vehicle_at(*HOME, float(second), height_m=100.0)
+            there = Position(*moved(*HOME, off_m, 0.0))
+            lean = Lean((shown, 0.0), 0.02) if off_m else None
+            watch.tell(match_at(there, float(second), vehicle, 1.0, (1,), View(), lean))
+    assert watch.is_wrong is is_wrong
 
 
 def test_gps_watch_reports_a_distance_again_when_it_has_doubled(watched):
