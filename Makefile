@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space bench-fleet service-faults soak test-arm64 sites sweeps clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space sites sweeps clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -43,8 +43,6 @@ lint: $(VENV)/installed
 results: $(VENV)/installed
 	$(BIN)/python benchmarks/run_sets.py
 	$(BIN)/python benchmarks/where.py
-	$(BIN)/python benchmarks/height_and_tilt.py
-	$(BIN)/python benchmarks/from_orthophoto.py
 	$(BIN)/python benchmarks/flights.py
 	$(BIN)/python benchmarks/figures_page.py
 	$(BIN)/python benchmarks/thesis.py --page
@@ -58,9 +56,8 @@ sites: $(VENV)/installed
 sweeps: $(VENV)/installed
 	$(BIN)/python benchmarks/sweeps.py
 
-# Speed and memory against the published way, into benchmarks/results/.
+# Speed and memory, into benchmarks/results/.
 bench: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
 	$(BIN)/python benchmarks/bench.py
 	$(BIN)/python benchmarks/figures_page.py
 	$(BIN)/python benchmarks/thesis.py --page
@@ -75,19 +72,9 @@ thesis: $(VENV)/installed
 bench-arm64: $(VENV)/installed
 	$(BIN)/python benchmarks/bench_arm64.py
 
-# edgevpr on an emulated ARM board: the core of the tests (as root; Debian's qemu-user-static, debootstrap and gcc), into
-# benchmarks/results/.
-test-arm64: $(VENV)/installed
-	$(BIN)/python benchmarks/on_arm64.py
-
-# Everything that a hostile world does, from a seed, into benchmarks/results/.
+# Streams, pictures and maps that are damaged or say nothing, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
-
-# One long flight, of which memory, descriptors and threads may not grow, into benchmarks/results/.
-MINUTES ?= 60
-soak: $(VENV)/installed
-	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
 
 # Ground stations' programs for the tests, without what their windows need (1 GB). Where they cannot be had, their tests
 # are skipped.
@@ -113,18 +100,6 @@ from-space: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/from_space.py
 	$(BIN)/python benchmarks/seams.py
-
-# Map making by one worker and by two, and what several flights leave of their maps, into benchmarks/results/: half
-# an hour.
-bench-fleet: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[fleet]'
-	$(BIN)/python benchmarks/bench_fleet.py
-	$(BIN)/python benchmarks/passes.py
-
-# The faults of the service under a real systemd, on a Debian in QEMU (as root; Debian's debootstrap, qemu-system-x86 and
-# qemu-utils), into benchmarks/results/ and docs/explanation/faults.md. EDGEVPR_MACHINE names the folder that the machine is kept in.
-service-faults: $(VENV)/installed
-	$(BIN)/python benchmarks/systemd/service_faults.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build site

@@ -72,7 +72,7 @@ def program_commit(repository: Path) -> str:
 def read(name: str, folder: Path = RESULTS) -> Row:
     """Return the content of NAME.json; {} where it is not there."""
     path = folder / f"{name}.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+    return json.loads(path.read_text(), object_hook=from_columns) if path.exists() else {}
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -88,7 +88,29 @@ def write(name: str, found: Row, page: str, folder: Path = RESULTS) -> None:
 
 def write_json(name: str, found: Row, folder: Path = RESULTS) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(json.dumps(rounded(found), indent=1) + "\n")
+    (folder / f"{name}.json").write_text(row_by_row(rounded(found), 0) + "\n")
+
+
+def row_by_row(value: Any, longest: int = 2000) -> str:
+    """Return JSON in which what is longer than so many characters has a line for each of its items; rows of the same
+    keys are kept as columns and rows."""
+    text = json.dumps(value)
+    if not isinstance(value, dict | list) or len(text) <= longest:
+        return text
+    if isinstance(value, list) and all(isinstance(row, dict) and row.keys() == value[0].keys() for row in value):
+        value = {"columns": list(value[0]), "rows": [[row[key] for key in value[0]] for row in value]}
+    if isinstance(value, dict):
+        items = [f"{json.dumps(key)}: {row_by_row(each)}" for key, each in value.items()]
+    else:
+        items = [row_by_row(each) for each in value]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    return "\n".join((first, ",\n".join(items), last))
+
+
+def from_columns(value: Row) -> Any:
+    """Return what `row_by_row` has kept as columns and rows."""
+    is_table = value.keys() == {"columns", "rows"}
+    return [dict(zip(value["columns"], row, strict=True)) for row in value["rows"]] if is_table else value
 
 
 def rounded(value: Any) -> Any:

@@ -3,13 +3,16 @@
 ARM boards by.
 
 It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of Debian and PyPI. Counts repeat to some
-thousandths; times do not.
+thousandths; times do not. Only the program is emulated: its system calls are this machine's, and so are its files but
+for those of the Debian system that is made for it.
 """
 
 import json
 import os
 import shutil
+import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +20,6 @@ from typing import Any
 
 import base
 from arm64 import counted
-from arm64.userland import CPU, PYTHON, install, make_system, run
 from big_map import make_big_map
 
 from edgevpr.power.boards import load_board
@@ -26,7 +28,22 @@ from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent
 TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
-WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml", "pymavlink", "fastcrc")  # what the parts import
+WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
+RELEASE = "bookworm"  # glibc 2.36, Python 3.11: that of Raspberry Pi OS 12
+PYTHON = "3.11"
+CPU = "cortex-a53"  # an instruction that a Raspberry Pi 3 or Zero 2 W has not ends the program
+# As Linux tells it of a Raspberry Pi Zero 2 W.
+_CPUINFO = """\
+processor\t: {}
+BogoMIPS\t: 38.40
+Features\t: fp asimd evtstrm crc32 cpuid
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU variant\t: 0x0
+CPU part\t: 0xd03
+CPU revision\t: 4
+"""
+_GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28")  # of the wheels
 _COLUMNS = {
     "part": "{part}",
     "million instructions": "{millions:.2f}",
@@ -54,8 +71,39 @@ def main() -> None:
 def build(work: Path) -> None:
     """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the plug-in that counts."""
     make_system(work / "system")
-    install(work / "site", "--no-deps", *(f"{name}=={metadata.version(name)}" for name in WHEELS))
+    names = [*(f"manylinux_{each}" for each in _GLIBC), "manylinux2014"]
+    tags = ["--only-binary=:all:", "--implementation=cp", f"--python-version={PYTHON}"]
+    tags += [f"--platform={name}_aarch64" for name in names]
+    wheels = [f"{name}=={metadata.version(name)}" for name in WHEELS]
+    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={work / 'site'}", "--no-deps", *tags, *wheels])
     run(["gcc", "-shared", "-fPIC", "-O2", "-o", str(work / "count.so"), str(HERE / "arm64" / "count.c")])
+
+
+def make_system(folder: Path) -> None:
+    """Make a Debian system for aarch64 with Python in a new folder, from Debian's packages; needs root for that."""
+    packages = "python3,libsqlite3-0,libstdc++6"
+    run(
+        ["debootstrap", "--foreign", "--arch=arm64", "--variant=minbase", f"--include={packages}", RELEASE, str(folder)]
+    )
+    for archive in sorted((folder / "var/cache/apt/archives").glob("*.deb")):
+        run(["dpkg-deb", "-x", str(archive), str(folder)])
+        archive.unlink()
+    # QEMU looks for every path here first: devices and settings are to be this machine's.
+    for each in folder.iterdir():
+        if each.name not in ("usr", "lib", "bin", "sbin"):
+            shutil.rmtree(each)
+    # Libraries look here for what the processor can do: not that of this machine.
+    (folder / "proc").mkdir()
+    (folder / "proc/cpuinfo").write_text("\n".join(_CPUINFO.format(number) for number in range(4)))
+
+
+def run(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:
+    """Run a command, with `env` beside the variables of this process; one that fails ends the program with its
+    output."""
+    done = subprocess.run(argv, capture_output=True, text=True, env={**os.environ, **(env or {})})
+    if done.returncode:
+        sys.exit(f"{' '.join(argv[:4])} ... failed: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return done
 
 
 def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:

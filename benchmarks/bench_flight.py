@@ -1,42 +1,28 @@
-"""What `edgevpr run` takes with a large map: peak memory, start to the first match, CPU while there is nothing to see,
-and how much of it the measuring takes.
+"""What `edgevpr run` takes with a large map: peak memory, start to the first match, CPU while there is nothing to see.
 
 A process of its own, as on the aircraft: a generated map of `cohog`, pictures from a folder, a link. What another
 process does is read in /proc. RSS counts pages of libraries as they lie in the system's cache: right after libraries
 were installed the same flight has 137 MB, and 96 once the cache was dropped, as by a restart.
 """
 
-import json
 import os
 import statistics
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import base  # noqa: F401
-import numpy as np
 from base import Row
 from big_map import make_big_map
 from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
 
-from edgevpr.core.config import BatteryConfig
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
 PLACES = 10_000
 FRAMES = 60
 STARTS = 5
-MEASURED = 200
-STEPS = ("encode", "scan", "compare")
 IDLE_S = 10.0
 SETTLE_S = 2.0
 NOBODY = "rtsp://127.0.0.1:9/nobody"
@@ -59,7 +45,6 @@ def rows() -> list[Row]:
         start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
         return [
             *memory_rows(place_map, frames, folder),
-            metering_row(folder / "memory.jsonl"),
             *start_rows(place_map, frames, folder),
             *idle_rows(place_map, frames, folder),
         ]
@@ -76,41 +61,6 @@ def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
         row_of("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
         row_of("... without libraries (RssAnon)", largest["RssAnon"], "MB", None),
     ]
-
-
-def metering_row(log: Path) -> Row:
-    """The CPU time that measuring takes, of that of a query (the median of the flight in `log`), at a query a second:
-    stages, memory, charge and heat, and their part of the log's line.
-
-    Between two measurements as much memory is gone through as a query does: all is slower when it has left the caches.
-    """
-    queries = [line for line in read_log(log) if line["kind"] == "query"]
-    query_s = statistics.median(line["costs"]["cpu_s"] + line["reading"]["cpu_s"] for line in queries)
-    board, pack = load_board("this"), Pack(4, 5200)
-    meter, of_query = FlightMeter(BatteryConfig("4S5200", 0.85), board, Clock()), QueryMeter(board, pack, 0.85)
-    elsewhere = np.ones(8_000_000, np.float32)
-    taken_s = []
-    for _ in range(MEASURED):
-        elsewhere += 1
-        begin_s = time.process_time()
-        with meter.timed() as reading:
-            pass
-        meter.load.busy(reading.cost)
-        with meter.timed(thread_only=True) as work:
-            of_query.begin()
-            for name in STEPS:
-                with of_query.step(name):
-                    pass
-            steps = replace(of_query.steps(), read=reading.cost)
-            meter.count(Recognition(frame=None, reason="", steps=steps, cost=of_query.cost()))
-            with meter.timed() as telling:
-                json.dumps([asdict(of_query.cost()), asdict(reading.cost), asdict(meter.thermal), meter.totals()])
-            meter.energy.add(telling.cost)
-        meter.load.busy(work.cost)
-        meter.look_at_heat()
-        meter.reading()
-        taken_s.append(time.process_time() - begin_s)
-    return row_of("metering, of a query", 100 * statistics.mean(taken_s) / query_s, "%", 1.0)
 
 
 def start_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:

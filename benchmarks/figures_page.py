@@ -12,7 +12,6 @@ from base import REPOSITORY, RESULTS
 from edgevpr.core.text import markdown
 
 BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
-FORMS = (" 8bit", " 1bit")
 
 
 def main() -> None:
@@ -37,9 +36,9 @@ def recall(contents: list[dict[str, Any]]) -> str:
         by_flight.append(said.format(set=content["set"], name=name, **content["techniques"][name]))
     return (
         "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries after the use of a set):\n\n"
-        f"{sets_page.overview(contents, lambda label: not label.endswith(FORMS))}\n\n"
+        f"{sets_page.overview(contents, lambda label: not label.endswith(sets_page.FORMS))}\n\n"
         "The same vectors less the map's mean, a byte or a bit a number:\n\n"
-        f"{sets_page.overview(contents, lambda label: label.endswith(FORMS))}\n\n"
+        f"{sets_page.overview(contents, lambda label: label.endswith(sets_page.FORMS))}\n\n"
         f"Weights in use: {'; '.join(sorted(weights))}.\n\n"
         f"![Precision-recall curves of all techniques on all sets](../benchmarks/results/{sets_page.CURVES})\n\n"
         "Accepted as the place by the rule of the flight:\n\n" + "\n".join(by_flight)
@@ -50,12 +49,9 @@ def speed() -> str:
     """The figures of `make bench` that a builder asks for."""
     content = base.read("bench")
     machine = content["machine"]
-    rows = [
-        [f"encode a frame ({row['entropy']})", f"{row['ours_ms']:.1f} ms", f"{row['ratio']:.1f}x the published way"]
-        for row in content["encode"]
-    ]
+    rows = [[f"encode a frame ({row['entropy']})", f"{row['ours_ms']:.1f} ms", "-"] for row in content["encode"]]
     (match,) = content["match"]
-    rows.append(["compare one place in full", f"{match['ours_ms']:.2f} ms", f"{match['ratio']:.1f}x the published way"])
+    rows.append(["compare one place in full", f"{match['ours_ms']:.2f} ms", "-"])
     for row in content["two_stage"]:
         ratio = f"{row['ratio']:.0f}x the vote over all" if row["ratio"] else row["beside"]
         rows.append([f"query, 10 000 places, {row['camera']}", f"{row['two_stage_ms']:.0f} ms", ratio])

@@ -12,7 +12,7 @@ import base
 import cv2
 import numpy as np
 import rasterio
-from from_orthophoto import Ground, ground_of, laid, mosaic_of, write_tif
+from mosaics import Ground, ground_of, laid, mosaic_of, write_tif
 
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position

@@ -1,9 +1,9 @@
-"""Everything that a hostile world does, again: `make hostile` writes benchmarks/results/hostile.md and hostile.json.
+"""Streams that break, pictures that say nothing, and maps that are damaged, all made from a seed: `make hostile` writes
+benchmarks/results/hostile.md and hostile.json.
 
 python benchmarks/hostile.py [--parts A,B] [--seed N]
 
-Streams that break, pictures that say nothing, maps that are damaged and packets of others are all made from a seed. The
-table says what was tried, how often, and what left the aircraft.
+The tables say what was tried, how often, and what came of it.
 """
 
 import argparse
@@ -11,22 +11,15 @@ from dataclasses import asdict, is_dataclass
 
 import base
 import damaged_streams
-import hostile_bytes
-import hostile_flights
-import hostile_links
 import hostile_maps
 import hostile_pictures
 from base import Row
 
-# name: (title, how it is run, usual count: of the pictures of each stream, each kind of picture in each map, kind of
-# packet, and in all of maps; of `bytes`, ten times as many bytes)
+# name: (title, how it is run, usual count: of pictures of each stream, pictures of each kind in each map, maps)
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
-    "flights": ("Flights behind such streams: how much older than claimed a picture was", hostile_flights.run, 800),
     "pictures": ("Pictures that say nothing, of other ground, and behind a display", hostile_pictures.run, 100),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
-    "links": ("Links: packets and autopilots that are not ours", hostile_links.run, 1000),
-    "bytes": ("Bytes and packets: random, changed, and forged", hostile_bytes.run, 1_000_000),
 }
 
 

@@ -1,4 +1,5 @@
-"""Maps damaged in every way, and what becomes of a flight, of the commands and of a repair with each."""
+"""Maps whose bytes are damaged at random, and what becomes of a flight, of the commands and of a repair with each. What
+programs may write into a map, tests/places and tests/runtime/flight try."""
 
 import contextlib
 import io
@@ -6,7 +7,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -28,24 +29,7 @@ from edgevpr.techniques import create
 _PLACES = 12
 _ASKED = (0, 5, 11)  # numbers of the pictures that each map is asked for
 _PAGE = 4096
-_ODD = (None, b"", b"\xff", "text", "\0", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
 _COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
-_ODD_JSON = ("", "null", "7", "[1]", "{}", '{"shape": [1e9], "dtype": "O"}', '{"w1": 1e999}', "[" * 5000, '"\\ud800"')
-_SCHEMA = (
-    "DROP TABLE places",
-    "ALTER TABLE places RENAME TO gone",
-    "ALTER TABLE places RENAME COLUMN fine TO fein",
-    "DROP TABLE edgevpr_map",
-    "DELETE FROM edgevpr_map",
-    "DELETE FROM gpkg_contents",
-    "UPDATE gpkg_contents SET min_x = NULL, max_y = 'north'",
-    "UPDATE gpkg_geometry_columns SET srs_id = 3857",
-    "ALTER TABLE places RENAME TO old; CREATE VIEW places AS WITH RECURSIVE n(place_id) AS "
-    "(SELECT 1 UNION ALL SELECT place_id + 1 FROM n) SELECT n.place_id, geom, time, alt_m, heading_deg, source_image, "
-    "quality, geom_crc32, coarse_crc32, fine_crc32, coarse, fine FROM n, old",
-)
-# What an owner may do to a map before a flight, and nobody in one.
-IN_FLIGHT_ONLY = ("another map", "moved by a program")
 
 Rng = np.random.Generator
 
@@ -77,93 +61,34 @@ def _position(path: Path, rng: Rng) -> None:
     path.write_bytes(data)
 
 
-def _written(path: Path, *statements: tuple[str, tuple]) -> None:
-    with contextlib.closing(sqlite3.connect(path)) as db, db:
-        for statement, values in statements:
-            with contextlib.suppress(sqlite3.IntegrityError):
-                db.execute(statement, values) if values else db.executescript(statement)
-
-
-def _values(path: Path, rng: Rng) -> None:
-    places = [int(each) for each in rng.integers(1, _PLACES + 1, rng.integers(1, _PLACES))]
-    changes = [(_COLUMNS[rng.integers(len(_COLUMNS))], _ODD[rng.integers(len(_ODD))], place) for place in places]
-    _written(path, *((f"UPDATE places SET {c} = ? WHERE place_id = ?", (value, place)) for c, value, place in changes))
-
-
-def _swapped(path: Path, rng: Rng) -> None:
-    one, other = (int(each) + 1 for each in rng.choice(_PLACES, 2, replace=False))
-    column = ("fine", "coarse", "fine_crc32")[rng.integers(3)]
-    taken = f"SELECT {column} FROM places WHERE place_id = ?"
-    _written(path, (f"UPDATE places SET {column} = ({taken}) WHERE place_id = ?", (one, other)))
-
-
-def _rows(path: Path, rng: Rng) -> None:
-    what = ("DELETE FROM places WHERE place_id % ? = 0", "UPDATE places SET place_id = place_id + 100 * ?")
-    _written(path, (what[rng.integers(2)], (int(rng.integers(1, 5)),)))
-
-
-def _spec(path: Path, rng: Rng) -> None:
-    keys = ("format_version", "map_id", "technique", "parameters", "model_sha256", "coarse", "fine", "packed")
-    change = (_ODD_JSON[rng.integers(len(_ODD_JSON))], keys[rng.integers(len(keys))])
-    _written(path, ("UPDATE edgevpr_map SET value = ? WHERE key = ?", change))
-
-
-def _another(path: Path, rng: Rng) -> None:
-    for place in range(1, _PLACES + 1):
-        _moved_to(path, place, 51 + rng.random())
-    if rng.random() < 0.5:
-        _written(path, ("UPDATE edgevpr_map SET value = ? WHERE key = 'map_id'", (f'"{rng.bytes(4).hex()}"',)))
-
-
-def _moved_to(path: Path, place: int, lat_deg: float) -> None:
-    _written(path, ("UPDATE places SET geom = ? WHERE place_id = ?", (point_blob(lat_deg, 9.0), place)))
-
-
 KINDS: dict[str, Callable[[Path, Rng], None]] = {
     "bits flipped": _bits,
     "bits of the header flipped": lambda path, rng: _bits(path, rng, 0, 100, most=3),
     "pages overwritten": _pages,
     "cut": lambda path, rng: os.truncate(path, int(rng.random() * path.stat().st_size)),
     "bits of a position flipped": _position,
-    "values of a wrong type": _values,
-    "parts of places exchanged": _swapped,
-    "rows gone or renumbered": _rows,
-    "description damaged": _spec,
-    "tables changed": lambda path, rng: _written(path, (_SCHEMA[rng.integers(len(_SCHEMA))], ())),
-    "another map": _another,
-    "moved by a program": lambda path, rng: _moved_to(path, int(rng.integers(1, _PLACES + 1)), 51.0),
 }
 
 
-def damaged_maps(folder: Path, whole_map: Path, count: int, seed: int) -> Iterator[tuple[str, Path]]:
-    """Write `count` damaged copies of a map into the folder, one after the other; yield the kind of damage and the path
-    of each. The kinds take turns."""
-    for number in range(count):
-        kind = list(KINDS)[number % len(KINDS)]
-        path = folder / f"{number:05d}.gpkg"
-        shutil.copyfile(whole_map, path)
-        KINDS[kind](path, np.random.default_rng((seed, number)))
-        yield kind, path
-
-
 def run(count: int, seed: int) -> list[Row]:
-    """Try `count` damaged maps, at take-off, in flight, with the commands and with a repair; return a row a kind: how
-    many commands or flights ended with a traceback, queries that accepted another position than the whole map has, and
-    places that could be read, but were lost by a repair."""
-    found: dict[str, list[tuple[int, int, int]]] = {}
+    """Try `count` damaged maps, the kinds in turn, in flight, at take-off, with the commands and with a repair. Returns
+    a row a kind: how many commands or flights ended with a traceback, queries that accepted another position than the
+    whole map has, and places that could be read, but were lost by a repair."""
+    rows = [{"kind": kind, "tried": 0, "tracebacks": 0, "wrong_positions": 0, "places_lost": 0} for kind in KINDS]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         whole = make_whole_map(folder / "whole.gpkg")
-        for kind, path in damaged_maps(folder, whole, count, seed):
+        for number in range(count):
+            row, path = rows[number % len(rows)], folder / f"{number:05d}.gpkg"
+            shutil.copyfile(whole, path)
+            KINDS[row["kind"]](path, np.random.default_rng((seed, number)))
             with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                found.setdefault(kind, []).append(_tried(kind, path, whole))
+                found = _tried(path, whole)
+            for key, value in {"tried": 1, **found}.items():
+                row[key] += value
             for each in folder.glob(path.name + "*"):
                 each.unlink()
-    names = ("tracebacks", "wrong_positions", "places_lost")
-    return [
-        {"kind": kind, "tried": len(each), **dict(zip(names, map(sum, zip(*each, strict=True)), strict=True))}
-        for kind, each in found.items()
-    ]
+    return rows
 
 
 def make_whole_map(path: Path) -> Path:
@@ -187,13 +112,11 @@ def _frame(number: int) -> Frame:
 _BOARD = load_board("this")
 
 
-def _tried(kind: str, path: Path, whole: Path) -> tuple[int, int, int]:
+def _tried(path: Path, whole: Path) -> Row:
     """Return tracebacks, wrong positions and places lost of one damaged map."""
     config, tracebacks, wrong, lost = load_config(None, {"map": str(path)}), 0, 0, 0
     damaged = path.read_bytes()
-    tries: list[Callable[[], int]] = [lambda: _in_flight(config, path, whole, damaged)]
-    if kind not in IN_FLIGHT_ONLY:
-        tries += [lambda: _at_take_off(config), lambda: _learning(config)]
+    tries = (lambda: _in_flight(config, path, whole, damaged), lambda: _at_take_off(config), lambda: _learning(config))
     for each in tries:
         path.write_bytes(damaged)
         try:
@@ -210,9 +133,8 @@ def _tried(kind: str, path: Path, whole: Path) -> tuple[int, int, int]:
         except Exception:
             tracebacks += 1
     if path.with_name(path.name + ".damaged").exists():
-        kept = _rows_of(path, whole)
-        lost = len(readable - kept)
-    return tracebacks, wrong, lost
+        lost = len(readable - _rows_of(path, whole))
+    return {"tracebacks": tracebacks, "wrong_positions": wrong, "places_lost": lost}
 
 
 def _asked(recogniser: Recogniser) -> int:

@@ -43,7 +43,7 @@ NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "
 # Of a set whose sites have no positions on Earth: where they are said to be, how far apart, and the size of a pixel.
 _FIRST_SITE, _SITES_APART_M, _PIXEL_M = (37.0, 36.0), 20_000.0, 0.5
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
-_POINTS = 100  # of a curve that is kept
+_POINTS = 25  # of a curve that is kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def write_original_calc(cards: Path, weights: Path) -> None:
 def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
-    rows: dict[str, Any] = base.read(path.stem, path.parent).get("techniques", {})
+    rows: dict[str, Any] = sets_page.by_name(base.read(path.stem, path.parent))
     if not (wanted := [variant for variant in wanted if can_be_asked(variant, folder, dataset)]):
         return
     for variant in wanted:
@@ -179,7 +179,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
 
         result = evaluate(variant.technique, dataset, settings(variant, folder), variant.options, shown)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
-            "precision_recall": thinned(result.precision_recall),
+            "precision_recall": thinned(result.precision_recall) if sets_page.is_drawn(variant.label) else [],
             "commit": base.commit(),
             "cpu": provenance.cpu_model(),
         }
@@ -188,7 +188,8 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
         row |= asdict(each)  # the slowest encoder of all may be another now
     made = base.made_by()
     content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
-    content["techniques"] = {row["technique"]: row for row in in_order}
+    content["ah_assumes"] = in_order[0]["ah_assumes"]
+    content["rows"] = [{key: value for key, value in row.items() if key != "ah_assumes"} for row in in_order]
     base.write_json(path.stem, content, path.parent)
 
 

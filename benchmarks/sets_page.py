@@ -1,6 +1,5 @@
 """The page that sums up the result files of the image sets, `sets.md`, and its precision-recall curves."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,12 @@ from edgevpr.lab.evaluate.metrics import Quality
 
 CURVES = "curves.png"
 _PANELS_A_ROW = 3
+_PAID = ("grief_stromovka_seasons", "aerial_swindale")  # whose costs are shown: ahead, and down
 # More than ten colours cannot be told apart: after ten curves the line style changes.
 _LINES = ("-", "--", ":", "-.")
-# What is drawn: the forms of a vector, and what is the same technique under other conditions, would hide the rest.
-_NOT_DRAWN = (" 8bit", " 1bit", ", exact", ", one frame", " candidates")
+FORMS = (" 8bit", " 1bit")  # of a vector
+# What is drawn: forms, and what is the same technique under other conditions, would hide the rest.
+_NOT_DRAWN = (*FORMS, ", exact", ", one frame", " candidates")
 
 _ABOUT = """\
 `cohog` is as it flies: a scan of 144 bytes a place (looking down 1120), then the displacement vote over the best
@@ -41,26 +42,37 @@ what networks reach there is not clean. A sequence wants a flight along the mapp
 grief_stromovka_seasons and nordland_tiny are such. The pictures of nordland_tiny have 64x32 pixels, which every
 technique enlarges: it is here for its thousand places. Of a network other than the shipped one nothing is accepted
 before the user says from when on. The truth of the aerial sets was computed by image registration: it favours pairs
-that local features can match, and says nothing of others. The JSON files beside this page hold every figure.
+that local features can match, and says nothing of others. Of the forms of vectors only recall is shown: the JSON files
+beside this page hold every figure.
 """
 
 
 def result(row: dict[str, Any]) -> TechniqueResult:
-    """A row of a file as what it was. Older rows do not say how far away a wrong place was: it counts as far."""
-    return from_json({"accepted_elsewhere": row["accepted_wrong"], **row})
+    """Return a row of a file as what it was."""
+    return from_json(row)
 
 
 def read_sets(folder: Path) -> list[dict[str, Any]]:
     """Read the results of all image sets in a folder."""
-    contents = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    return [content for content in contents if "techniques" in content]
+    contents = [base.read(path.stem, folder) for path in sorted(folder.glob("*.json"))]
+    return [{**content, "techniques": by_name(content)} for content in contents if "ah_assumes" in content]
+
+
+def by_name(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the rows of a file of results ({}: there is none) by the technique."""
+    return {row["technique"]: {"ah_assumes": content["ah_assumes"], **row} for row in content.get("rows", ())}
+
+
+def is_drawn(label: str) -> bool:
+    """Return whether a row has a curve."""
+    return not label.endswith(_NOT_DRAWN)
 
 
 def write(folder: Path, left_out: dict[str, str]) -> None:
     """Sum up all files of `folder`; `left_out` says of sets that are not there why."""
     contents = read_sets(folder)
     results = {content["set"]: [result(row) for row in content["techniques"].values()] for content in contents}
-    drawn = {name: [each for each in rows if not each.technique.endswith(_NOT_DRAWN)] for name, rows in results.items()}
+    drawn = {name: [each for each in rows if is_drawn(each.technique)] for name, rows in results.items()}
     plot(drawn, folder / CURVES)
     base.shrink(folder / CURVES)
     (folder / "sets.md").write_text(_page(contents, results, left_out))
@@ -88,7 +100,7 @@ def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
         axes.legend(
             title="AUC (2.3)", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13)
         )
-    drawn.savefig(path, dpi=100)
+    drawn.savefig(path, dpi=60)
 
 
 def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict[str, str]) -> str:
@@ -97,14 +109,15 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
         for content in contents
     ]
     machine = contents[0]["machine"]
-    reached = [[name, each.technique, *tables.quality(each)] for name, rows in results.items() for each in rows]
-    paid = [
-        [content["set"], label, *tables.costs(result(row)), row["cpu"]]
+    shown = [
+        (content["set"], row)
         for content in contents
         for label, row in content["techniques"].items()
+        if not label.endswith(FORMS)
     ]
+    reached = [[name, row["technique"], *tables.quality(result(row))] for name, row in shown]
+    paid = [[name, row["technique"], *tables.costs(result(row)), row["cpu"]] for name, row in shown if name in _PAID]
     weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})
-    assumed = next(iter(results.values()))[0].ah_assumes
     page = f"""# Every technique on real images
 
 Made by `make results` with {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}; the table of costs names
@@ -138,8 +151,8 @@ Weights in use:
 
 {markdown(("set", "technique", *tables.COSTS, "machine"), paid)}
 
-* Means over the queries; t_m is for all references. U: share of all cores.
-* mAh: {assumed}.
+* Means over the queries; t_m is for all references. U: share of all cores. Of the other sets the JSON files have them.
+* mAh: {contents[0]["ah_assumes"]}.
 """
     if left_out:
         page += "\n## Left out\n\n"

@@ -7,9 +7,8 @@ near (`foreign_places.py`), in equal mixture at every size. So up to the size of
 from there on only foreign ones do.
 
 Places have no positions: the confidence is the shipped one, and looking down landmarks tell which places show the same
-ground. Each map is asked in a process of its own, one thread. Times are of the processor. Beside that all places are
-compared in full, which no flight has time for: looking ahead, in the map of 200, for every third query.
-Looking down, a third of the foreign places is mirrored ground of the very sites; a map of others only stands beside.
+ground. Each map is asked in a process of its own, one thread. Times are of the processor. Looking down, a
+third of the foreign places is mirrored ground of the very sites.
 
 What is measured stays in sites_work/, so that an interrupted run goes on.
 """
@@ -44,8 +43,6 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 TITLES = {"nadir": "Looking straight down", "forward": "Looking ahead"}
 AHEAD = ("corridor", "grief_stromovka_seasons")  # the sets that look ahead and are large enough to be asked
-EXACT_EVERY = 3  # every third query
-UNLIKE = "unlike"
 WORK = Path("sites_work")
 _BESIDE = 2  # pictures, as where a map has no positions
 _FOUND = {
@@ -72,11 +69,11 @@ _COSTS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--measure", nargs=3, metavar=("CAMERA", "PLACES", "HOW"), help="one map, in this process")
+    parser.add_argument("--measure", nargs=2, metavar=("CAMERA", "PLACES"), help="one map, in this process")
     args = parser.parse_args()
     if args.measure:
-        camera, places, how = args.measure
-        print(json.dumps(measured(camera, int(places), how)))
+        camera, places = args.measure
+        print(json.dumps(measured(camera, int(places))))
         return
     rows = [base.kept(WORK / f"{'_'.join(words)}.json", partial(in_a_process, words)) for words in planned()]
     found = {**base.made_by(), "rows": rows}
@@ -88,14 +85,12 @@ def in_a_process(words: tuple[str, ...]) -> Row:
     return json.loads(done.stdout)
 
 
-def planned() -> Iterator[tuple[str, str, str]]:
+def planned() -> Iterator[tuple[str, str]]:
     """Yield what is to be measured; the map of all places is built before its camera's first."""
     for camera in TITLES:
         _build(camera)
         for size in sorted({*SIZES, len(dataset_of(camera).references)}):
-            yield camera, str(size), "flown"
-    yield "nadir", "5000", UNLIKE
-    yield "forward", "200", "exact"
+            yield camera, str(size)
 
 
 def folders_of(camera: str) -> list[Path]:
@@ -144,14 +139,13 @@ def covering(wanted: list[frozenset[str]]) -> list[str]:
     return cover
 
 
-def part_of(dataset: Dataset, camera: str, count: int, how: str) -> Path:
+def part_of(dataset: Dataset, camera: str, count: int) -> Path:
     """Copy the places of a map of `count` from the map of all, in the same order."""
-    path = WORK / f"{camera}_{count}_{how}.gpkg"
+    path = WORK / f"{camera}_{count}.gpkg"
     path.unlink(missing_ok=True)
     with PlaceMap.open(WORK / f"{camera}.gpkg") as whole:
         names = {place.place_id: place.source_image for place in whole.places()}
-        may_be = [name for name in names.values() if how != UNLIKE or not name.startswith(MIRRORED)]
-        kept = chosen(dataset, may_be, count)
+        kept = chosen(dataset, list(names.values()), count)
         with PlaceMap.create(path, whole.spec) as part, part.transaction():
             for each in examine(whole):
                 if names.get(each.place_id) in kept:
@@ -159,23 +153,20 @@ def part_of(dataset: Dataset, camera: str, count: int, how: str) -> Path:
     return path
 
 
-def measured(camera: str, count: int, how: str) -> Row:
-    """Ask every query in the map of `count` places. `how` is flown, exact (all places compared), or unlike (flown, and
-    no mirrored picture is in the map). `hits` has a + for each query whose best place is right. `accepted_right` were
-    accepted for a right place, or one of which the truth says nothing, `accepted_beside` for one at most two pictures
-    beside a right one, which the truth does not count, and `accepted_wrong` for another. `wrong_by` counts the best
-    places that are wrong by where they are: the query's own site, another site, or the kind of foreign place. Times are
-    medians and a 90th percentile of the processor; `peak_mb` is the highest resident memory of the whole process."""
+def measured(camera: str, count: int) -> Row:
+    """Ask every query in the map of `count` places. `accepted_right` were accepted for a right place, or one of which
+    the truth says nothing, `accepted_beside` for one at most two pictures beside a right one, which the truth does not
+    count, and `accepted_wrong` for another. `wrong_by` counts the best places that are wrong by where they are: the
+    query's own site, another site, or the kind of foreign place. Times are medians and a 90th percentile of the
+    processor; `peak_mb` is the highest resident memory of the whole process."""
     dataset, sites = dataset_of(camera), [folder.name for folder in folders_of(camera)]
-    path = part_of(dataset, camera, count, how)
+    path = part_of(dataset, camera, count)
     recogniser = open_recogniser(walks.config(map=str(path), **{"source.camera": camera}), load_board("this"))
-    if how == "exact":
-        recogniser.candidates = None
     hits, costs, wrong_by, accepted, beside, wrong = [], [], Counter(), 0, 0, []
-    queries = dataset.queries[::EXACT_EVERY] if how == "exact" else dataset.queries
     with recogniser.place_map as place_map:
         names = walks.names_of(place_map, recogniser.index)
-        for number, query in enumerate((queries[0], *queries)):  # the first pays for tables and a cold disk
+        asked = (dataset.queries[0], *dataset.queries)  # the first pays for tables and a cold disk
+        for number, query in enumerate(asked):
             event = recogniser.step(walks.frame(query.path))
             ranked = walks.ranked(event, names)
             if number == 0:
@@ -197,9 +188,7 @@ def measured(camera: str, count: int, how: str) -> Row:
         "camera": camera,
         "places": len(recogniser.index),
         "of_sites": sum(name in set(dataset.references) for name in names),
-        "how": how,
         "queries": len(hits),
-        "hits": "".join("-+"[hit] for hit in hits),
         "recall_at_1": round(float(np.mean(hits)), 4),
         "recall_at_1_interval": interval(np.array(hits)),
         "accepted_right": int(accepted) - beside - len(wrong),
@@ -244,16 +233,7 @@ def page(found: Row) -> str:
         rows = [dict(row) for row in found["rows"] if row["camera"] == camera]
         for row in rows:
             row["where"] = ", ".join(f"{count} {kind}" for kind, count in sorted(row["wrong_by"].items())) or "-"
-        flown, exact, unlike = ([row for row in rows if row["how"] == how] for how in ("flown", "exact", UNLIKE))
-        parts += [f"## {title}: {flown[0]['queries']} queries", base.table(flown, _FOUND), base.table(flown, _COSTS)]
-        for row in exact:
-            (hits,) = (each["hits"][::EXACT_EVERY] for each in flown if each["places"] == row["places"])
-            row["as_flown"] = hits.count("+") / len(hits)
-            parts.append(f"All places compared in full, {exact[0]['queries']} of the queries:")
-            also = {"flown, the same queries": "{as_flown:.3f}", "query ms": "{t_query_ms:.0f}"}
-            parts.append(base.table(exact, {**_FOUND, **also}))
-        if unlike:
-            parts += ["Without mirrored ground:", base.table(unlike, _FOUND)]
+        parts += [f"## {title}: {rows[0]['queries']} queries", base.table(rows, _FOUND), base.table(rows, _COSTS)]
     return "\n\n".join([*parts, base.made_line(found, "make sites")])
 
 

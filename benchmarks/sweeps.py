@@ -29,9 +29,8 @@ import base
 import cv2
 import numpy as np
 import walks
-from base import RESULTS, Row, camera_of
-from from_orthophoto import laid, mosaic_of
-from height_and_tilt import OVERLAP, TOUCHING, area, corners, cut, through
+from base import Row, camera_of
+from mosaics import laid, mosaic_of
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr import techniques
@@ -46,6 +45,8 @@ TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # 
 WORK = Path("sweeps_work")
 _MOST_ASKED = 24
 _LEAST_COVERED, _LEAST_SHOWN = 0.8, 0.7
+_OVERLAP = 0.3  # of a place or of the view is common: it is right
+_TOUCHING = 0.02  # more than this and less than that: it counts neither way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,14 +84,12 @@ def main() -> None:
         rows += base.kept(WORK / f"{folder.name}.json", partial(swept, folder))
     found = {**base.made_by(), "rows": rows}
     base.write("sweeps", found, page(found))
-    draw(rows, RESULTS / "sweeps.png")
 
 
 def swept(folder: Path) -> list[Row]:
-    """Return what each technique finds in its map of a set, at all levels of all sweeps."""
+    """Return what each technique finds in its map of a set, a row for each level of each sweep."""
     camera = camera_of(folder.name)
-    starts = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder))
-    rows = [{"set": folder.name, "camera": camera, "technique": name, "levels": []} for name in TECHNIQUES]
+    starts, rows = list(_over_mosaic(folder) if camera == "nadir" else _ahead(folder)), []
     with ExitStack() as stack:
         asked = []
         for name in TECHNIQUES:
@@ -102,15 +101,14 @@ def swept(folder: Path) -> list[Row]:
         for sweep, level in ((key, level) for key, each in SWEEPS.items() for level in each.of(camera)):
             is_none = level == NONE.get(sweep, 0)
             found = unchanged if is_none else _asked(asked, starts, camera, sweep, level)
-            for row, each in zip(rows, found, strict=True):
-                row["levels"].append({"sweep": sweep, "level": level, **each})
+            rows.append({"set": folder.name, "sweep": sweep, "level": level, **found})
     return rows
 
 
-def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> list[Row]:
+def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, level: float) -> Row:
     """Ask every technique for the place of every start, at one level of a sweep: how many were `asked`, how much of
-    their views showed anything, and which were accepted for which wrong place."""
-    shares, found = [], [{"hits": [], "accepted": 0, "wrong": []} for _ in asked]
+    their views showed anything, and what was `found` by each: recall@1, accepted, accepted for a wrong place."""
+    shares, found = [], [{"hits": [], "accepted": 0, "wrong": 0} for _ in asked]
     for number, start in enumerate(starts):
         rng = np.random.default_rng((number, list(SWEEPS).index(sweep)))
         change = view(camera, sweep, level, start.size, rng) if sweep in OF_CAMERA else np.eye(3)
@@ -120,28 +118,23 @@ def _asked(asked: list[Asked], starts: list[Start], camera: str, sweep: str, lev
         if sweep not in OF_CAMERA:
             image = spoilt(sweep, level, image, rng)
         shares.append(mask.mean())
-        common = _common(start, change @ start.onto)
-        right = start.right | {place for place, share in common.items() if share >= OVERLAP}
-        ignored = start.ignored | {place for place, share in common.items() if TOUCHING < share < OVERLAP}
+        shares_of = _shares_of(start, change @ start.onto)
+        right = start.right | {place for place, share in shares_of.items() if share >= _OVERLAP}
+        ignored = start.ignored | {place for place, share in shares_of.items() if _TOUCHING < share < _OVERLAP}
         for (walk, shown, names), of_it in zip(asked, found, strict=True):
             shown.mask = None if mask.all() else mask
             event = walk.step(walks.frame(image, start.name))
             ranked = walks.ranked(event, names)
             of_it["hits"].append(next((place for place in ranked if place not in ignored), None) in right)
             of_it["accepted"] += event.accepted
-            if event.accepted and ranked[0] not in right | ignored:
-                of_it["wrong"].append((start.name, ranked[0]))
-    return [
-        {
-            "asked": len(shares),
-            "shown": round(float(np.mean(shares)), 3) if shares else 0.0,
-            "recall_at_1": round(float(np.mean(each["hits"])), 4) if shares else None,
-            "accepted": each["accepted"],
-            "accepted_wrong": len(each["wrong"]),
-            "wrong": each["wrong"],
-        }
-        for each in found
-    ]
+            of_it["wrong"] += event.accepted and ranked[0] not in right | ignored
+    recalls = [round(float(np.mean(each["hits"])), 4) if shares else None for each in found]
+    by_technique = zip(TECHNIQUES, recalls, found, strict=True)
+    return {
+        "asked": len(shares),
+        "shown": round(float(np.mean(shares)), 3) if shares else 0.0,
+        "found": {name: (recall, each["accepted"], each["wrong"]) for name, recall, each in by_technique},
+    }
 
 
 def seen(start: Start, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,11 +149,30 @@ def seen(start: Start, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return image, mask
 
 
-def _common(start: Start, onto: np.ndarray) -> dict[str, float]:
+def _shares_of(start: Start, onto: np.ndarray) -> dict[str, float]:
     """Return what each other place and a view have in common, as a share of the smaller of both."""
     width, height = start.size
     ground = through(np.linalg.inv(onto), corners(np.empty((height, width))))
-    return {name: area(cut(ground, lies)) / min(area(ground), area(lies)) for name, lies in start.lies.items()}
+    return {name: area(common(ground, lies)) / min(area(ground), area(lies)) for name, lies in start.lies.items()}
+
+
+def corners(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
+
+
+def through(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return cv2.perspectiveTransform(np.asarray(points, float)[None], homography)[0]
+
+
+def common(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the common part of two convex polygons (N, 2), empty where there is none."""
+    found = cv2.intersectConvexConvex(one.astype(np.float32), other.astype(np.float32))[1]
+    return np.empty((0, 2)) if found is None else found.reshape(-1, 2)
+
+
+def area(polygon: np.ndarray) -> float:
+    return abs(cv2.contourArea(polygon.astype(np.float32)))
 
 
 def _over_mosaic(folder: Path) -> Iterator[Start]:
@@ -211,58 +223,16 @@ def _some(starts):
 def page(found: Row) -> str:
     """Return the page for people."""
     parts = ["# How far off the map", base.told(__doc__, "What is measured")]
-    parts.append("![recall@1 and accepted queries against each change](sweeps.png)")
+    changes = {key: f"{sweep.title}, {sweep.unit}" for key, sweep in SWEEPS.items()}
     for name, rows in base.groups(found["rows"], lambda row: row["set"]):
         columns = {"change": "{change}", "level": "{level:g}", "asked": "{asked}", "shown": "{shown:.2f}"}
-        lines = []
-        for levels in zip(*(row["levels"] for row in rows), strict=True):
-            sweep = SWEEPS[levels[0]["sweep"]]
-            lines.append({**levels[0], "change": f"{sweep.title}, {sweep.unit}"})
-            for row, level in zip(rows, levels, strict=True):
-                lines[-1][row["technique"]] = base.cell("{recall_at_1:.2f} ({accepted}, {accepted_wrong})", level)
-        columns |= {row["technique"]: f"{{{row['technique']}}}" for row in rows}
+        for of in rows[0]["found"]:
+            columns[of] = f"{{found[{of}][0]:.2f}} ({{found[{of}][1]}}, {{found[{of}][2]}})"
+        lines = [{**row, "change": changes[row["sweep"]]} for row in rows]
         parts.append(f"## {name} ({base.use_of(name).replace('tune', 'tuned on')})")
         parts.append("recall@1; in brackets accepted and, of these, wrong.")
         parts.append(base.table(lines, columns))
     return "\n\n".join([*parts, base.made_line(found, "make sweeps")])
-
-
-def draw(found: list[Row], path: Path) -> None:
-    """Draw recall against each change, two lines of panels a set, and of `cohog` what was accepted."""
-    sets = dict(base.groups(found, lambda row: row["set"]))
-    columns = -(-len(SWEEPS) // 2)
-    drawn, axes = base.panels(2.3 * columns, 4.4 * len(sets), 2 * columns * len(sets), 2 * len(sets), sharey=True)
-    for number, (name, rows) in enumerate(sets.items()):
-        of_set = axes[2 * columns * number :][: 2 * columns]
-        of_set[0].set_ylabel(f"{name}\n({base.use_of(name)})", fontsize=9)
-        for axis, (key, sweep) in zip(of_set, SWEEPS.items(), strict=False):
-            for colour, row in enumerate(rows):
-                _curve(axis, row, key, "tab:orange" if row["technique"] == "cohog" else f"C{colour + (colour > 0)}")
-            axis.set(xlabel=sweep.unit, ylim=(-0.03, 1.03))
-            axis.set_title(sweep.title, fontsize=9)
-        for axis in of_set[len(SWEEPS) :]:
-            axis.set_visible(False)
-    handles, labels = axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
-    base.save(drawn, path, 70)
-
-
-def _curve(axis, row: Row, sweep: str, colour: str) -> None:
-    levels = [level for level in row["levels"] if level["sweep"] == sweep and level["asked"]]
-    name, at = row["technique"], [level["level"] for level in levels]
-    recall, width = [level["recall_at_1"] for level in levels], 2 if name == "cohog" else 0.9
-    axis.plot(at, recall, "o-", ms=1.5 * width, lw=width, color=colour, label=f"{name}, recall@1")
-    if name == "cohog":
-        right = [(level["accepted"] - level["accepted_wrong"]) / level["asked"] for level in levels]
-        axis.plot(at, right, "--", color=colour, label="cohog, accepted and right")
-        wrong = [level["accepted_wrong"] / level["asked"] or None for level in levels]
-        axis.plot(at, wrong, "x", color="red", ms=5, zorder=9, label="cohog, accepted and wrong")
-    if sweep in ("dark", "height"):
-        axis.set_xscale("log")
-        axis.set_xticks(at[::2], [f"{level:g}" for level in at[::2]])
-        axis.minorticks_off()
-    if sweep in ("dark", "jpeg") and not axis.xaxis_inverted():
-        axis.invert_xaxis()
 
 
 if __name__ == "__main__":

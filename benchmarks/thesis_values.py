@@ -1,13 +1,14 @@
 """The values of the thesis, from thesis.yaml, this project's results, and what follows from the thesis's own inputs."""
 
 import itertools
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import base
+import sets_page
 import yaml
 
 from edgevpr.lab.evaluate import metrics
@@ -55,9 +56,8 @@ class Results:
 
 def read_results(folder: Path) -> Results:
     """Read the results of a folder."""
-    contents = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
-    sets = {name: content for name, content in contents.items() if "techniques" in content}
-    return Results(sets, contents["bench"], contents["salience"], contents["thesis"])
+    sets = {content["set"]: content for content in sets_page.read_sets(folder)}
+    return Results(sets, *(base.read(name, folder) for name in ("bench", "salience", "thesis")))
 
 
 def corners(formula: Callable[..., float], printed: Iterable[str]) -> tuple[float, float, float]:

@@ -22,6 +22,7 @@ from pathlib import Path
 import base
 import numpy as np
 from base import RESULTS, Row
+from mosaics import read_mosaic
 
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Place
@@ -76,10 +77,7 @@ def load(folder: Path) -> Set:
     solved = _registered(folder, names, tags)
     largest = np.bincount(solved.component).argmax()
     truth = {name: complex(solved.position[at]) for at, name in enumerate(names) if solved.component[at] == largest}
-    rows = base.read_csv(folder / "mosaic_positions.csv")
-    components = [row["component"] for row in rows]
-    of = max(set(components), key=components.count)
-    mosaic = {row["file"]: complex(float(row["x_px"]), -float(row["y_px"])) for row in rows if row["component"] == of}
+    mosaic = {row["file"]: complex(float(row["x_px"]), -float(row["y_px"])) for row in read_mosaic(folder)}
     return Set(folder.name, folder, empty.origin, tags, truth, mosaic)
 
 

@@ -10,15 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import cv2
-import flying
 import numpy as np
 from counted import SMALL
 
 from edgevpr.core.arrays import Image
+from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
 from edgevpr.power.speed import pass_round, product_round
+from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
+from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques import create
 
 PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
@@ -28,7 +30,7 @@ def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the name of each part, and a function that does it."""
     yield from of_camera("ahead", "forward", ahead)
     yield from of_camera("down", "nadir", down)
-    yield from flying.parts(_picture(np.random.default_rng(0)))
+    yield from of_landmarks(_picture(np.random.default_rng(0)))
     yield "micro-benchmark: a round of products", product_round()
     yield "micro-benchmark: a round of passes", pass_round()
 
@@ -71,6 +73,23 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
         yield f"{name}: a query", lambda: query(NOTHING)
         if camera == "nadir":
             yield f"{name}: a query, heading known", lambda: query(known)
+
+
+def of_landmarks(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield what a flight does beside its queries: the landmarks of a frame, and its stride."""
+    moved = cv2.warpAffine(picture, np.float32([[1, 0, 40], [0, 1, 15]]), picture.shape[::-1])
+    view = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0), focal=0.77)
+    before, now = describe(picture, None, OF_QUERY), describe(moved, None, OF_QUERY)
+
+    def stride() -> object:
+        strides = Strides()
+        strides.to(0.0, view, before)
+        if (found := strides.to(1.0, view, now)) is None:
+            raise RuntimeError("no stride was found")
+        return found
+
+    yield "flight: landmarks of a frame", lambda: describe(moved, None, OF_QUERY)
+    yield "flight: the stride since the frame before", stride
 
 
 def mark_each(*maps: str) -> None:

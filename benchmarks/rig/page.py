@@ -18,6 +18,7 @@ from edgevpr.runtime.flight.flightlog import read_log
 
 _SHOWN_PER_M = 0.3  # pixels of the ground in the picture
 _TRUE, _WITH, _WITHOUT = "white", "#20e020", "#ff3030"
+_FEW_BYTES = {"quality": 30, "optimize": True}
 _ESTIMATES = {
     "flight": "{name}",
     "edgevpr": "{which}",
@@ -218,7 +219,7 @@ def draw_claims(folders: list[Path], path: Path) -> None:
             axis.plot(at_s, np.full(len(at_s), -0.04 * top_m), "|", color=colour, ms=4)
         axis.set(xlim=(0, None), ylim=(-0.08 * top_m, top_m))
         axis.set_title(folder.name, fontsize=9)
-    drawn.savefig(path, dpi=70)
+    drawn.savefig(path, dpi=56, pil_kwargs=_FEW_BYTES)
 
 
 def _draw(work: Path, names: list[str], path: Path) -> None:
@@ -242,4 +243,4 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
         axis.set(xlim=(-80, ground.WIDTH_M + 80), ylim=(-80, ground.DEPTH_M + 80), facecolor="0.25")
         axis.set_title("; ".join(titles), fontsize=9)
         axis.grid(False)
-    drawn.savefig(path, dpi=70)
+    drawn.savefig(path, dpi=56, pil_kwargs=_FEW_BYTES)

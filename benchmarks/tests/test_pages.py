@@ -17,14 +17,10 @@ PAGES = {
     "bench": "bench",
     "confidence": "confidence",
     "flights": "flights",
-    "from_orthophoto": "from_orthophoto",
-    "height_and_tilt": "height_and_tilt",
     "hostile": "hostile",
     "salience": "bench_salience",
     "sites": "sites",
-    "soak": "soak",
     "sweeps": "sweeps",
-    "test_arm64": "on_arm64",
     "where": "where",
 }
 
@@ -33,7 +29,7 @@ def loaded(name: str):
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        if error.name in ("torch", "skimage"):
+        if error.name == "torch":
             pytest.skip(f"{error.name} is not installed")
         raise
 

@@ -1,11 +1,10 @@
 """`make results` on a folder with one small set."""
 
-import json
-
 import base
 import cv2
 import pytest
 import run_sets
+import sets_page
 from pictures import textured
 
 from edgevpr.core.geodesy import distance_m
@@ -33,7 +32,7 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
         measure(tmp_path / "data", tmp_path / "out", "--variants", variants)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["curves.png", "meadow.json", "sets.md"]
 
-    content = json.loads((tmp_path / "out" / "meadow.json").read_text())
+    (content,) = sets_page.read_sets(tmp_path / "out")
     assert content["use"] == "report"
     assert content["machine"]["cores"] >= 1
     assert list(content["techniques"]) == ["cohog", "hog", "seqslam"]
@@ -53,7 +52,8 @@ def test_a_set_of_sites_gets_positions_and_what_is_known_is_measured_where_there
     (tmp_path / "data" / "sat_town" / "sites.csv").write_text("\n".join(["file,site,time,x_px,y_px,yaw_deg", *rows]))
     measure(tmp_path / "data", tmp_path / "out", "--variants", "cohog, known")
     assert not (tmp_path / "out" / "meadow.json").exists(), "it has no headings"
-    found = json.loads((tmp_path / "out" / "sat_town.json").read_text())["techniques"]["cohog, known"]
+    (content,) = sets_page.read_sets(tmp_path / "out")
+    found = content["techniques"]["cohog, known"]
     assert (found["known"], found["parameters"]["camera"]) == ("heading,height", "nadir")
 
     placed = run_sets.placed(tmp_path / "data" / "sat_town", tmp_path)

@@ -2,11 +2,13 @@
 
 import random
 
+from conversing import Autopilot
+
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 
-def a_packet_of_every_kind(rng: random.Random) -> list[bytes]:
-    packer = mavlink.MAVLink(None, 1, 1)
+def a_packet_of_every_kind(rng: random.Random, system_id: int = 1) -> list[bytes]:
+    packer = mavlink.MAVLink(None, system_id, 1)
     packets = []
     for kind in mavlink.mavlink_map.values():
         message = mavlink.MAVLink_message(kind.id, kind.msgname)
@@ -48,3 +50,16 @@ def test_damaged_packets_and_noise_never_raise_and_are_counted():
     assert receiver.bad_bytes > 10_000
     assert sum(receiver.received.values()) > 200
     assert len(receiver.received) <= len(packets) + 1  # messages of unknown number share one name
+
+
+def test_any_content_of_the_autopilots_messages_raises_nothing():
+    rng, autopilot = random.Random(3), Autopilot()
+    for _ in range(30):
+        for packet in a_packet_of_every_kind(rng, system_id=7):
+            autopilot.wait(0.01)
+            autopilot.conversation.hear(packet, autopilot.clock.now_s, None)
+        autopilot.put_fix()
+        autopilot.told()
+        autopilot.at(autopilot.clock.now_s)
+    received = autopilot.conversation.reader.received
+    assert received.total() - received["UNKNOWN"] > 30 * 300

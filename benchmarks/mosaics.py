@@ -1,15 +1,6 @@
-"""Maps without a mapping flight, on real pictures: `python from_orthophoto.py`, part of `make results`.
+"""Mosaics of real aerial pictures: those of a set laid over each other by its mosaic_positions.csv, and their place on
+Earth."""
 
-The pictures ref/ of a set are laid over each other by mosaic_positions.csv, as one geo-referenced GeoTIFF. A map is cut
-from it by `edgevpr map build --orthophoto`, and the set's queries are matched with it. The truth is where the same
-mosaic has the query. So camera, day and light are nearly the flight's own, and only flown and mapped ground differ in
-how they were made: a survey or satellite picture of another season is harder, and none is at hand.
-
-Footprints were chosen to fit each set, as a user does who knows his camera and height. Writes from_orthophoto.json and
-from_orthophoto.md into benchmarks/results/.
-"""
-
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,24 +8,12 @@ import base
 import cv2
 import numpy as np
 import rasterio
-from base import Row
 from rasterio.warp import transform
 
-from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
 
-# Set: footprint and spacing in metres.
-CASES = {"aerial_caliterra": (64.0, 16.0), "aerial_garfield28": (140.0, 35.0), "aerial_swindale": (120.0, 30.0)}
 _ROUNDS = 10
-_COLUMNS = {
-    "set": "{set}",
-    "use": "{use}",
-    "footprint / spacing m": "{footprint_m:g} / {spacing_m:g}",
-    **{name: f"{{{name}}}" for name in ("places", "queries", "right", "accepted")},
-    "wrong": "{accepted_wrong}",
-    "fix error m": "{error[median_m]} / {error[p90_m]}",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +32,17 @@ class Laid:
         return np.column_stack([turned, self.middle[name] - turned @ middle])
 
 
-def laid(folder: Path) -> Laid:
-    """Read the largest component of a set's mosaic, scaled so that a picture keeps about its resolution."""
+def read_mosaic(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of the largest component of a set's mosaic."""
     rows = base.read_csv(folder / "mosaic_positions.csv")
     components = [row["component"] for row in rows]
-    of = max(set(components), key=components.count)
-    rows = [row for row in rows if row["component"] == of]
+    largest = max(set(components), key=components.count)
+    return [row for row in rows if row["component"] == largest]
+
+
+def laid(folder: Path) -> Laid:
+    """Read a set's mosaic, scaled so that a picture keeps about its resolution."""
+    rows = read_mosaic(folder)
     per_px = 1 / np.median([float(row["scale"]) for row in rows])
     scale = {row["file"]: float(row["scale"]) * per_px for row in rows}
     at = {row["file"]: np.array([float(row["x_px"]), float(row["y_px"])]) * per_px for row in rows}
@@ -136,59 +120,3 @@ def _similarity(pixels: np.ndarray, metres: np.ndarray) -> tuple[complex, comple
         off = abs(scale * pixels + offset - metres)
         kept = off < 2.5 * np.median(off)
     return complex(scale), complex(offset)
-
-
-def measure(folder: Path, footprint_m: float, spacing_m: float, work: Path) -> Row:
-    """Cut a map of a set's mosaic, and match its queries."""
-    tif, path, on = work / f"{folder.name}.tif", work / f"{folder.name}.gpkg", laid(folder)
-    ground = ground_of(folder, on)
-    write_tif(tif, ground, *mosaic_of(folder, on, "ref"))
-    truth = {name: ground.position(at) for name, at in on.middle.items() if (folder / "query" / name).is_file()}
-    flags = ("--footprint-m", f"{footprint_m:g}", "--spacing-m", f"{spacing_m:g}")
-    built = base.edgevpr("map", "build", path, "--orthophoto", tif, *flags)
-    matches = base.edgevpr("match", path, "--images", folder / "query")
-    known = [match for match in matches if match["query"] in truth and match["place"]]
-
-    def off_m(match: Row, where: str) -> float:
-        return float(distance_m(*truth[match["query"]], match[where]["lat_deg"], match[where]["lon_deg"]))
-
-    errors_m = [off_m(match, "position") for match in known if match["accepted"]]
-    median_m, p90_m = np.percentile(errors_m, (50, 90)).tolist()
-    return {
-        "set": folder.name,
-        "use": base.use_of(folder.name),
-        "footprint_m": footprint_m,
-        "spacing_m": spacing_m,
-        "places": built["places"],
-        "queries": len(known),
-        "right": sum(off_m(match, "place") < footprint_m / 2 for match in known),
-        "accepted": len(errors_m),
-        "accepted_wrong": sum(error_m > footprint_m / 4 for error_m in errors_m),
-        "error": {"median_m": round(median_m, 1), "p90_m": round(p90_m, 1)},
-    }
-
-
-def main() -> None:
-    found = {**base.made_by(), "sets": []}
-    with tempfile.TemporaryDirectory(prefix="edgevpr-orthophoto-") as work:
-        for folder in base.find_sets(names=CASES):
-            found["sets"].append(measure(folder, *CASES[folder.name], Path(work)))
-    base.write("from_orthophoto", found, page(found))
-
-
-def page(found: Row) -> str:
-    return f"""# Maps cut from an orthophoto
-
-{base.told(__doc__, "Footprints were")}
-
-Right: the best place is within half a footprint of the truth. Wrong: accepted, and the fix is a quarter of a footprint
-off or more. Errors: median / 90 % of the accepted.
-
-{base.table(found["sets"], _COLUMNS)}
-
-{base.made_line(found, "python benchmarks/from_orthophoto.py")}
-"""
-
-
-if __name__ == "__main__":
-    base.run(main)
