@@ -243,4 +243,4 @@ def _draw(work: Path, names: list[str], path: Path) -> None:
         axis.set(xlim=(-80, ground.WIDTH_M + 80), ylim=(-80, ground.DEPTH_M + 80), facecolor="0.25")
         axis.set_title("; ".join(titles), fontsize=9)
         axis.grid(False)
-    drawn.savefig(path, dpi=56, pil_kwargs=_FEW_BYTES)
+    drawn.savefig(path, dpi=48, pil_kwargs=_FEW_BYTES)
