@@ -12,10 +12,12 @@ import av.logging
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
+from edgevpr.frames.causes import NoVideoError, explain_failure
 from edgevpr.frames.images import jpeg_is_whole
-from edgevpr.frames.shot import Refusal
+from edgevpr.frames.shot import Refusal, StreamFacts
 
 if TYPE_CHECKING:
+    from _typeshed import SupportsRead
     from av.container import InputContainer
     from av.packet import Packet
     from av.video.frame import VideoFrame
@@ -31,20 +33,26 @@ _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up f
 
 
 def open_pictures(
-    uri: str, options: dict[str, str], timeouts_s: tuple[float, float] | None = None, form: str | None = None
-) -> "WholePictures | None":
+    uri: str,
+    options: dict[str, str],
+    timeouts_s: tuple[float, float] | None = None,
+    form: str | None = None,
+    file: "SupportsRead[bytes] | None" = None,
+) -> "WholePictures":
     """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). Returns None if it cannot be
-    opened or has no pictures."""
+    for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). `file`: an open file that is
+    read instead. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
     with av.logging.Capture() as said:
         try:
-            container = av.open(uri, format=form, options=options, timeout=timeouts_s)
-        except (av.FFmpegError, OSError, ValueError):
-            return None
-    if container.streams.video:
+            container = av.open(file or uri, "r", format=form, options=options, timeout=timeouts_s)
+        except (av.FFmpegError, OSError, ValueError) as error:
+            messages = [message for _, _, message in said]
+            raise explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
+    if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
         return WholePictures(container, _is_missed(said))
+    has_video = bool(container.streams.video)
     container.close()
-    return None
+    raise NoVideoError("a codec that FFmpeg does not know" if has_video else "no video in the stream")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +87,19 @@ class WholePictures:
         self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
         self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
         self._has_begun = False
+
+    @property
+    def facts(self) -> StreamFacts:
+        """What the stream states of its pictures; known once one is decoded."""
+        aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
+        return StreamFacts(
+            width_px=self._codec.width,
+            height_px=self._codec.height,
+            codec=self._codec.name,
+            bits=self._codec.format.components[0].bits if self._codec.format else 8,
+            pixel_aspect=float(aspect or 1),
+            rate_hz=float(rate) if rate and self.is_stamped else None,
+        )
 
     def caught_up(self) -> None:
         """Trust the packets that are fetched from now on: they were sent after the opening."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
+from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, StreamFacts, coarse
 from edgevpr.frames.source import Source
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
@@ -54,6 +54,7 @@ class LiveSource(Source):
         self.dropped: int = 0
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
+        self.facts: StreamFacts | None = None  # of the first picture; None for a device
         self._open_capture = open_capture
         self._clock = clock
         self._t_start_s = clock()
@@ -91,6 +92,7 @@ class LiveSource(Source):
             except OpeningError as error:
                 cause = str(error)
             if capture is not None:
+                cause = "no picture came"
                 self._take_pictures(capture)
                 capture.release()
             has_failed_again = wait_s and self._captured == before
@@ -112,6 +114,7 @@ class LiveSource(Source):
             elif shot.t_mono_s < self._last_taken_s:
                 self._refuse(Refusal.LATE)
             else:
+                self.facts = self.facts or getattr(capture, "facts", None)
                 self._put(shot)
 
     def _put(self, shot: Shot) -> None:

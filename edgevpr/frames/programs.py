@@ -13,9 +13,10 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from edgevpr.core.errors import SourceError
-from edgevpr.frames.shot import Refusal, Shot
+from edgevpr.frames.shot import OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_stream
 
 _RIBBON, _PIPELINE = "rpicam-vid", "gst-launch-1.0"
@@ -62,8 +63,8 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture | N
     )
     end_s = time.monotonic() + _STARTS_S
     while process.poll() is None and time.monotonic() < end_s:
-        if stream := open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg"):
-            return ProgramCapture(stream, process)
+        with suppress(OpeningError):
+            return ProgramCapture(open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg"), process)
         time.sleep(_LOOK_S)
     why = (
         f"run `{_PIPELINE} -v` with it to see why, and end it with raw video (video/x-raw)"

@@ -68,6 +68,24 @@ class OpeningError(Exception):
     """A camera or stream cannot be opened at present. The text names the cause in a few words, for `Source.state`."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamFacts:
+    """What a stream states of its pictures: size, name of the codec, bits of a channel, width of a pixel by its height,
+    and pictures per second (None: not stated)."""
+
+    width_px: int
+    height_px: int
+    codec: str
+    bits: int
+    pixel_aspect: float
+    rate_hz: float | None
+
+    def __str__(self) -> str:
+        shape = "square pixels" if self.pixel_aspect == 1 else f"pixels {self.pixel_aspect:.3g} times as wide as high"
+        rate = f", {self.rate_hz:.3g} pictures a second" if self.rate_hz else ""
+        return f"{self.codec}, {self.bits} bits a channel, {shape}{rate}"
+
+
 class Capture(Protocol):
     """An open camera or stream, used by one thread from opening to release."""
 

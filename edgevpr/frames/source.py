@@ -17,13 +17,17 @@ from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageErro
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
-from edgevpr.frames.images import EXTENSIONS, cv2, list_images, read_image
+from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, Refusal
 
 _READ_TIMEOUT_S = 1.0
+_SNAPSHOT_PERIOD_S = 0.5
 _BY_PROGRAM = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
-_ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|udp://.*:\d+.*")  # udp://:PORT: on all interfaces
+# udp://:PORT: on all interfaces.
+_ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
+# A password with a character that ends the part of an address in which FFmpeg looks for one. Port digits are none.
+_UNESCAPED = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
 
 
 class Source:
@@ -161,7 +165,8 @@ def open_source(
 ) -> Source:
     """Open the source that `uri` names: a path, device or address.
 
-    `step_s`: least video time in seconds between two frames of a video file (None: every frame).
+    `step_s`: least video time in seconds between two frames of a video file (None: every frame); of an address of a
+    single picture, seconds between two requests (None: 0.5).
     `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
     video the table that `positions.read_track` reads (None: the .csv of the same name beside it, else frames have no
     positions).
@@ -180,7 +185,7 @@ def open_source(
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
         from edgevpr.frames.live import LiveSource
 
-        return LiveSource(_capture_of(uri, clock), clock)
+        return LiveSource(_capture_of(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
@@ -214,14 +219,20 @@ def is_by_program(uri: str) -> bool:
     return bool(_BY_PROGRAM.fullmatch(uri))
 
 
-def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | None]:
-    """Return a function that opens the camera or stream `uri`. Raises SourceError if that can never succeed."""
+def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture | None]:
+    """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
+    each must be requested. Raises SourceError if that can never succeed."""
     if is_by_program(uri):
         from edgevpr.frames.programs import open_by_program, require_program  # loads FFmpeg
 
         require_program(uri)
         return lambda: open_by_program(uri, clock)
     if "://" in uri:
+        if _UNESCAPED.fullmatch(uri):
+            raise SourceError(
+                "The password in the address of the source must be percent-encoded: write %2F for /, %23 for #, %3F "
+                "for ?, %40 for @, %25 for % and %20 for a space."
+            )
         if not _ADDRESS.fullmatch(uri):
             raise SourceError(
                 f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
@@ -231,9 +242,9 @@ def _capture_of(uri: str, clock: Callable[[], float]) -> Callable[[], Capture | 
     elif not os.access(uri, os.R_OK):
         raise SourceError(f"{uri} may not be read by this user: add the user to the group of the file, often `video`.")
     elif uri.startswith("/dev/"):
-        from edgevpr.frames.live import DeviceCapture
+        from edgevpr.frames.devices import open_device
 
-        return lambda: DeviceCapture(cv2.VideoCapture(uri, cv2.CAP_V4L2), clock)
-    from edgevpr.frames.streams import open_stream  # loads FFmpeg
+        return lambda: open_device(uri, clock)
+    from edgevpr.frames.streams import open_address  # loads FFmpeg
 
-    return lambda: open_stream(uri, clock)
+    return lambda: open_address(uri, clock, period_s)

@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from edgevpr.core.arrays import Image
+from edgevpr.frames.causes import TransportError
 from edgevpr.frames.decoding import Fetched, WholePictures, open_pictures
-from edgevpr.frames.shot import Refusal, Shot, coarse
+from edgevpr.frames.rtp import describe_rtp
+from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts, coarse
+from edgevpr.frames.webpictures import PartsFile, Snapshots, open_request
 
 if TYPE_CHECKING:
+    from _typeshed import SupportsRead
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
@@ -25,7 +29,9 @@ READ_TIMEOUT_S = 3.0
 # packets back to wait for the missing one: at least two. It opens the addresses in an .sdp file only if these protocols
 # are allowed.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
-_SDP_OPTIONS = {"protocol_whitelist": "file,rtp,udp"}
+# Some cameras send RTSP by UDP only. FFmpeg then waits 0.1 s for a packet that is missing, and reports it.
+_UDP_OPTIONS = {"rtsp_transport": "udp"}
+_SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
 _BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # prefixes of pixel formats whose first plane is the brightness
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
@@ -38,13 +44,44 @@ _USUAL_OF, _AS_USUAL = 9, 1.5  # number of waits whose median is the usual one, 
 _WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due to the path, and not to congestion
 
 
-def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -> "StreamCapture | None":
-    """Open a network stream or an .sdp file, with time-outs; None if it cannot be opened. `clock` is the monotonic
-    clock, in seconds; `form` FFmpeg's name of a format without time stamps (None: it finds out)."""
+def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | Snapshots":
+    """Open a network stream or an .sdp file as `open_stream` does, or an address of a single picture, which is then
+    requested every `period_s` seconds."""
+    if not uri.lower().startswith("http"):
+        return open_stream(uri, clock)
     opened_s = clock()
+    request = open_request(uri, READ_TIMEOUT_S)
+    if request is None:
+        return open_stream(uri, clock)  # or the cause
+    kind = request.headers.get_content_type()
+    if kind.startswith("multipart/"):
+        return StreamCapture(_open(uri, "mpjpeg", PartsFile(request)), clock, opened_s)
+    if kind == "application/octet-stream":  # FFmpeg as a server says so; a second request would find it gone
+        return StreamCapture(_open(uri, None, request), clock, opened_s)
+    request.close()
+    if kind.startswith("image/"):
+        return Snapshots(uri, period_s, READ_TIMEOUT_S, clock)
+    if kind == "text/html":
+        raise OpeningError(f"no video at this address, but {kind}")
+    return open_stream(uri, clock)
+
+
+def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -> "StreamCapture":
+    """Open a network stream or an .sdp file, with time-outs. `clock` is the monotonic clock, in seconds; `form`
+    FFmpeg's name of a format without time stamps (None: it finds out). Raises OpeningError with the cause."""
+    opened_s = clock()
+    return StreamCapture(_open(uri, form), clock, opened_s)
+
+
+def _open(uri: str, form: str | None = None, file: "SupportsRead[bytes] | None" = None) -> WholePictures:
     options = _RAW_OPTIONS if form else _OPTIONS if "://" in uri else _SDP_OPTIONS
-    whole = open_pictures(uri, options, (OPEN_TIMEOUT_S, READ_TIMEOUT_S), form)
-    return StreamCapture(whole, clock, opened_s) if whole else None
+    if uri.lower().startswith(("udp:", "rtp:")) and (sdp := describe_rtp(uri, OPEN_TIMEOUT_S)):
+        uri, form, options = sdp, "sdp", _SDP_OPTIONS
+    timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
+    try:
+        return open_pictures(uri, options, timeouts_s, form, file)
+    except TransportError:
+        return open_pictures(uri, _UDP_OPTIONS, timeouts_s)
 
 
 class StreamCapture:
@@ -58,6 +95,10 @@ class StreamCapture:
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
         self._arrivals = Arrivals(whole.fetch, clock)
+
+    @property
+    def facts(self) -> StreamFacts:
+        return self._whole.facts
 
     def read(self) -> Shot | Refusal | None:
         while not self._ready:

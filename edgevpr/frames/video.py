@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
-from edgevpr.frames.decoding import open_pictures
+from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.positions import GeoTag, Track, parse_time
-from edgevpr.frames.shot import Refusal
+from edgevpr.frames.shot import OpeningError, Refusal
 from edgevpr.frames.source import RecordingSource, tagged
 
 if TYPE_CHECKING:
@@ -25,15 +25,20 @@ _CUT_S = 1.0  # seconds that may be missing at the end: other streams in the fil
 def recorded_at(path: Path) -> tuple[float | None, float]:
     """Return when a video was begun, in seconds since 1970 by the clock of the camera (None: it does not say), and how
     many seconds it lasts (0: unknown). Raises SourceError for a file that is no video."""
-    whole = open_pictures(str(path), {})
-    if whole is None:
-        raise SourceError(f"{path} is not a video that can be decoded: give the video file of the positions.")
+    whole = _open_video(path, "the video file of the positions")
     said = {**whole.container.metadata, **whole.stream.metadata}.get("creation_time")
     lasts_s = (whole.container.duration or 0) / 1e6
     whole.close()
     with suppress(ValueError, OverflowError):
         return (parse_time(said) if said else None), lasts_s
     return None, lasts_s
+
+
+def _open_video(path: Path, wanted: str) -> WholePictures:
+    try:
+        return open_pictures(str(path), {})
+    except OpeningError:
+        raise SourceError(f"{path} is not a video that can be decoded: give {wanted}.") from None
 
 
 class VideoSource(RecordingSource):
@@ -54,10 +59,8 @@ class VideoSource(RecordingSource):
     ):
         super().__init__(only)
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track
-        whole = open_pictures(str(path), {})
-        if whole is None:
-            raise SourceError(f"{path} is not a video that can be decoded: give a video file or a folder of images.")
-        self._whole, stream = whole, whole.stream
+        self._whole = whole = _open_video(path, "a video file or a folder of images")
+        stream = whole.stream
         self._unit_s, self._first_stamp = float(whole.time_base), stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
         self._is_stamped = whole.is_stamped

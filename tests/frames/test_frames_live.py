@@ -82,8 +82,8 @@ def test_a_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened
     with socket.socket() as closed:  # bound but not listening: every connection is refused
         closed.bind(("127.0.0.1", 0))
         source = opened(f"tcp://127.0.0.1:{closed.getsockname()[1]}")
-        wait_for(lambda: source.state == "nothing there, reopening in 0.5 s")
-        wait_for(lambda: source.state == "nothing there, reopening in 1 s")
+        wait_for(lambda: source.state == "connection refused, reopening in 0.5 s")
+        wait_for(lambda: source.state == "connection refused, reopening in 1 s")
         assert source.read(0.01) is None
         assert not source.ended
     assert capfd.readouterr().err == ""

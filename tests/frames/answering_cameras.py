@@ -1,0 +1,160 @@
+"""Small cameras on loopback: what they answer is given, and what they send are pictures that all differ."""
+
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+
+import av
+import cv2
+import numpy as np
+
+WIDTH, HEIGHT = 320, 240
+RATE_HZ = 10
+_NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+_SDP = (
+    "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nc=IN IP4 127.0.0.1\r\nt=0 0\r\n"
+    "m=video 0 RTP/AVP 96\r\na=rtpmap:96 {codec}/90000\r\na=control:track0\r\n"
+)
+
+
+def picture(number):
+    return np.roll(cv2.GaussianBlur(_NOISE, (9, 9), 0), 7 * number, axis=1)
+
+
+def encoded(number, extension=".jpg"):
+    return bytes(cv2.imencode(extension, picture(number))[1])
+
+
+class Server:
+    """Calls `answer` with each connection, a file of what it says and nothing else, in a thread of its own."""
+
+    def __init__(self, answer):
+        self._answer, self._listener = answer, socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self):
+        with suppress(OSError):
+            while True:
+                connection, _ = self._listener.accept()
+                threading.Thread(target=self._talk, args=(connection,), daemon=True).start()
+
+    def _talk(self, connection):
+        with suppress(OSError, ValueError), connection, connection.makefile("rb") as asked:
+            self._answer(connection, asked)
+
+    def close(self):
+        self._listener.close()
+
+
+def read_request(asked):
+    """The first line of a request, and its headers by names in small letters; ValueError at the end."""
+    first, headers = asked.readline().decode(), {}
+    if not first:
+        raise ValueError
+    while line := asked.readline().decode().strip():
+        name, _, value = line.partition(":")
+        headers[name.lower()] = value.strip()
+    return first, headers
+
+
+def http(status, kind="text/plain", body=b"nothing"):
+    """An answer to every request: `body`, or what it returns for the number of the request."""
+    numbers = iter(range(10_000))
+
+    def answer(connection, asked):
+        read_request(asked)
+        content = body(next(numbers)) if callable(body) else body
+        head = f"HTTP/1.0 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(content)}\r\n\r\n"
+        connection.sendall(head.encode() + content)
+
+    return answer
+
+
+def multipart(kind, extension, has_length=True, connections=None):
+    """A multipart stream; the times of sending go into a list for each connection, in `connections`."""
+
+    def answer(connection, asked):
+        read_request(asked)
+        connection.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=part\r\n\r\n")
+        sent_s: list[float] = []
+        if connections is not None:
+            connections.append(sent_s)
+        for number in range(10_000):
+            data = encoded(number, extension)
+            length = f"Content-Length: {len(data)}\r\n" if has_length else ""
+            sent_s.append(time.monotonic())
+            connection.sendall(f"--part\r\nContent-Type: {kind}\r\n{length}\r\n".encode() + data + b"\r\n")
+            time.sleep(1 / RATE_HZ)
+
+    return answer
+
+
+def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", codec="H264", authorization=None):
+    """A camera that answers the method `refuses` with `status`. It sends by UDP only: a request for TCP gets a 461, or
+    an "offer" of UDP. `authorization`: what it must be sent for DESCRIBE."""
+
+    def answer(connection, asked):
+        port, is_on = None, threading.Event()
+        is_on.set()
+        try:
+            while True:
+                first, headers = read_request(asked)
+                method, code, body, more = first.split()[0], "200 OK", "", "Public: DESCRIBE, SETUP, PLAY"
+                if method == "DESCRIBE":
+                    more, body = "Content-Type: application/sdp", _SDP.format(codec=codec)
+                if method == "SETUP":
+                    _, _, wanted = headers["transport"].partition("client_port=")
+                    port = int(wanted.split("-")[0]) if wanted else None
+                    more = f"Transport: RTP/AVP;unicast;client_port={wanted or '5000-5001'};server_port=7000-7001"
+                    code = "461 Unsupported Transport" if not wanted and over_tcp == "461" else code
+                if method == refuses and (authorization is None or headers.get("authorization") != authorization):
+                    code, more, body = status, header, body if status == "200 OK" else ""
+                    more = more if status != "200 OK" else "Content-Type: application/sdp"
+                head = f"RTSP/1.0 {code}\r\nCSeq: {headers['cseq']}\r\nSession: 1\r\n{more}\r\n"
+                connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
+                if method == "PLAY":
+                    threading.Thread(target=send_rtp, args=(port, is_on), daemon=True).start()
+        finally:
+            is_on.clear()
+
+    return answer
+
+
+def send_rtp(port, is_on, codec="libx264"):
+    """Send RTP to a port of this machine until `is_on` is cleared."""
+    box = av.open(f"rtp://127.0.0.1:{port}?pkt_size=1200", "w", format="rtp")
+    stream = box.add_stream(codec, rate=RATE_HZ, options={"preset": "ultrafast", "tune": "zerolatency"})
+    stream.width, stream.height, stream.pix_fmt, stream.codec_context.gop_size = WIDTH, HEIGHT, "yuv420p", RATE_HZ // 2
+    number = 0
+    while is_on.is_set():
+        frame = av.VideoFrame.from_ndarray(picture(number), "bgr24").reformat(format="yuv420p")
+        frame.pts = number
+        for packet in stream.encode(frame):
+            box.mux(packet)
+        number += 1
+        time.sleep(1 / RATE_HZ)
+    box.close()
+
+
+def send_rtp_jpeg(port, is_on):
+    """The same with JPEG (RFC 2435), which FFmpeg sends without its end."""
+    sequence = 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number in range(10_000):
+            jpeg = encoded(number)
+            tables = b"".join(part[3:67] for part in jpeg.split(b"\xff\xdb")[1:3])
+            scan_at = jpeg.index(b"\xff\xda")
+            scan = jpeg[scan_at + 2 + int.from_bytes(jpeg[scan_at + 2 : scan_at + 4], "big") : -2]
+            for at in range(0, len(scan), 1200):
+                last = 0x80 * (at + 1200 >= len(scan))
+                head = struct.pack(">BBHII", 0x80, 26 | last, sequence & 0xFFFF, number * 90_000 // RATE_HZ, 7)
+                head += struct.pack(">IBBBB", at, 1, 255, WIDTH // 8, HEIGHT // 8)
+                head += b"" if at else struct.pack(">BBH", 0, 0, len(tables)) + tables
+                sender.sendto(head + scan[at : at + 1200], ("127.0.0.1", port))
+                sequence += 1
+            if not is_on.wait(0) and number:
+                return
+            time.sleep(1 / RATE_HZ)

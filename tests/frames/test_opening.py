@@ -1,0 +1,277 @@
+"""What cannot be opened is said with its cause; what FFmpeg does not open by itself is opened all the same."""
+
+import base64
+import contextlib
+import socket
+import threading
+import time
+from statistics import median
+
+import pytest
+from answering_cameras import (
+    HEIGHT,
+    RATE_HZ,
+    WIDTH,
+    Server,
+    encoded,
+    http,
+    multipart,
+    picture,
+    read_request,
+    rtsp,
+    send_rtp,
+    send_rtp_jpeg,
+)
+from live_sources import wait_for
+from rtsp_camera import free_port
+
+from edgevpr.core.errors import SourceError
+from edgevpr.frames import streams
+from edgevpr.frames.devices import open_device
+from edgevpr.frames.shot import Condition, OpeningError, Shot
+from edgevpr.frames.source import open_source
+from edgevpr.frames.streams import open_address
+
+pytestmark = pytest.mark.network
+PASSWORD = "geh%23heim"
+
+
+@pytest.fixture
+def serve():
+    """A function that starts a camera by its answer, and returns its host and port."""
+    with contextlib.ExitStack() as stack:
+        yield lambda answer: stack.enter_context(contextlib.closing(Server(answer))).address
+
+
+@pytest.fixture
+def sending():
+    """A function that sends RTP by `send`, until the end of the test, and returns the port."""
+    is_on = threading.Event()
+    is_on.set()
+
+    def start(send, *how):
+        port = free_port()
+        threading.Thread(target=send, args=(port, is_on, *how), daemon=True).start()
+        return port
+
+    yield start
+    is_on.clear()
+
+
+def cause_of(uri):
+    with pytest.raises(OpeningError) as refusal:
+        open_address(uri, lambda: 0.0, 0.5)
+    return str(refusal.value)
+
+
+BASIC = 'WWW-Authenticate: Basic realm="camera"'
+
+
+@pytest.mark.parametrize(
+    ("answer", "account", "cause"),
+    [
+        (rtsp("401 Unauthorized", header=BASIC), "", "password needed (401): write USER:PASSWORD@ before the host"),
+        (rtsp("401 Unauthorized", header=BASIC), f"pilot:{PASSWORD}@", "password refused (401): correct it, with"),
+        (rtsp("403 Forbidden"), "", "access forbidden (403)"),
+        (rtsp("404 Not Found"), "", "no stream at this path (404)"),
+        (rtsp("453 Not Enough Bandwidth"), "", "refused by the camera (453)"),
+        (rtsp("503 Service Unavailable"), "", "refused by the camera (503)"),
+        (rtsp("461 Unsupported Transport", refuses="SETUP"), "", "transport refused (461)"),
+        (lambda connection, asked: asked.readline(), "", "connection closed by the camera"),
+        (lambda connection, asked: asked.read(), "", "no answer within 0.7 s"),
+    ],
+)
+def test_rtsp_names_the_cause(answer, account, cause, serve, monkeypatch):
+    monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.7)
+    found = cause_of(f"rtsp://{account}{serve(answer)}/stream")
+    assert found.startswith(cause)
+    assert PASSWORD not in found
+
+
+@pytest.mark.parametrize(
+    ("answer", "cause"),
+    [
+        (http("401 Unauthorized"), "password needed (401)"),
+        (http("403 Forbidden"), "access forbidden (403)"),
+        (http("404 Not Found"), "no stream at this path (404)"),
+        (http("500 Internal Server Error"), "refused by the camera (500)"),
+        (http("200 OK", "text/html", b"<html>log in</html>" * 50), "no video at this address, but text/html"),
+    ],
+)
+def test_http_names_the_cause(answer, cause, serve):
+    assert cause_of(f"http://{serve(answer)}/video").startswith(cause)
+
+
+def test_addresses_without_a_camera_name_the_cause(monkeypatch):
+    monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
+    closed = free_port()
+    for uri in (f"rtsp://127.0.0.1:{closed}/a", f"http://127.0.0.1:{closed}/a", f"tcp://127.0.0.1:{closed}"):
+        assert cause_of(uri) == "connection refused"
+    assert cause_of("rtsp://camera.invalid/a") == "no such host camera.invalid"
+    assert cause_of("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode the password's")
+    assert cause_of(f"udp://:{closed}") == f"no packet at UDP port {closed} within 0.3 s"
+
+
+def test_a_live_source_shows_the_cause_as_its_state(opened, serve):
+    source = opened(f"rtsp://{serve(rtsp('404 Not Found'))}/stream")
+    wait_for(lambda: source.state == "no stream at this path (404), reopening in 0.5 s")
+    assert source.condition is Condition.LOST
+
+
+@pytest.mark.parametrize("password", ["sec/ret", "sec#ret", "sec?ret", "sec ret"])
+def test_a_password_that_must_be_percent_encoded_is_refused_and_not_shown(password):
+    with pytest.raises(SourceError, match="percent-encoded") as refusal:
+        open_source(f"rtsp://pilot:{password}@127.0.0.1:9/camera", live=True)
+    assert password not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "uri", ["http://127.0.0.1:9/photo@2x.jpg", "rtsp://u:p@127.0.0.1:9/a?b=c@d", "http://[::1]:9/a@b", "rtsp://h/a:b@c"]
+)
+def test_an_address_with_an_at_sign_in_its_path_has_no_password(uri, opened):
+    assert opened(uri).is_live
+
+
+def test_a_password_that_is_percent_encoded_is_decoded(serve):
+    right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
+    camera = serve(rtsp("401 Unauthorized", header=BASIC, authorization=right))
+    stream = open_address(f"rtsp://pilot:{PASSWORD}@{camera}/stream", lambda: 0.0, 0.5)
+    assert stream.facts.codec == "h264"
+    stream.release()
+
+
+@pytest.mark.parametrize(("path", "cause"), [("/dev/null", "no V4L2 camera"), ("/dev/video97", "not connected")])
+def test_a_device_names_the_cause(path, cause):
+    with pytest.raises(OpeningError) as refusal:
+        open_device(path, lambda: 0.0)
+    assert str(refusal.value) == cause
+
+
+def first_frame(source):
+    frame = wait_for(lambda: source.read(0.05))
+    assert frame.image.shape == (HEIGHT, WIDTH, 3)
+    assert frame.image.std() > 5
+    return frame
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("over_tcp", ["461", "offer"])
+def test_rtsp_of_a_camera_that_sends_by_udp_only(over_tcp, opened, serve):
+    source = opened(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
+    first_frame(source)
+    assert (source.facts.codec, source.facts.width_px, source.facts.height_px) == ("h264", WIDTH, HEIGHT)
+    assert (source.facts.bits, source.facts.pixel_aspect) == (8, 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scheme", "send", "how", "codec"),
+    [
+        ("udp", send_rtp, ("libx264",), "h264"),
+        ("rtp", send_rtp, ("libx264",), "h264"),
+        ("udp", send_rtp, ("libx265",), "hevc"),
+        ("udp", send_rtp_jpeg, (), "mjpeg"),
+    ],
+)
+def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, how, codec, opened, sending):
+    source = opened(f"{scheme}://127.0.0.1:{sending(send, *how)}")
+    first_frame(source)
+    assert source.facts.codec == codec
+
+
+def test_ports_that_are_in_use_are_named(sending):
+    port = sending(send_rtp)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", port + 1))
+        assert cause_of(f"udp://:{port}") == f"UDP port {port + 1} is in use by another program"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", port))
+        assert cause_of(f"udp://:{port}") == f"UDP port {port} is in use by another program"
+
+
+def test_rtp_of_an_unknown_codec_asks_for_a_description():
+    port, is_over = free_port(), threading.Event()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not is_over.wait(0.01):
+                sender.sendto(b"\x80\x62" + bytes(10) + b"\xff\xff picture", ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    cause = cause_of(f"udp://:{port}")
+    is_over.set()
+    thread.join()
+    assert cause == "RTP of an unknown codec (payload type 98): describe it in an .sdp file"
+
+
+@pytest.mark.parametrize(
+    ("kind", "extension", "has_length"),
+    [
+        ("image/jpg", ".jpg", True),
+        ("image/jpg", ".jpg", False),
+        ("image/png", ".png", True),
+        ("image/png", ".png", False),
+    ],
+)
+def test_parts_of_any_image_type_are_read(kind, extension, has_length, opened, serve):
+    source = opened(f"http://{serve(multipart(kind, extension, has_length))}/video")
+    numbers = [int(first_frame(source).name.split()[1]) for _ in range(3)]
+    assert numbers == sorted(set(numbers))
+
+
+def test_parts_without_a_length_do_not_wait_for_the_next(opened, serve):
+    """FFmpeg gives such a picture when the next one has come, as if it had been taken then."""
+    connections: list[list[float]] = []
+    source = opened(f"http://{serve(multipart('image/jpeg', '.jpg', False, connections))}/video")
+    late_s = []
+    for _ in range(12):
+        frame = first_frame(source)
+        sent_s = connections[-1]  # the first was FFmpeg's
+        (number,) = (at for at in range(len(sent_s)) if abs(frame.image.astype(int) - picture(at)).mean() < 4)
+        late_s.append(frame.t_mono_s - sent_s[number])
+    assert median(late_s) < 0.7 / RATE_HZ
+
+
+def test_a_snapshot_is_requested_again_and_again_and_is_as_old_as_its_request(serve):
+    asked_s: list[float] = []
+
+    def taken(number):
+        asked_s.append(time.monotonic())
+        time.sleep(0.05)
+        return encoded(number)
+
+    camera = serve(http("200 OK", "image/jpeg", taken))
+    capture = open_address(f"http://{camera}/snapshot.jpg", time.monotonic, 0.1)
+    first, second = capture.read(), capture.read()
+    assert isinstance(first, Shot)
+    assert isinstance(second, Shot)
+    assert not (first.pixels() == second.pixels()).all()
+    assert first.pixels().shape == (HEIGHT, WIDTH, 3)
+    assert asked_s[-3] < first.t_mono_s <= asked_s[-2]
+    assert first.t_mono_s + 0.1 <= second.t_mono_s <= asked_s[-1]
+    assert (capture.facts.width_px, capture.facts.codec) == (WIDTH, "snapshots (jpeg)")
+    capture.release()
+
+
+def test_snapshots_that_are_cut_are_damaged_and_those_that_fail_are_lost(opened, serve):
+    pictures = iter([encoded(0), encoded(1), encoded(2)[:900], b""])
+    camera = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
+    source = opened(f"http://{camera.address}/snapshot.jpg")
+    wait_for(lambda: source.refused["damaged"] >= 1)
+    camera.close()
+    wait_for(lambda: source.condition is Condition.LOST)
+
+
+def test_a_snapshot_takes_a_password(serve):
+    right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
+
+    def answer(connection, asked):
+        _, headers = read_request(asked)
+        picture = encoded(0) if headers.get("authorization") == right else b""
+        status = "200 OK" if picture else f"401 Unauthorized\r\n{BASIC}"
+        head = f"HTTP/1.0 {status}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+        connection.sendall(head.encode() + picture)
+
+    capture = open_address(f"http://pilot:{PASSWORD}@{serve(answer)}/snapshot.jpg", lambda: 0.0, 0.5)
+    assert isinstance(capture.read(), Shot)
