@@ -24,7 +24,7 @@ LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
 BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
     "a folder of images, a video file, a camera (/dev/video0, or rpicam on a Raspberry Pi's ribbon), a stream "
-    "(rtsp://, udp://, tcp://, http://, FILE.sdp) or gst: and a pipeline of GStreamer"
+    "(rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp) or gst: and a pipeline of GStreamer"
 )
 
 _LARGEST = 2**63

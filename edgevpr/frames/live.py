@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, StreamFacts, coarse
+from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
 from edgevpr.frames.source import Source
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
@@ -54,7 +54,6 @@ class LiveSource(Source):
         self.dropped: int = 0
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
-        self.facts: StreamFacts | None = None  # of the first picture; None for a device
         self._open_capture = open_capture
         self._clock = clock
         self._t_start_s = clock()

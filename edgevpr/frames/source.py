@@ -19,7 +19,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
-from edgevpr.frames.shot import Capture, Condition, Refusal
+from edgevpr.frames.shot import Capture, Condition, Refusal, StreamFacts
 
 _READ_TIMEOUT_S = 1.0
 _SNAPSHOT_PERIOD_S = 0.5
@@ -40,6 +40,7 @@ class Source:
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
     `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
+    `facts`: what a stream states of its pictures, None if unknown.
     `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them."""
 
     is_live: bool
@@ -50,6 +51,7 @@ class Source:
     latency_s: float | None
     condition: Condition
     state: str
+    facts: StreamFacts | None = None
     step_s: float | None = None
 
     def read(self, timeout_s: float) -> Frame | None:

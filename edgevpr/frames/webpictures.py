@@ -71,19 +71,21 @@ class Request:
 
 
 class Snapshots:
-    """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request: cameras
-    take it then or later."""
+    """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, as most
+    cameras take it then. One that gave the same file twice keeps a picture ready, which may be as old as the request
+    before."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
         self._period_s = min(period_s, _MAX_PERIOD_S)
-        self._due_s = clock()
+        self._due_s = self._asked_s = clock()
+        self._data, self._is_kept = b"", False
         self.facts: StreamFacts | None = None
 
     def read(self) -> Shot | Refusal | None:
         time.sleep(max(0.0, self._due_s - self._clock()))
-        asked_s = self._clock()
-        self._due_s = asked_s + self._period_s
+        before_s, self._asked_s = self._asked_s, self._clock()
+        self._due_s = self._asked_s + self._period_s
         try:
             request = Request(self._uri, self._timeout_s)
             data = request.take(None)
@@ -93,13 +95,16 @@ class Snapshots:
             return Refusal.DAMAGED
         except _FAILURES:
             return None
+        self._is_kept = self._is_kept or data == self._data
+        self._data = data
         height, width = image.shape[:2]
         kind, rate_hz = request.headers.get_content_subtype(), 1 / self._period_s
         self.facts = StreamFacts(
             width_px=width, height_px=height, codec=f"snapshots ({kind})", bits=8, pixel_aspect=1.0, rate_hz=rate_hz
         )
         plane = image if image.ndim == 2 else image[:, :, 1]
-        return Shot(t_mono_s=asked_s, look=coarse(plane), pixels=lambda: image)
+        taken_s = before_s if self._is_kept else self._asked_s
+        return Shot(t_mono_s=taken_s, look=coarse(plane), pixels=lambda: image)
 
     def release(self) -> None:
         """Do nothing: no connection is open between two requests."""

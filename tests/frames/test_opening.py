@@ -25,12 +25,15 @@ from answering_cameras import (
 from live_sources import wait_for
 from rtsp_camera import free_port
 
+from edgevpr.core.config import load_config
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import streams
 from edgevpr.frames.devices import open_device
 from edgevpr.frames.shot import Condition, OpeningError, Shot
 from edgevpr.frames.source import open_source
 from edgevpr.frames.streams import open_address
+from edgevpr.runtime.service import camera
+from edgevpr.runtime.service.camera import frame_seen
 
 pytestmark = pytest.mark.network
 PASSWORD = "geh%23heim"
@@ -134,8 +137,8 @@ def test_an_address_with_an_at_sign_in_its_path_has_no_password(uri, opened):
 
 def test_a_password_that_is_percent_encoded_is_decoded(serve):
     right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
-    camera = serve(rtsp("401 Unauthorized", header=BASIC, authorization=right))
-    stream = open_address(f"rtsp://pilot:{PASSWORD}@{camera}/stream", lambda: 0.0, 0.5)
+    address = serve(rtsp("401 Unauthorized", header=BASIC, authorization=right))
+    stream = open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0, 0.5)
     assert stream.facts.codec == "h264"
     stream.release()
 
@@ -241,8 +244,8 @@ def test_a_snapshot_is_requested_again_and_again_and_is_as_old_as_its_request(se
         time.sleep(0.05)
         return encoded(number)
 
-    camera = serve(http("200 OK", "image/jpeg", taken))
-    capture = open_address(f"http://{camera}/snapshot.jpg", time.monotonic, 0.1)
+    address = serve(http("200 OK", "image/jpeg", taken))
+    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     first, second = capture.read(), capture.read()
     assert isinstance(first, Shot)
     assert isinstance(second, Shot)
@@ -254,12 +257,19 @@ def test_a_snapshot_is_requested_again_and_again_and_is_as_old_as_its_request(se
     capture.release()
 
 
+def test_a_snapshot_that_the_camera_keeps_ready_is_as_old_as_the_request_before(serve):
+    address = serve(http("200 OK", "image/jpeg", lambda number: encoded(number // 2)))
+    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
+    *_, last = (capture.read() for _ in range(4))
+    assert time.monotonic() - last.t_mono_s > 0.1
+
+
 def test_snapshots_that_are_cut_are_damaged_and_those_that_fail_are_lost(opened, serve):
     pictures = iter([encoded(0), encoded(1), encoded(2)[:900], b""])
-    camera = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
-    source = opened(f"http://{camera.address}/snapshot.jpg")
+    server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
+    source = opened(f"http://{server.address}/snapshot.jpg")
     wait_for(lambda: source.refused["damaged"] >= 1)
-    camera.close()
+    server.close()
     wait_for(lambda: source.condition is Condition.LOST)
 
 
@@ -275,3 +285,23 @@ def test_a_snapshot_takes_a_password(serve):
 
     capture = open_address(f"http://pilot:{PASSWORD}@{serve(answer)}/snapshot.jpg", lambda: 0.0, 0.5)
     assert isinstance(capture.read(), Shot)
+
+
+def seen(uri):
+    return frame_seen(load_config(None, {"source.uri": uri}).source)
+
+
+def test_frame_seen_shows_the_facts_of_the_first_picture_and_that_a_flight_accepts_it(serve, monkeypatch):
+    uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
+    shown = f"{uri}, streaming, {WIDTH} x {HEIGHT} pixels, mjpeg, 8 bits a channel, square pixels, "
+    assert seen(uri).startswith(shown)
+    assert seen(uri).endswith(" s old: a flight accepts it")
+    monkeypatch.setattr(camera, "FIX_MAX_AGE_S", -1.0)
+    with pytest.raises(SourceError, match="no fix of a picture older than -1 s is sent"):
+        seen(uri)
+
+
+def test_frame_seen_says_how_long_it_waited_and_the_cause(serve):
+    uri = f"rtsp://pilot:{PASSWORD}@{serve(rtsp('401 Unauthorized', header=BASIC))}/stream"
+    with pytest.raises(SourceError, match=r"no frame came in \d+ s \(password refused \(401\)"):
+        seen(uri)

@@ -94,11 +94,12 @@ class Vitals:
         if trouble == self._source_trouble:
             return
         self._source_trouble = trouble
+        is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state has the cause
         self._crew.herald.tell(
             "source",
             Severity.WARNING if trouble else Severity.INFO,
             f"source: {source.state}",
-            ground=f"camera {trouble or 'is back'}",
+            ground=f"camera {trouble or 'is back'}{f': {source.state}' if is_unopened else ''}",
             state=source.state,
             refused=source.refused,
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.lens import sight_of
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_by_program, open_source
@@ -18,7 +19,7 @@ from edgevpr.power import machine
 from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.service.finding import Finding, device, fine, looked_at, wrong
 
-_FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
+FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
 _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
@@ -62,30 +63,39 @@ def _ribbon(uri: str, program: str, root: Path) -> Finding:
 
 
 def frame_seen(config: SourceConfig) -> str:
-    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 15 s,
-    ImageError if it does not fit the lens, and ConfigError for a calibration that cannot be used."""
+    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 15 s, or
+    if it is too old for a flight, ImageError if it does not fit the lens, and ConfigError for a calibration that cannot
+    be used."""
     assert config.uri is not None
     lens = calibrated_lens(config)
     with closing(open_source(config.uri, live=True)) as source:
-        state, (width, height) = _frame(source, config.uri)
+        (width, height), state = _frame_size(source, config.uri), source.state
+        facts, age_s = source.facts, source.latency_s
     seen = f"{config.uri}, {state}, {width} x {height} pixels"
-    if lens is None:
+    if lens is not None:
+        seen = f"{seen}, of which {lens.path} shows {sight_of(lens, (width, height)).fov_deg:.0f} degrees"
+    if age_s is None:
         return seen
-    sight = sight_of(lens, (width, height))
-    return f"{seen}, of which {lens.path} shows {sight.fov_deg:.0f} degrees"
+    if age_s > FIX_MAX_AGE_S:
+        raise SourceError(
+            f"{seen}, {age_s:.1f} s old: no fix of a picture older than {FIX_MAX_AGE_S:g} s is sent: shorten "
+            "the buffers of the camera."
+        )
+    return f"{seen}{f', {facts}' if facts else ''}, {age_s:.1f} s old: a flight accepts it"
 
 
-def _frame(source: Source, uri: str) -> tuple[str, tuple[int, int]]:
-    """Wait for a frame, 15 s at most; return the state of the source, and the frame's width and height."""
-    end_s = time.monotonic() + _FRAME_WAIT_S
+def _frame_size(source: Source, uri: str) -> tuple[int, int]:
+    """Wait for a frame, 15 s at most; return its width and height in pixels."""
+    begin_s = time.monotonic()
     is_hopeless = False
-    while not (is_hopeless or source.ended) and time.monotonic() < end_s:
+    while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
         is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
         with suppress(ImageError):
             if frame := source.read(0.25):
                 height, width = frame.image.shape[:2]
-                return source.state, (width, height)
+                return width, height
+    waited_s = time.monotonic() - begin_s
     raise SourceError(
-        f"{uri}: no frame comes ({source.state}): start the camera or the stream, or correct `source: {{uri: ...}}`; "
-        "`edgevpr check --offline` waits for none."
+        f"{uri}: no frame came in {waited_s:.0f} s ({source.state}): start the camera or the stream, or "
+        "correct `source: {uri: ...}`; `edgevpr check --offline` waits for none."
     )

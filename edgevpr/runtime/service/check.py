@@ -27,7 +27,7 @@ from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.service.camera import frame_seen
+from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
 from edgevpr.runtime.service.doctor import silence
 from edgevpr.runtime.service.finding import Finding, fine, log_findings, looked_at, wrong
 
@@ -51,7 +51,7 @@ def check(
         looked_at("battery", lambda: _battery(config)),
         looked_at("map", lambda: _map(config)),
     ]
-    say("waiting for the source of frames")
+    say("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
     findings.append(looked_at("source", lambda: _source(config, offline)))
     say("waiting for the flight controller")
     findings.append(looked_at("link", lambda: _link(config, offline)))
@@ -106,7 +106,7 @@ def _source(config: Config, offline: bool) -> str:
         return frame_seen(config.source)
     calibrated_lens(config.source)
     with closing(open_source(uri, live=True)) as source:
-        # Wait until FFmpeg has given up (5 s at most): a capture that returns while Python ends aborts the process.
+        # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.
         while source.condition is Condition.OPENING:
             time.sleep(0.05)
         return f"{uri}, {source.state}"

@@ -104,6 +104,16 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_
 
 
 @pytest.mark.slow
+def test_a_camera_that_has_not_been_opened_is_reported_to_the_ground_with_its_state(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    source = FakeSource(pictures(2), clock, work=lambda: setattr(source, "is_lost", False))
+    source.is_lost = True
+    flight(recording, tmp_path, link, clock).fly(source)
+    assert link.texts()[0] == (4, "edgevpr: camera lost: lost, reopening in 0.5 s")
+
+
+@pytest.mark.slow
 def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
     clock = FakeClock()
     link, health = FakeLink(clock), []
