@@ -50,7 +50,7 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     if not uri.lower().startswith("http"):
         return open_stream(uri, clock)
     opened_s = clock()
-    request = open_request(uri, READ_TIMEOUT_S)
+    request = open_request(uri, OPEN_TIMEOUT_S)
     if request is None:
         return open_stream(uri, clock)  # or the cause
     kind = request.headers.get_content_type()
@@ -60,7 +60,7 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
         return StreamCapture(_open(uri, None, request), clock, opened_s)
     request.close()
     if kind.startswith("image/"):
-        return Snapshots(uri, period_s, READ_TIMEOUT_S, clock)
+        return Snapshots(uri, period_s, OPEN_TIMEOUT_S, clock)
     if kind == "text/html":
         raise OpeningError(f"no video at this address, but {kind}")
     return open_stream(uri, clock)

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
-from edgevpr.frames.shot import Refusal, Shot, StreamFacts, coarse
+from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts, coarse
 
 _MAX_BYTES = 64_000_000  # of one picture
 _CHUNK_BYTES = 65536
@@ -153,7 +153,10 @@ class PartsFile:
 
 
 def open_request(uri: str, timeout_s: float) -> Request | None:
-    """Request `uri`; None if that fails."""
-    with suppress(*_FAILURES):
+    """Request `uri`; None if that fails, for a cause that FFmpeg can find. Raises OpeningError if nothing answers."""
+    try:
         return Request(uri, timeout_s)
+    except _FAILURES as error:
+        if isinstance(getattr(error, "reason", error), TimeoutError):
+            raise OpeningError(f"no answer within {timeout_s:g} s") from None
     return None
