@@ -16,6 +16,7 @@ _BY_ERROR = {
     errno.ECONNRESET: "connection closed by the camera",
     errno.EHOSTUNREACH: "no route to the host",
     errno.ENETUNREACH: "no route to the host",
+    errno.EINVAL: "an address that cannot be used: correct host and port",
     errno.EADDRINUSE: "UDP port in use by another program",
 }
 
@@ -40,7 +41,7 @@ def explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: 
         return TransportError("transport refused (461)")
     if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
         return OpeningError(_explain_status(uri, error, text))
-    number = errno.EADDRINUSE if "Address already in use" in text else error.errno if isinstance(error, OSError) else 0
+    number = errno.EADDRINUSE if "Address already in use" in text else getattr(error, "errno", 0)
     if number in _BY_ERROR:
         return OpeningError(_BY_ERROR[number])
     if isinstance(error, av.ExitError) or "Immediate exit" in text or number == errno.ETIMEDOUT:

@@ -21,11 +21,14 @@ _H264_TYPES = (1, 5, 6, 7, 8, 9, 24, 28)  # of NAL units, aggregates and fragmen
 _H265_TYPES = (0, 1, 19, 20, 21, 32, 33, 34, 35, 39, 48, 49)  # the same (RFC 7798)
 
 
-def describe_rtp(uri: str, timeout_s: float) -> str | None:
-    """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. If they are RTP, return an address of an SDP
-    that describes them; None if they are something else, which FFmpeg may know. Raises OpeningError if no packet comes,
+def describe_rtp(uri: str, timeout_s: float) -> tuple[str, dict[str, str]] | None:
+    """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. If they are RTP, return the address of an SDP
+    that describes them, and options of FFmpeg for it; None if they are something else, which FFmpeg may know. Raises OpeningError if no packet comes,
     if the port is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and MPEG-TS."""
-    host, port = urlsplit(uri).hostname or "", urlsplit(uri).port or 0
+    try:
+        host, port = urlsplit(uri).hostname or "", urlsplit(uri).port or 0
+    except ValueError:
+        raise OpeningError("no host and port in the address") from None
     group = host if _is_multicast(host) else ""
     local = parse_qs(urlsplit(uri).query).get("localaddr", ["0.0.0.0"])[0]
     with _receiver(port, group, local) as receiver:
@@ -47,7 +50,8 @@ def describe_rtp(uri: str, timeout_s: float) -> str | None:
         *("v=0", "o=- 0 0 IN IP4 127.0.0.1", "s=camera", f"c=IN IP4 {group or '0.0.0.0'}", "t=0 0"),
         *(f"m=video {port} RTP/AVP {kind}", f"a=rtpmap:{kind} {codec}/90000", ""),
     )
-    return f"data:application/sdp;base64,{base64.b64encode(chr(10).join(lines).encode()).decode()}"
+    sdp = base64.b64encode("\n".join(lines).encode()).decode()
+    return f"data:application/sdp;base64,{sdp}", {"localaddr": local} if group else {}
 
 
 def _is_multicast(host: str) -> bool:
@@ -64,9 +68,10 @@ def _receiver(port: int, group: str, local: str) -> socket.socket:
             member = socket.inet_aton(group) + socket.inet_aton(local)
             receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
         receiver.bind((group, port))
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         receiver.close()
-        why = "is in use by another program" if error.errno == errno.EADDRINUSE else f"cannot be used: {error.strerror}"
+        is_taken = getattr(error, "errno", None) == errno.EADDRINUSE
+        why = "is in use by another program" if is_taken else f"cannot be used: {error}"
         raise OpeningError(f"UDP port {port} {why}") from None
     return receiver
 

@@ -75,8 +75,8 @@ def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -
 
 def _open(uri: str, form: str | None = None, file: "SupportsRead[bytes] | None" = None) -> WholePictures:
     options = _RAW_OPTIONS if form else _OPTIONS if "://" in uri else _SDP_OPTIONS
-    if uri.lower().startswith(("udp:", "rtp:")) and (sdp := describe_rtp(uri, OPEN_TIMEOUT_S)):
-        uri, form, options = sdp, "sdp", _SDP_OPTIONS
+    if uri.lower().startswith(("udp:", "rtp:")) and (described := describe_rtp(uri, OPEN_TIMEOUT_S)):
+        uri, form, options = described[0], "sdp", _SDP_OPTIONS | described[1]
     timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
     try:
         return open_pictures(uri, options, timeouts_s, form, file)

@@ -113,6 +113,8 @@ def test_addresses_without_a_camera_name_the_cause(monkeypatch):
     closed = free_port()
     for uri in (f"rtsp://127.0.0.1:{closed}/a", f"http://127.0.0.1:{closed}/a", f"tcp://127.0.0.1:{closed}"):
         assert cause_of(uri) == "connection refused"
+    assert cause_of("udp://:99999") == "no host and port in the address"
+    assert cause_of("rtsp://127.0.0.1:99999/a") == "an address that cannot be used: correct host and port"
     assert cause_of("rtsp://camera.invalid/a") == "no such host camera.invalid"
     assert cause_of("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode the password's")
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
