@@ -1,5 +1,4 @@
-"""The causes why FFmpeg cannot open a stream, in a few words. They never contain the address, which
-may hold a password."""
+"""The causes why FFmpeg cannot open a stream, in a few words. None contains the address, which may hold a password."""
 
 import errno
 import re
@@ -19,10 +18,6 @@ _BY_ERROR = {
     errno.EINVAL: "an address that cannot be used: correct host and port",
     errno.EADDRINUSE: "UDP port in use by another program",
 }
-
-
-class NoVideoError(OpeningError):
-    """Something answers, but FFmpeg finds no video in it."""
 
 
 class TransportError(OpeningError):
@@ -49,7 +44,7 @@ def explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: 
         return OpeningError(f"no {missing} within {timeout_s:g} s")
     if isinstance(error, av.InvalidDataError):
         closed = "End of file" in text
-        return NoVideoError("connection closed by the camera" if closed else "no video that FFmpeg can read")
+        return OpeningError("connection closed by the camera" if closed else "no video that FFmpeg can read")
     return OpeningError(getattr(error, "strerror", None) or type(error).__name__)
 
 

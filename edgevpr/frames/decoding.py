@@ -12,9 +12,9 @@ import av.logging
 import numpy as np
 from av.video.reformatter import VideoReformatter
 
-from edgevpr.frames.causes import NoVideoError, explain_failure
+from edgevpr.frames.causes import explain_failure
 from edgevpr.frames.images import jpeg_is_whole
-from edgevpr.frames.shot import Refusal, StreamFacts
+from edgevpr.frames.shot import OpeningError, Refusal, StreamFacts
 
 if TYPE_CHECKING:
     from _typeshed import SupportsRead
@@ -52,7 +52,7 @@ def open_pictures(
         return WholePictures(container, _is_missed(said))
     has_video = bool(container.streams.video)
     container.close()
-    raise NoVideoError("a codec that FFmpeg does not know" if has_video else "no video in the stream")
+    raise OpeningError("a codec that FFmpeg does not know" if has_video else "no video in the stream")
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,9 @@ _H265_TYPES = (0, 1, 19, 20, 21, 32, 33, 34, 35, 39, 48, 49)  # the same (RFC 77
 
 def describe_rtp(uri: str, timeout_s: float) -> tuple[str, dict[str, str]] | None:
     """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. If they are RTP, return the address of an SDP
-    that describes them, and options of FFmpeg for it; None if they are something else, which FFmpeg may know. Raises OpeningError if no packet comes,
-    if the port is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and MPEG-TS."""
+    that describes them, and options of FFmpeg for it; None if they are something else, which FFmpeg may know. Raises
+    OpeningError if no packet comes, if the port is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and
+    MPEG-TS."""
     try:
         host, port = urlsplit(uri).hostname or "", urlsplit(uri).port or 0
     except ValueError:

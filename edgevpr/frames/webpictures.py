@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
-from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts, coarse
+from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
 
 _MAX_BYTES = 64_000_000  # of one picture
 _CHUNK_BYTES = 65536
@@ -80,7 +80,6 @@ class Snapshots:
         self._period_s = min(period_s, _MAX_PERIOD_S)
         self._due_s = self._asked_s = clock()
         self._data, self._is_kept = b"", False
-        self.facts: StreamFacts | None = None
 
     def read(self) -> Shot | Refusal | None:
         time.sleep(max(0.0, self._due_s - self._clock()))
@@ -97,11 +96,6 @@ class Snapshots:
             return None
         self._is_kept = self._is_kept or data == self._data
         self._data = data
-        height, width = image.shape[:2]
-        kind, rate_hz = request.headers.get_content_subtype(), 1 / self._period_s
-        self.facts = StreamFacts(
-            width_px=width, height_px=height, codec=f"snapshots ({kind})", bits=8, pixel_aspect=1.0, rate_hz=rate_hz
-        )
         plane = image if image.ndim == 2 else image[:, :, 1]
         taken_s = before_s if self._is_kept else self._asked_s
         return Shot(t_mono_s=taken_s, look=coarse(plane), pixels=lambda: image)
@@ -133,7 +127,7 @@ class PartsFile:
         while line := self._request.take(lambda seen: seen.find(b"\n") + 1).strip():
             name, _, value = line.partition(b":")
             if name.strip().lower() == b"content-length":
-                length = int(value)
+                length = max(0, int(value))
         data = self._request.take(lambda seen: length * (len(seen) >= length) if length else self._find_end(seen))
         if not data.startswith(_JPEG_START):
             try:
