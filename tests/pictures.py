@@ -1,9 +1,14 @@
 """Small pictures for tests, made from a seed."""
 
+from collections.abc import Iterable
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
+
+from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
 
 
 def textured(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
@@ -21,3 +26,30 @@ def _textured(seed: int, height: int, width: int) -> np.ndarray:
     picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     picture[: height // 3, : width // 3] = 90
     return picture
+
+
+def rough_ground(side_px: int) -> np.ndarray:
+    """Square grey ground with texture at all scales, of which pictures are taken."""
+    rng = np.random.default_rng(3)
+    octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
+    rough = sum(cv2.resize(each, (side_px, side_px), interpolation=cv2.INTER_CUBIC) for each in octaves)
+    return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def from_height(seed: int, height_ratio: float) -> np.ndarray:
+    """384 pixels square of a place, from so many times the height of its map."""
+    half_px = round(384 * height_ratio / 2)
+    seen = textured(seed, 800, 800)[400 - half_px : 400 + half_px, 400 - half_px : 400 + half_px]
+    return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
+
+
+def write_flight(folder: Path, pictures: Iterable[np.ndarray], step_deg: float = 0.001, start_s: float | None = None):
+    """Write pictures, numbered, and the table of their positions, each `step_deg` of latitude north of the one before,
+    and a second after it."""
+    folder.mkdir(parents=True)
+    tags = {}
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number}.png"), picture)
+        t_utc_s = None if start_s is None else start_s + number
+        tags[f"{number}.png"] = GeoTag(position=Position(50 + number * step_deg, 8.0), heading_deg=0.0, t_utc_s=t_utc_s)
+    write_positions(folder / "positions.csv", tags)

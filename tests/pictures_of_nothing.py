@@ -124,21 +124,9 @@ def display(picture, rng):
     return picture
 
 
-def _display_on_blank(rng, height, width):
-    return display(_filled(height, width, int(rng.choice((0, 16, 60, 128)))), rng)
-
-
 def _display_on_dark(rng, height, width):
     ground = _as_picture(_clouded(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
     return display(grained(ground, rng, rng.uniform(0.5, 4)), rng)
-
-
-def _display_on_fog(rng, height, width):
-    return display(_fog(rng, height, width), rng)
-
-
-def _blank(rng, height, width):
-    return grained(_filled(height, width, _colour(rng)), rng, rng.choice((0, 0.5, 1)))
 
 
 def _specks(rng, height, width):
@@ -275,10 +263,10 @@ NOTHING: dict[str, Draw] = {
     "no signal: logo": _logo,
     "no signal: snow": _snow,
     "test card": _card,
-    "display on blank": _display_on_blank,
+    "display on blank": lambda rng, *size: display(_filled(*size, int(rng.choice((0, 16, 60, 128)))), rng),
     "display on dark": _display_on_dark,
-    "display on fog": _display_on_fog,
-    "blank": _blank,
+    "display on fog": lambda rng, *size: display(_fog(rng, *size), rng),
+    "blank": lambda rng, *size: grained(_filled(*size, _colour(rng)), rng, rng.choice((0, 0.5, 1))),
     "specks": _specks,
     "scratches": _scratches,
     "interlaced": _interlaced,
@@ -296,10 +284,6 @@ NOTHING: dict[str, Draw] = {
 }
 
 Spoil = Callable[[np.random.Generator, np.ndarray], np.ndarray]
-
-
-def _out_of_focus(rng, picture):
-    return cv2.GaussianBlur(picture, (0, 0), picture.shape[1] * rng.uniform(0.01, 0.08))
 
 
 def _half_covered(rng, picture):
@@ -342,24 +326,8 @@ def _smeared(rng, picture):
     return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
 
 
-def _washed_out(rng, picture):
-    return np.clip(picture * rng.uniform(2, 8), 0, 255).astype(np.uint8)
-
-
 def _nearly_dark(rng, picture):
     return grained(picture * rng.uniform(0.01, 0.06), rng, rng.uniform(0.5, 3))
-
-
-def _foggy(rng, picture):
-    return grained(picture * rng.uniform(0.01, 0.08) + rng.uniform(100, 200), rng, rng.uniform(0.5, 3))
-
-
-def _noisy(rng, picture):
-    return grained(picture, rng, rng.uniform(30, 120))
-
-
-def _upside_down(rng, picture):
-    return np.ascontiguousarray(picture[::-1, ::-1])
 
 
 def _mostly_display(rng, picture):
@@ -369,16 +337,16 @@ def _mostly_display(rng, picture):
 
 
 SPOILT: dict[str, Spoil] = {
-    "out of focus": _out_of_focus,
+    "out of focus": lambda rng, it: cv2.GaussianBlur(it, (0, 0), it.shape[1] * rng.uniform(0.01, 0.08)),
     "half covered": _half_covered,
     "strut": _strut,
     "finger": _finger,
     "smeared": _smeared,
-    "washed out": _washed_out,
+    "washed out": lambda rng, it: np.clip(it * rng.uniform(2, 8), 0, 255).astype(np.uint8),
     "nearly dark": _nearly_dark,
-    "foggy": _foggy,
-    "noisy": _noisy,
-    "upside down": _upside_down,
+    "foggy": lambda rng, it: grained(it * rng.uniform(0.01, 0.08) + rng.uniform(100, 200), rng, rng.uniform(0.5, 3)),
+    "noisy": lambda rng, it: grained(it, rng, rng.uniform(30, 120)),
+    "upside down": lambda rng, it: np.ascontiguousarray(it[::-1, ::-1]),
     "display on it": _mostly_display,
 }
 

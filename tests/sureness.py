@@ -1,9 +1,12 @@
-"""A confidence for tests of what decides by it, without the figures of the shipped models."""
+"""Evidence, and a confidence for tests of what decides by it, without the figures of the shipped models."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from edgevpr.core.contract import PartSpec, TechniqueSpec
+from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Evidence
 from edgevpr.runtime.recognise.evidence import OF_MAP
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness
@@ -39,6 +42,17 @@ def sure_rule(confidence: Callable[[Evidence], float], needed: float = NEEDED, *
     """The rule that accepts a match whose confidence is `needed`."""
     sure = told(confidence, needed=needed)
     return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": sure, **limits})
+
+
+def bare_index(places: int) -> PlaceIndex:
+    """An index of places without positions: neighbours are those beside each other."""
+    return empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), places, None)
+
+
+def agreed(inliers: int, shift_share: tuple[float, float] = (0.1, 0.0), **more) -> Agreement:
+    """An agreement of so many landmarks."""
+    found = {"matched": 60, "possible": 250, "rotation_deg": 0.0, "scale": 1.0, "covariance_share2": (1e-4, 0.0, 1e-4)}
+    return Agreement(inliers=inliers, shift_share=shift_share, **{"is_expected": True} | found | more)
 
 
 def landmarks_count(evidence: Evidence) -> float:

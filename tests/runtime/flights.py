@@ -67,11 +67,14 @@ class Flight:
         meter: FlightMeter | None = None,
         fewer_candidates: tuple[int, ...] = (),
         status=None,
+        start: dict | None = None,
     ) -> list[dict]:
         settings, clock = self.config.mavlink, self.clock.clock
         with ExitStack() as opened:
             opened.callback(self.recogniser.place_map.close)
             flight_log = opened.enter_context(FlightLog(self.log, clock=self.clock))
+            if start:
+                flight_log.write("start", **start)
             herald, autopilot = Herald(flight_log, self.link), None
             if tiles := tiles_of(self.recogniser, self.config.match, herald, NO_TAPE):
                 opened.callback(tiles.close)

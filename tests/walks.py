@@ -1,0 +1,51 @@
+"""Small maps, and recognisers over them, for tests of the walk of a frame."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from fakes import FakeClock
+
+from edgevpr.core.config import load_config
+from edgevpr.core.contract import Technique
+from edgevpr.core.types import Frame
+from edgevpr.mapmaking.mapping import build_map
+from edgevpr.places.index import load_index
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.sequence import SequenceSearch
+from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+
+USUAL = WalkSettings(candidates=50)
+
+
+def query_meter(clock: FakeClock | None = None) -> QueryMeter:
+    """A meter by a clock that moves when told to."""
+    clock = clock or FakeClock()
+    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+
+
+def map_of(path: Path, technique: Technique, frames: Iterable[Frame], preparation: Preparation | None = None) -> Path:
+    """Make a map of frames; return its path."""
+    with PlaceMap.create(path, technique.spec) as place_map:
+        build_map(frames, technique, place_map, query_meter(), preparation)
+    return path
+
+
+def walk_over(
+    place_map: PlaceMap,
+    technique: Technique,
+    rule: AcceptRule | None = None,
+    search: SequenceSearch | None = None,
+    *,
+    clock: FakeClock | None = None,
+    settings: WalkSettings = USUAL,
+    **more,
+) -> Recogniser:
+    """A recogniser over an open map, by the usual rule where none is given."""
+    rule = rule or accept_rule(technique, load_config(None).match)
+    matcher = Matcher(technique, load_index(place_map, technique, 10**7), rule, search)
+    return Recogniser(matcher, place_map, query_meter(clock), settings, **more)
