@@ -12,16 +12,13 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from fakes import FakeClock
 from pictures import textured
+from walks import map_of
 
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import model_of, prior
 from edgevpr.runtime.recognise.evidence import (
     OF_MAP,
@@ -58,11 +55,7 @@ def frame(number):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    path, technique, clock = tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), FakeClock()
-    meter = QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(frame, range(3)), technique, place_map, meter)
-    return path
+    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), map(frame, range(3)))
 
 
 @pytest.fixture

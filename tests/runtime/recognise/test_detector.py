@@ -1,15 +1,22 @@
 """Staticity: boxes of detectors as a mask over the picture."""
 
+import math
+import os
+from pathlib import Path
+
+import detectors
 import numpy as np
 import pytest
+
+from edgevpr.frames.images import read_image
+from edgevpr.runtime.recognise.gate_networks import Detector, fastestdet, yolox
+from edgevpr.techniques.card import load_card
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
 
 from tiny_detectors import CELLS, write_detector
 
 from edgevpr.core.errors import ModelError
-from edgevpr.runtime.recognise.gate_networks import Detector
-from edgevpr.techniques.card import load_card
 
 PICTURE = np.full((128, 256), 90, np.uint8)
 
@@ -65,3 +72,67 @@ def test_a_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, 
 def test_the_card_of_another_network_is_no_detector(monkeypatch):
     with pytest.raises(ModelError, match="detector"):
         Detector(load_card("calc"))
+
+
+RNG = np.random.default_rng(3)
+
+
+def sigmoid(x):
+    return 1 / (1 + math.exp(-x))
+
+
+def test_yolox_cell_by_cell():
+    height, width, classes = 64, 96, 4
+    strides = (8, 16, 32)
+    count = sum((height // stride) * (width // stride) for stride in strides)
+    raw = RNG.normal(0, 1, (1, count, 5 + classes)).astype(np.float32)
+    boxes, scores = yolox([raw], (height, width))
+    at = 0
+    for stride in strides:
+        for row in range(height // stride):
+            for column in range(width // stride):
+                x, y, w, h, thing, *named = raw[0, at]
+                middle = ((x + column) * stride, (y + row) * stride)
+                half = (math.exp(w) * stride / 2, math.exp(h) * stride / 2)
+                wanted = [
+                    (middle[0] - half[0]) / width,
+                    (middle[1] - half[1]) / height,
+                    (middle[0] + half[0]) / width,
+                    (middle[1] + half[1]) / height,
+                ]
+                assert boxes[at] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
+                assert scores[at] == pytest.approx([thing * each for each in named], rel=1e-4)
+                at += 1
+
+
+def test_fastestdet_cell_by_cell():
+    rows, columns, classes = 3, 5, 4
+    raw = RNG.normal(0, 1, (1, 5 + classes, rows, columns)).astype(np.float32)
+    raw[0, 0], raw[0, 5:] = RNG.random((rows, columns)), RNG.random((classes, rows, columns))
+    boxes, scores = fastestdet([raw], (96, 160))
+    for row in range(rows):
+        for column in range(columns):
+            thing, x, y, w, h, *named = raw[0, :, row, column].tolist()
+            middle = ((column + math.tanh(x)) / columns, (row + math.tanh(y)) / rows)
+            half = (sigmoid(w) / 2, sigmoid(h) / 2)
+            at = row * columns + column
+            wanted = [middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1]]
+            assert boxes[at] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
+            assert scores[at] == pytest.approx([thing**0.6 * each**0.4 for each in named], rel=1e-4)
+
+
+DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data")
+HALL = DATA / "grief_michigan_monthly" / "query" / "m07_loc04.jpg"  # a person stands in it
+
+
+@pytest.mark.parametrize("name", detectors.NAMES)
+def test_a_person_is_taken_out_and_the_hall_stays(name, tmp_path, monkeypatch):
+    if not HALL.is_file() or not detectors.is_there(name):
+        pytest.skip(f"needs {HALL} and {detectors.FILES / name}; set EDGEVPR_DATA and EDGEVPR_DETECTORS")
+    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
+    detectors.write_card(name, tmp_path)
+    static = Detector(load_card(name)).is_static(np.ascontiguousarray(read_image(HALL)[40:240, 60:260]))
+    person = np.zeros((200, 200), bool)
+    person[98:, 108:164] = True
+    overlap = (person & ~static).sum() / (person | ~static).sum()
+    assert overlap > 0.8

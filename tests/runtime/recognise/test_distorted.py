@@ -3,10 +3,9 @@
 import logging
 import math
 
-import cv2
-import numpy as np
 import pytest
 from distorted_cameras import DistortedCamera, fisheye, wide
+from pictures import rough_ground
 
 from edgevpr.api import Map
 from edgevpr.core.config import load_config
@@ -22,7 +21,7 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 pytestmark = pytest.mark.slow
 
 ORIGIN = 50.0, 8.0
-M_PER_PX, SIDE_PX = 0.25, 2000
+M_PER_PX = 0.25
 FOCAL_PX = 493.0
 CAMERAS = {"straight": DistortedCamera(FOCAL_PX, (0,) * 4), "wide": wide(), "fisheye": fisheye()}
 SEEN_DEG = {"straight": 2 * math.degrees(math.atan(320 / FOCAL_PX)), "wide": 101.0, "fisheye": 136.0}
@@ -36,10 +35,7 @@ ON_THE_WAY = [
 
 @pytest.fixture(scope="module")
 def ground():
-    rng = np.random.default_rng(3)
-    octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
-    rough = sum(cv2.resize(each, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_CUBIC) for each in octaves)
-    return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return rough_ground(2000)
 
 
 @pytest.fixture(scope="module")

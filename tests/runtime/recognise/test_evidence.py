@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sureness import agreed, bare_index
 
-from edgevpr.core.contract import FineMatch, PartSpec, Support, TechniqueSpec
-from edgevpr.places.index import empty_index
+from edgevpr.core.contract import FineMatch, Support
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
@@ -27,8 +26,7 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.techniques import create
 
-SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
-INDEX = empty_index(SPEC, 30, None)  # places without position: neighbours are those beside each other
+INDEX = bare_index(30)
 NEIGHBOUR_M = 50.0
 
 
@@ -55,25 +53,12 @@ def looked_down(matches, proof=None, same=()):
     return evidence_of(ranked(matches), INDEX, NEIGHBOUR_M, proof, same, down=True)
 
 
-def agreement(inliers, is_expected=True, shift_share=(0.1, 0.0)):
-    return Agreement(
-        inliers=inliers,
-        matched=60,
-        possible=250,
-        shift_share=shift_share,
-        rotation_deg=0.0,
-        scale=1.0,
-        covariance_share2=(1e-4, 0.0, 1e-4),
-        is_expected=is_expected,
-    )
-
-
 def test_evidence_has_the_names_that_models_ask_for():
     down = {5: FineMatch(0.2, coverage=0.3)}
     for kind, evidence in (
         (AHEAD, looked_ahead({5: ahead(0.2)})),
         (AHEAD_PROVEN, looked_ahead({5: ahead(0.2)}) | {"proof": 0.1}),
-        (DOWN, looked_down(down, agreement(12))),
+        (DOWN, looked_down(down, agreed(12))),
         (DOWN_BARE, looked_down(down)),
     ):
         assert kind_of(evidence) == kind
@@ -113,10 +98,10 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
 @pytest.mark.parametrize(
     ("proof", "counts"),
     [
-        (agreement(12), 12),
-        (agreement(12, is_expected=False), 0),
-        (agreement(12, shift_share=(0.0, 0.001)), 0),
-        (agreement(0), 0),
+        (agreed(12), 12),
+        (agreed(12, is_expected=False), 0),
+        (agreed(12, shift_share=(0.0, 0.001)), 0),
+        (agreed(0), 0),
     ],
 )
 def test_landmarks_count_where_they_are_expected_and_have_moved(proof, counts):
@@ -161,7 +146,7 @@ def test_a_model_of_other_evidence_cannot_be_used():
 def test_with_a_known_heading_as_much_evidence_comes_less_often_by_chance():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
     all_of_them, known = (
-        evidence_of(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreement(3), (), down=True)
+        evidence_of(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreed(3), (), down=True)
         for tried in (1.0, 1 / 8)
     )
     model = prior(DOWN)

@@ -6,21 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fakes import FakeClock
 from pictures import textured
 from sureness import sure_rule
+from walks import map_of, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
@@ -37,17 +32,10 @@ def frame(place, t_s=0.0, position=True):
     return Frame(image=textured(shown), name=f"{place}.png", t_mono_s=t_s, t_utc_s=t_s, position=there)
 
 
-def meter():
-    clock = FakeClock()
-    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
-
-
 @pytest.fixture(scope="module", params=[True, False], ids=["positions", "in order"])
 def whole_map(request, tmp_path_factory):
-    path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    with PlaceMap.create(path, TECHNIQUE.spec) as place_map:
-        build_map((frame(place, position=request.param) for place in range(PLACES)), TECHNIQUE, place_map, meter())
-    return path
+    frames = (frame(place, position=request.param) for place in range(PLACES))
+    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", TECHNIQUE, frames)
 
 
 class Walk:
@@ -55,17 +43,10 @@ class Walk:
 
     def __init__(self, place_map, rule=None, follows=True):
         self.confidence, self._t_s = 0.88, 0.0
-        self.recogniser = Recogniser(
-            Matcher(
-                TECHNIQUE,
-                load_index(place_map, TECHNIQUE, 10**7),
-                rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1),
-            ),
-            place_map,
-            meter(),
-            WalkSettings(candidates=42),
-            follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
-        )
+        follower = Follower(place_map, fastest_m_s=None, is_live=False) if follows else None
+        rule = rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1)
+        settings = WalkSettings(candidates=42)
+        self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, follower=follower)
 
     def see(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
         self._t_s += elapsed_s

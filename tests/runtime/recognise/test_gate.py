@@ -7,15 +7,14 @@ import numpy as np
 import pictures_of_nothing
 import pytest
 from pictures import textured
+from walks import map_of
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.types import NO_COST, Frame
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.judge import says_nothing
-from edgevpr.runtime.recognise.opening import meter_of, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -32,10 +31,8 @@ def walk(request, tmp_path_factory):
     """A recogniser of six places, as a flight opens it."""
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
     config, board = load_config(None, {"map": str(path), "source.camera": request.param}), load_board("this")
-    technique = create("cohog", {"camera": request.param})
-    with PlaceMap.create(path, technique.spec) as place_map:
-        frames = (frame(textured(number, 240, 320), f"{number}.png") for number in range(PLACES))
-        build_map(frames, technique, place_map, meter_of(config, board))
+    frames = (frame(textured(number, 240, 320), f"{number}.png") for number in range(PLACES))
+    map_of(path, create("cohog", {"camera": request.param}), frames)
     recogniser = open_recogniser(config, board)
     with recogniser.place_map:
         yield recogniser

@@ -3,23 +3,16 @@
 import math
 from dataclasses import replace
 
-import cv2
 import pytest
-from pictures import textured
+from pictures import from_height
+from walks import map_of, walk_over
 
-from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.level import Lens
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
-from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -28,25 +21,22 @@ PLACES = 4
 
 
 def frame(place, height_ratio=1.0):
-    middle_px = round(384 * height_ratio / 2)
-    seen = textured(place, 800, 800)[400 - middle_px : 400 + middle_px, 400 - middle_px : 400 + middle_px]
-    image = cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
-    return Frame(image=image, name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0))
+    return Frame(
+        image=from_height(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
+    )
 
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
-    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("heights") / "m.gpkg"
-    meter = meter_of(load_config(None), load_board("this"))
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(frame, range(PLACES)), technique, place_map, meter)
+    technique = create("cohog", {"camera": "nadir"})
+    path = map_of(tmp_path_factory.mktemp("heights") / "m.gpkg", technique, map(frame, range(PLACES)))
     with PlaceMap.open(path) as place_map:
-        yield technique, place_map, load_index(place_map, technique, 10**6), meter
+        yield technique, place_map
 
 
 def recogniser(opened, monkeypatch, prior=None):
     """A recogniser, and the heights that its scans are asked to look from."""
-    technique, place_map, index, meter = opened
+    technique, place_map = opened
     heights, scan = [], type(technique).coarse_scores
 
     def coarse_scores(query, rows, mean, **hints):
@@ -54,9 +44,7 @@ def recogniser(opened, monkeypatch, prior=None):
         return scan(technique, query, rows, mean, **hints)
 
     monkeypatch.setattr(technique, "coarse_scores", coarse_scores, raising=False)
-    rule = accept_rule(technique, load_config(None).match)
-    walk = Recogniser(Matcher(technique, index, rule), place_map, meter, WalkSettings(candidates=50), prior=prior)
-    return walk, heights
+    return walk_over(place_map, technique, prior=prior), heights
 
 
 def test_one_look_is_enough_from_the_height_of_the_map(opened, monkeypatch):
@@ -96,22 +84,19 @@ def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkey
 
 @pytest.fixture(scope="module")
 def cut_twice(tmp_path_factory):
-    """A map of places that were cut at two footprints, 100 m and 150 m, and its index."""
-    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("layers") / "m.gpkg"
-    meter = meter_of(load_config(None), load_board("this"))
-    with PlaceMap.create(path, technique.spec) as place_map:
-        for ratio in (1.0, 1.5):
-            pose = Pose(up_deg=0.0, footprint_m=100 * ratio, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
-            frames = [replace(frame(place, ratio), name=f"{place} {ratio}", pose=pose) for place in range(PLACES)]
-            build_map(frames, technique, place_map, meter)
-    with PlaceMap.open(path) as place_map:
-        yield technique, place_map, load_index(place_map, technique, 10**6), meter
+    """A map of places that were cut at two footprints, 100 m and 150 m."""
+    technique, frames = create("cohog", {"camera": "nadir"}), []
+    for ratio in (1.0, 1.5):
+        pose = Pose(up_deg=0.0, footprint_m=100 * ratio, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+        frames += [replace(frame(place, ratio), name=f"{place} {ratio}", pose=pose) for place in range(PLACES)]
+    with PlaceMap.open(map_of(tmp_path_factory.mktemp("layers") / "m.gpkg", technique, frames)) as place_map:
+        yield technique, place_map
 
 
 @pytest.mark.parametrize("height_m", [None, 100.0])
 def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_height(cut_twice, height_m):
     """By the height, where it is told, from the first picture on; else by the last match."""
-    technique, place_map, index, meter = cut_twice
+    technique, place_map = cut_twice
     scan, looked = type(technique).coarse_scores, []
 
     class Noting(type(technique)):
@@ -121,15 +106,8 @@ def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_he
 
     fov_deg = math.degrees(2 * math.atan(0.5))  # the footprint is the height
     levelling = Levelling(Lens(fov_deg), is_live=False) if height_m else None
-    noting = Noting(**technique.spec.parameters)
-    walk = Recogniser(
-        Matcher(noting, index, accept_rule(technique, load_config(None).match)),
-        place_map,
-        meter,
-        WalkSettings(candidates=50),
-        preparation=Preparation(levelling=levelling),
-        prior=Prior(None, None, is_live=False),
-    )
+    noting, prior = Noting(**technique.spec.parameters), Prior(None, None, is_live=False)
+    walk = walk_over(place_map, noting, preparation=Preparation(levelling=levelling), prior=prior)
     for place, ratio in ((1, 1.5), (3, 1.5), (2, 1.0), (0, 1.0)):
         del looked[:]
         asked = replace(frame(place, ratio), height_m=height_m and ratio * height_m)

@@ -1,4 +1,5 @@
-"""The judge of a single query: by its confidence, or by score and lead; and what speaks against a match."""
+"""The judge: by a confidence, or by score and lead; what speaks against a match; and when the best place of a sequence
+is accepted: never before it is full, nor at a speed that is not followed."""
 
 import math
 from dataclasses import replace
@@ -6,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sureness import NEEDED, sure_rule, told
+from sureness import NEEDED, agreed, bare_index, sure_rule, told
 
 from edgevpr.core.config import load_config
-from edgevpr.core.contract import FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.contract import FineMatch
 from edgevpr.core.text import nines
-from edgevpr.places.index import empty_index
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.agreement import Agreement
+from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, is_hardly_ahead, judge
 from edgevpr.techniques import create
@@ -23,12 +23,10 @@ RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 
 def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
     """The verdict on a best place and places elsewhere with these scores; `more` is known of the best."""
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
     slots = np.array([0, 10, 20])[: len(scores)]
     compared = dict(zip(slots.tolist(), matches or map(FineMatch, scores), strict=True))
-    return judge(
-        Findings(Ranking(slots=slots, scores=np.array(scores, np.float32), compared=compared), **more), index, rule
-    )
+    ranking = Ranking(slots=slots, scores=np.array(scores, np.float32), compared=compared)
+    return judge(Findings(ranking, **more), bare_index(30), rule)
 
 
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():
@@ -120,9 +118,8 @@ def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
 
 def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_with():
     search = SimpleNamespace(frames=2, length=2)
-    index = empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), 30, None)
     ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
-    assert "newest query" in judge(Findings(ranking), index, RULE, search).reason
+    assert "newest query" in judge(Findings(ranking), bare_index(30), RULE, search).reason
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (3 / 9, True), (4 / 9, False), (1.0, False)])
@@ -148,20 +145,6 @@ def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation
     assert is_at_rest(match) is expected
 
 
-def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
-    """An agreement of so many landmarks."""
-    return Agreement(
-        inliers=inliers,
-        matched=60,
-        possible=possible,
-        shift_share=shift_share,
-        rotation_deg=0.0,
-        scale=1.0,
-        covariance_share2=(1e-4, 0.0, 1e-4),
-        is_expected=is_expected,
-    )
-
-
 @pytest.mark.parametrize(
     ("lead", "inliers", "rival", "accepted"),
     [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.1, 0, 0, True)],
@@ -169,7 +152,7 @@ def found(inliers, possible=250, shift_share=(0.1, 0.0), is_expected=True):
 def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5} | counted
-    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=found(inliers), evidence=evidence)
+    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=agreed(inliers), evidence=evidence)
     assert verdict.accepted is accepted
     assert f"{inliers} landmarks agree, and {rival} with a place elsewhere" in verdict.reason
     if not accepted:
@@ -186,13 +169,88 @@ def test_a_place_that_is_clearly_ahead_needs_no_landmarks_to_be_told_from_others
 @pytest.mark.parametrize(
     ("score", "proof", "accepted"),
     [
-        (0.3, found(4), False),
-        (0.3, found(0), False),
-        (0.3, found(5), True),
-        (0.3, found(0, possible=99), True),
-        (0.19, found(0), True),
-        (0.12, found(30, is_expected=False), False),
+        (0.3, agreed(4), False),
+        (0.3, agreed(0), False),
+        (0.3, agreed(5), True),
+        (0.3, agreed(0, possible=99), True),
+        (0.19, agreed(0), True),
+        (0.12, agreed(30, is_expected=False), False),
     ],
 )
 def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
     assert judged((score, score - 0.1), proof=proof).accepted == accepted
+
+
+PLACES, LENGTH = 80, 6
+RULE_OF_SEQUENCE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
+
+
+def flown(velocity, start, leaves=18, seed=3):
+    """(accepted, why, slot) of each query of a flight along places that look a little like the two around them; from
+    query `leaves` on it shows nothing of the map."""
+    index = bare_index(PLACES)
+    index.place_ids[:] = np.arange(PLACES)
+    noise = np.random.default_rng(seed)
+    sequence, found = SequenceSearch(LENGTH), []
+    for query in range(18):
+        away = np.abs(np.arange(PLACES) - (start + velocity * query))
+        here = np.exp(-away) if query < leaves else 0.0
+        scores = (0.3 + 0.4 * here + 0.02 * noise.random(PLACES)).astype(np.float32)
+        slots = np.argsort(-scores)
+        ranking = Ranking(slots=slots, scores=scores[slots], compared={})
+        ranking = sequence.follow(ranking, index, float(query))
+        verdict = judge(Findings(ranking), index, RULE_OF_SEQUENCE, sequence)
+        found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
+    return found
+
+
+@pytest.mark.parametrize("velocity", [0.8, 1.0, 1.2])
+def test_a_flight_like_the_mapping_flight_is_accepted_from_the_first_full_sequence_on(velocity):
+    found = flown(velocity, 5)
+    assert [yes for yes, _, _ in found] == [False] * (LENGTH - 1) + [True] * (18 - LENGTH + 1)
+    assert all(abs(slot - (5 + velocity * query)) <= 1 for query, (yes, _, slot) in enumerate(found) if yes)
+    assert "4 queries of 6" in found[3][1]
+
+
+@pytest.mark.parametrize(("velocity", "start"), [(2.0, 5), (3.0, 5), (0.0, 30), (0.3, 30), (-1.0, 60), (-2.0, 60)])
+def test_at_another_speed_or_the_other_way_nothing_wrong_is_accepted(velocity, start):
+    for query, (yes, _, slot) in enumerate(flown(velocity, start)):
+        assert not yes or abs(slot - (start + velocity * query)) <= 2  # neighbours are no other place
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
+    found = flown(1.0, 5, leaves=11, seed=seed)
+    assert found[10][0]
+    # The mean would bear it for some queries yet: it is far ahead of all other places.
+    assert not any(yes for yes, _, _ in found[13:])
+    assert any("no longer" in why for _, why, _ in found[11:14])
+
+
+@pytest.mark.parametrize(
+    ("queries", "least", "goes_on"),
+    [
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.299, True),
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.31, False),  # too low for one query
+        ([(5, 0.9), (60, 0.1), (20, 0.1)], 0.0, False),  # the newest was not compared with the place
+    ],
+)
+def test_the_newest_query_must_still_see_the_place(queries, least, goes_on):
+    sequence, near = SequenceSearch(3), abs(np.arange(PLACES) - 7) <= 2
+    index = bare_index(PLACES)
+    index.place_ids[:] = np.arange(PLACES)
+    for query, (slot, score) in enumerate(queries):
+        slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
+        sequence.follow(Ranking(slots=slots, scores=scores, compared={}), index, float(query))
+    assert sequence.goes_on(near, min_score=least) == goes_on
+
+
+def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():
+    technique, config = create("hog"), load_config(None).match
+    assert accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
+    assert accept_rule(technique, config).min_margin == technique.min_margin
+    assert accept_rule(technique, config, 40).min_margin == accept_rule(technique, config, 10).min_margin
+    technique.min_margin = 1.0  # what is never to be accepted is not in a sequence either
+    assert accept_rule(technique, config, 9).min_margin == 1.0
+    told = load_config(None, {"match.min_margin": 0.2}).match
+    assert accept_rule(technique, told, 9).min_margin == 0.2

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from fakes import vehicle_at
+from pictures import rough_ground
+from walks import map_of, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
@@ -15,17 +17,14 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarged
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Prior
-from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, laid, levelling_of
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
+from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
 from edgevpr.techniques import create
 
 CAMERA = Camera(noise_sigma=0)
@@ -40,11 +39,7 @@ STRAIGHT = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_de
 
 @pytest.fixture(scope="module")
 def ground():
-    rng = np.random.default_rng(3)
-    octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
-    rough = sum(cv2.resize(each, (2400, 2400), interpolation=cv2.INTER_CUBIC) for each in octaves)
-    grey = cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    return cv2.cvtColor(rough_ground(2400), cv2.COLOR_GRAY2BGR)
 
 
 def frame(ground, place, t_mono_s=0.0, told=None, **pose):
@@ -74,27 +69,16 @@ def place_map(ground, technique, tmp_path_factory):
     path = tmp_path_factory.mktemp("levelled") / "m.gpkg"
     poses = ({"heading_deg": 90.0}, {"pitch_deg": 8.0}, {"heading_deg": 200.0, "pitch_deg": -6.0}, {})
     frames = [frame(ground, place, **pose) for place, pose in enumerate(poses)]
-    levelling = Levelling(LENS, below=True, is_live=False)
-    with PlaceMap.create(path, technique.spec) as made:
-        build_map(
-            frames, technique, made, meter_of(load_config(None), load_board("this")), Preparation(levelling=levelling)
-        )
-    with PlaceMap.open(path) as opened:
+    preparation = Preparation(levelling=Levelling(LENS, below=True, is_live=False))
+    with PlaceMap.open(map_of(path, technique, frames, preparation)) as opened:
         yield opened
 
 
 @pytest.fixture
 def walk(place_map, technique):
     def of(levelling, prior=None, mask=None):
-        return Recogniser(
-            Matcher(
-                technique, load_index(place_map, technique, 10**6), accept_rule(technique, load_config(None).match)
-            ),
-            place_map,
-            meter_of(load_config(None), load_board("this")),
-            preparation=Preparation(levelling=levelling, mask=mask),
-            prior=prior,
-        )
+        preparation = Preparation(levelling=levelling, mask=mask)
+        return walk_over(place_map, technique, settings=WalkSettings(), preparation=preparation, prior=prior)
 
     return of
 
@@ -113,7 +97,9 @@ HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 @pytest.mark.slow
 def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, ground):
     as_it_is = walk(None).step(frame(ground, 1, **HARD))
-    event = walk(scaling()).step(frame(ground, 1, **HARD))
+    walker = walk(scaling())
+    walker.meter = meter_of(load_config(None), load_board("this"))
+    event = walker.step(frame(ground, 1, **HARD))
     assert recognised(event, 1)
     assert event.best.match.score > as_it_is.best.match.score
     assert event.view.up_deg == 0.0

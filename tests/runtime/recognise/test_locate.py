@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from sureness import agreed
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.locate import as_learnt, at_place, located
 
 ORIGIN = Position(50.0, 8.0, 120.0)
@@ -22,11 +22,6 @@ def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, t
     place = Place(place_id=number, source_image=f"{number}", position=Position(lat_deg, lon_deg, 120.0), pose=lies)
     match = FineMatch(score, shift_cells=shift, covariance_cells2=(0.2, 0.0, 0.2), rotation_deg=turned_deg)
     return Candidate(place, match)
-
-
-def landmarks_say(shift_share, **more):
-    found = {"inliers": 20, "matched": 30, "possible": 250, "rotation_deg": 0.0, "scale": 1.0}
-    return Agreement(shift_share=shift_share, covariance_share2=(1e-5, 0.0, 1e-5), **found | more)
 
 
 def off_m(position):
@@ -73,14 +68,14 @@ def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_de
 
 
 def test_what_is_aside_of_a_query_from_higher_up_is_farther():
-    proof = landmarks_say((0.0, 0.0), scale=2.0)
+    proof = agreed(20, (0.0, 0.0), scale=2.0)
     found = located([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_landmarks_are_heard_before_the_vote():
-    proof = landmarks_say((0.11, -0.05), rotation_deg=4.0)
+    proof = agreed(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
     by_vote = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
     found = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says

@@ -1,22 +1,20 @@
 """The tilt that landmarks show: of rays that are turned by a known angle, and of rendered pictures."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from levelled_views import lit_ground, view_from
 
-from edgevpr.core.types import Frame
-from edgevpr.frames.level import Lens, View, levelled
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
-from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.frames.level import View
+from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.agreement import agreement
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
 from edgevpr.runtime.recognise.perspective import lean_shown
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
-METRES_PER_PIXEL, FOOTPRINT_M = 0.25, 130.0
-FOV_DEG = math.degrees(2 * math.atan(Camera().width / 2 / Camera().focal_px))
 SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
 
 
@@ -88,26 +86,18 @@ def test_few_landmarks_or_those_on_a_line_say_nothing():
 
 @pytest.fixture(scope="module")
 def ground():
-    light = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
-    return lit(make_scene(5, 320.0, 280.0, METRES_PER_PIXEL), light, 5), light
-
-
-def taken(ground, pose, **told):
-    """A picture from a pose, and what the autopilot says of it."""
-    picture = photograph(ground[0], METRES_PER_PIXEL, pose, Camera(), ground[1], np.random.default_rng(1))
-    said = {"heading_deg": pose.heading_deg, "roll_deg": 0.0, "pitch_deg": 0.0, "height_m": pose.height_m} | told
-    return levelled(Frame(image=picture, name="", t_mono_s=0.0, **said), None, Lens(FOV_DEG), FOOTPRINT_M)
+    return lit_ground(320.0, 280.0)
 
 
 @pytest.mark.parametrize(
     ("roll_deg", "pitch_deg", "told_roll_deg"), [(3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (15.0, 2.0, 13.0)]
 )
 def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_deg, pitch_deg, told_roll_deg):
-    place = taken(ground, CameraPose(east_m=160.0, north_m=140.0, height_m=100.0, heading_deg=0.0))
+    place = view_from(ground, CameraPose(east_m=160.0, north_m=140.0, height_m=100.0, heading_deg=0.0))
     pose = CameraPose(
         east_m=168.0, north_m=134.0, height_m=102.0, heading_deg=40.0, roll_deg=roll_deg, pitch_deg=pitch_deg
     )
-    query = taken(ground, pose, roll_deg=told_roll_deg)
+    query = view_from(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
     found = agreement(describe(query.image, query.mask, OF_QUERY), describe(place.image, place.mask))
     lean = lean_shown(*found.coinciding, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.

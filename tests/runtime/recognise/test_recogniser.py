@@ -7,18 +7,14 @@ import numpy as np
 import pytest
 from fakes import FakeClock
 from pictures import textured
+from walks import map_of, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, ModelError
 from edgevpr.core.types import Frame, Pose, Position
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
 from edgevpr.techniques import create
 
 PLACES = 6
@@ -35,29 +31,18 @@ def clock():
     return FakeClock()
 
 
-def meter_with(clock):
-    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
-
-
 @pytest.fixture(scope="module")
 def whole_map(tmp_path_factory):
-    technique = create("cohog", {"w1": 208})
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(frame, range(PLACES)), technique, place_map, meter_with(FakeClock()))
-    return path
+    return map_of(path, create("cohog", {"w1": 208}), map(frame, range(PLACES)))
 
 
 @pytest.fixture
 def walk(whole_map, tmp_path, clock):
     """A recogniser over six places, whose meter has a clock to turn."""
-    technique, meter = create("cohog", {"w1": 208}), meter_with(clock)
-    shutil.copy(whole_map, tmp_path)
-    with PlaceMap.open(tmp_path / whole_map.name) as place_map:
-        index = load_index(place_map, technique, 10**6)
-        yield Recogniser(
-            Matcher(technique, index, RULE), place_map, meter, WalkSettings(candidates=42, min_accuracy_m=20.0)
-        )
+    settings = WalkSettings(candidates=42, min_accuracy_m=20.0)
+    with PlaceMap.open(shutil.copy(whole_map, tmp_path)) as place_map:
+        yield walk_over(place_map, create("cohog", {"w1": 208}), RULE, clock=clock, settings=settings)
 
 
 def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
@@ -160,7 +145,7 @@ def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     assert load_config(None).mavlink.min_accuracy_m == 5.0
 
 
-def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path, clock):
+def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path):
     """A place 60 m on is beyond `neighbour_m`, and half of its ground is the same."""
     technique, ground, side_px = create("cohog", {"camera": "nadir"}), textured(9, 256, 2048), 256
     pose = Pose(up_deg=0.0, footprint_m=128.0, covariance_m2=(1.0, 0.0, 1.0))
@@ -170,9 +155,7 @@ def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path, clock):
         image = np.ascontiguousarray(ground[:, 2 * east_m : 2 * east_m + side_px])
         return Frame(image=image, name=f"{east_m}", t_mono_s=0.0, position=at, heading_deg=0.0, pose=pose)
 
-    with PlaceMap.create(tmp_path / "dense.gpkg", technique.spec) as place_map:
-        build_map(map(cut, range(0, 880, 20)), technique, place_map, meter_with(clock))
-        matcher = Matcher(technique, load_index(place_map, technique, 10**6), RULE)
-        event = Recogniser(matcher, place_map, meter_with(clock), WalkSettings(candidates=8)).step(cut(400))
+    with PlaceMap.open(map_of(tmp_path / "dense.gpkg", technique, map(cut, range(0, 880, 20)))) as place_map:
+        event = walk_over(place_map, technique, RULE, settings=WalkSettings(candidates=8)).step(cut(400))
     away_m = 20.0 * abs(np.array(event.ranking.compared_slots) - event.ranking.compared_slots[0])
     assert (away_m > 140).sum() >= 3

@@ -6,31 +6,24 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from levelled_views import lit_ground, view_from
 
-from edgevpr.core.types import Frame
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
-from edgevpr.lab.simulate.landscape import make_scene
+from edgevpr.frames.level import UNKNOWN_VIEW
+from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
 from edgevpr.runtime.recognise.stride import Strides
 
-METRES_PER_PIXEL, FOOTPRINT_M = 0.25, 130.0
-FOV_DEG = math.degrees(2 * math.atan(Camera().width / 2 / Camera().focal_px))
-LIGHT = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
 START = CameraPose(east_m=200.0, north_m=200.0, height_m=100.0, heading_deg=30.0, roll_deg=4.0, pitch_deg=-3.0)
 
 
 @pytest.fixture(scope="module")
 def ground():
-    return lit(make_scene(5, 400.0, 400.0, METRES_PER_PIXEL), LIGHT, 5)
+    return lit_ground(400.0, 400.0)
 
 
 def seen(ground, pose, told=None):
-    """The levelled picture from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
-    image, told = photograph(ground, METRES_PER_PIXEL, pose, Camera(), LIGHT, np.random.default_rng(1)), told or pose
-    names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")
-    frame = Frame(image=image, name="f", t_mono_s=0.0, **{name: getattr(told, name) for name in names})
-    picture = levelled(frame, None, Lens(FOV_DEG), FOOTPRINT_M)
+    """The view from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
+    picture = view_from(ground, pose, told)
     return picture.view, describe(picture.image, picture.mask, OF_QUERY)
 
 

@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 from pictures import textured
+from walks import map_of, walk_over
 
-from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.hints import Told
-from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.techniques import create
 
 LIKE_A_BRIDGE = 2  # the place that looks the same from its other end
@@ -30,16 +24,9 @@ def frame(place, shift_px=0, heading_deg=None):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    technique, path = create("cohog", {"camera": "nadir"}), tmp_path_factory.mktemp("turned") / "m.gpkg"
-    meter = meter_of(load_config(None), load_board("this"))
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map((frame(place, heading_deg=0.0) for place in range(4)), technique, place_map, meter)
-    with PlaceMap.open(path) as place_map:
-        matcher = Matcher(
-            technique, load_index(place_map, technique, 10**6), accept_rule(technique, load_config(None).match)
-        )
-        told = Told(("heading",), technique.spec.heading_within_deg)
-        yield Recogniser(matcher, place_map, meter, WalkSettings(candidates=50), prior=told)
+    technique, frames = create("cohog", {"camera": "nadir"}), (frame(place, heading_deg=0.0) for place in range(4))
+    with PlaceMap.open(map_of(tmp_path_factory.mktemp("turned") / "m.gpkg", technique, frames)) as place_map:
+        yield walk_over(place_map, technique, prior=Told(("heading",), technique.spec.heading_within_deg))
 
 
 def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):

@@ -11,24 +11,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from fakes import FakeClock
 from pictures_of_nothing import figures
 from sureness import landmarks_count, sure_rule, told
+from walks import map_of, walk_over
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import Verification
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
 from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
@@ -51,11 +46,6 @@ def frame(seed, right_px=0, down_px=0):
     return Frame(image=image, name=f"{seed}.png", t_mono_s=0.0, position=Position(50 + seed * 0.001, 8.0))
 
 
-def meter(clock=None):
-    clock = clock or FakeClock()
-    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
-
-
 @pytest.fixture(scope="module")
 def technique():
     return create("cohog", {"camera": "nadir"})
@@ -63,10 +53,7 @@ def technique():
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, technique):
-    path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(frame, range(PLACES)), technique, place_map, meter())
-    return path
+    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", technique, map(frame, range(PLACES)))
 
 
 @pytest.fixture
@@ -84,12 +71,8 @@ def keep(path, landmarks, checksum):
 def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
     """The event of a query; of the last, where it is asked several times."""
     with PlaceMap.open(path) as place_map:
-        walk = Recogniser(
-            Matcher(technique, load_index(place_map, technique, 10**7), rule, search),
-            place_map,
-            meter(),
-            WalkSettings(candidates=technique.candidates, verify=verify),
-        )
+        settings = WalkSettings(candidates=technique.candidates, verify=verify)
+        walk = walk_over(place_map, technique, rule, search, settings=settings)
         return [walk.step(query) for _ in range(times)][-1]
 
 
@@ -106,10 +89,7 @@ def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, 
 @pytest.fixture(scope="module")
 def mapped_ahead(tmp_path_factory):
     """A map made by a camera that looks ahead, of pictures twice as wide as high."""
-    technique, path = create("cohog"), tmp_path_factory.mktemp("ahead") / "m.gpkg"
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map((wide(seed) for seed in range(PLACES)), technique, place_map, meter())
-    return path
+    return map_of(tmp_path_factory.mktemp("ahead") / "m.gpkg", create("cohog"), map(wide, range(PLACES)))
 
 
 def wide(seed, right_px=0, down_px=0):
@@ -166,12 +146,6 @@ def test_landmarks_are_evidence_where_they_are_asked_and_have_moved(mapped, tech
     assert (still.accepted, still.evidence["landmarks"]) == (False, 0.0), "what has not moved may be a display"
 
 
-def made(path, technique, frames):
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, technique, place_map, meter())
-    return path
-
-
 def behind_figures(image):
     return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
 
@@ -179,7 +153,7 @@ def behind_figures(image):
 def test_of_a_picture_at_rest_places_elsewhere_tell_whether_there_is_a_display(tmp_path, mapped, technique):
     anything = sure_rule(lambda evidence: 1.0)
     drawn = [replace(frame(place), image=behind_figures(frame(place).image)) for place in range(PLACES)]
-    path = made(tmp_path / "drawn.gpkg", technique, drawn)
+    path = map_of(tmp_path / "drawn.gpkg", technique, drawn)
     changed = cv2.addWeighted(frame(1).image, 0.3, frame(7).image, 0.7, 0)
     at_rest = asked(path, technique, replace(frame(1), image=behind_figures(changed)), anything)
     assert (at_rest.accepted, at_rest.position) == (False, None)
@@ -195,7 +169,7 @@ def far(image):
 
 
 def test_ground_that_is_in_the_map_twice_is_an_even_chance_at_best(tmp_path, technique):
-    path = made(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(frame(1).image)])
+    path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(frame(1).image)])
     event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert (event.accepted, event.confidence) == (False, 0.5)
 
@@ -205,7 +179,7 @@ def test_ground_that_is_in_the_map_nearly_twice_is_not_accepted_for_its_landmark
     """A place elsewhere without landmarks may be the right one as well."""
     changed = frame(1).image.copy()
     changed[:, :80] = frame(9).image[:, :80]
-    path = made(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(changed)])
+    path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(changed)])
     if not has_landmarks:
         with closing(sqlite3.connect(path)) as db, db:
             db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 2")
@@ -224,17 +198,16 @@ def overlapping(tmp_path_factory, technique):
     """Places without positions: the first, the fifth and the eighth show the same ground."""
     same, other = [bare(1, -25, -10), bare(1, 25, 10), bare(1, 0, 28)], list(map(bare, range(2, 7)))
     order = [same[0], *other[:3], same[1], *other[3:], same[2]]
-    return made(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
+    return map_of(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
 
 
 def same_ground(path, technique, query):
     """The best place of a query, and the numbers of the places that show the same ground."""
     with PlaceMap.open(path) as place_map:
-        index = load_index(place_map, technique, 10**7)
-        walk = Recogniser(Matcher(technique, index, BY_LANDMARKS), place_map, meter())
+        walk = walk_over(place_map, technique, BY_LANDMARKS, settings=WalkSettings())
         event = walk.step(query)
-        looked = Verification(technique.spec, event.picture, index, place_map)
-        return event, int(index.place_ids[event.ranking.slots[0]]), set(looked.same_ground(event.ranking))
+        looked = Verification(technique.spec, event.picture, walk.index, place_map)
+        return event, int(walk.index.place_ids[event.ranking.slots[0]]), set(looked.same_ground(event.ranking))
 
 
 def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, technique):
@@ -278,8 +251,8 @@ def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, techn
 def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
-    with PlaceMap.create(tmp_path / "half.gpkg", technique.spec) as place_map:
-        build_map([frame(1)], technique, place_map, meter(), Preparation(mask=Mask(allowed, "half")))
+    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], Preparation(mask=Mask(allowed, "half")))
+    with PlaceMap.open(path) as place_map:
         there = unpacked(place_map.landmarks_of(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0
