@@ -2,11 +2,11 @@
 
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 import train_words
 from training_pictures import read_pictures
-from write_pictures import write_pictures
 
 from edgevpr import techniques
 from edgevpr.core.errors import UsageError
@@ -24,7 +24,17 @@ def own_models(models, monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path):
-    return write_pictures(tmp_path / "pictures", 12)
+    """Twelve pictures of stripes at an angle of their own under spots of their own."""
+    folder, rng = tmp_path / "pictures", np.random.default_rng(0)
+    folder.mkdir()
+    y, x = np.mgrid[:120, :160]
+    for number in range(12):
+        angle = np.pi * number / 12
+        picture = 128 + 60 * np.sin((x * np.cos(angle) + y * np.sin(angle)) / 3)
+        spots = rng.normal(0, 25, (12, 16)).astype(np.float32)
+        picture += cv2.resize(spots, (160, 120), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number}.jpg"), np.clip(picture, 0, 255).astype(np.uint8))
+    return folder
 
 
 def train(folder, out, *more):

@@ -1,12 +1,16 @@
 """Cards: what a good one says, and one sentence for everything that a bad one may."""
 
+import numpy as np
 import pytest
+from pictures import textured
 from tiny_networks import CARD, write_card, write_network
 
+from edgevpr import techniques
 from edgevpr.core.contract import PartSpec, TechniqueSpec
-from edgevpr.core.errors import EdgevprError, ModelError
+from edgevpr.core.errors import EdgevprError, ModelError, UsageError
 from edgevpr.core.files import model_folders, shipped
 from edgevpr.techniques.card import card_names, load_card, read_card, weights_of
+from edgevpr.techniques.session import open_backbone
 
 SHA256 = "0" * 64
 
@@ -52,7 +56,7 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
         ({"file": "../tiny.onnx"}, "write the name of a file that lies beside the card"),
         ({"file": "tiny.yaml"}, "`file` is `tiny.yaml`, which is the name of a card: write that of the ONNX file"),
         ({"file": "other.YML"}, "which is the name of a card"),
-        ({"file": r"a\0.onnx"}, r"tiny.yaml: `file` holds a character that no file name can have"),
+        ({"file": "a\0.onnx"}, r"tiny.yaml: `file` holds a character that no file name can have"),
         ({"input": {**CARD["input"], "height": 10**18}}, "`input.height` is 1e"),
         ({"outputs": {}}, "`outputs` names none"),
         ({"similarity": "cosin"}, "`similarity` is `cosin`: write cosine or l1"),
@@ -98,3 +102,35 @@ def test_the_weights_of_a_result_are_named(models):
     assert (
         weights_of(TechniqueSpec(name="calc", parameters={"model": "tiny"}, coarse=part, model_sha256=SHA256)) == said
     )
+
+
+def test_a_card_makes_a_technique_of_its_name(models):
+    write_network(models, "mine")
+    assert "mine" in techniques.names()
+    assert techniques.parameters("mine") == {"form": "float", "threads": 1}
+    technique = techniques.create("mine")
+    assert (technique.spec.name, technique.spec.parameters) == ("mine", {})
+    image = textured(1)
+    expected = open_backbone("mine", "descriptor").run(image)
+    found = technique.encode(image).coarse.astype(np.float32)
+    np.testing.assert_allclose(found, expected / np.linalg.norm(expected), atol=1e-3)
+    for form in ("float", "8bit", "1bit"):  # nobody has measured it
+        assert techniques.create("mine", {"form": form}).min_margin > 1
+
+
+def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models):
+    write_network(models, "mine", card={"outputs": {"features": "features"}})
+    write_card(models / "broken.yaml", {"sha256": "no"})
+    write_network(models, "good")
+    assert {"mine", "broken"}.isdisjoint(techniques.names())
+    assert "good" in techniques.names()
+    with pytest.raises(UsageError, match="`mine`"):
+        techniques.create("mine")
+    with pytest.raises(ModelError, match=r"broken\.yaml"):
+        techniques.create("broken")
+
+
+def test_a_card_may_be_called_like_a_technique(models):
+    write_network(models, "calc")
+    assert techniques.names().count("calc") == 1
+    assert techniques.create("calc").spec.parameters == {"model": "calc"}

@@ -2,13 +2,13 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 from pictures import textured
 
+from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import create
-from edgevpr.techniques.displacement import displacement, support
+from edgevpr.techniques.displacement import aligned, displacement, support
 
 
 def test_grids_of_other_sizes_are_laid_middle_on_middle():
@@ -62,22 +62,6 @@ def test_cohog_finds_how_far_a_picture_has_moved():
     assert match.shift_cells == pytest.approx((4.0, 2.0), abs=0.3)
     stranger = technique.encode(textured(2, 512, 512))
     assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("turned_deg", [0, 195])
-def test_a_camera_that_looks_down_finds_how_far_it_has_turned(turned_deg):
-    technique = create("cohog", {"camera": "nadir"})
-    scene = textured(3, 720, 720)
-    matrix = cv2.getRotationMatrix2D((359.5, 359.5), turned_deg, 1)  # the ground turns against the camera
-    turned = cv2.warpAffine(scene, matrix, (720, 720))
-    reference = technique.encode(scene[104:616, 104:616])
-    match = technique.match(technique.encode(turned[104:616, 104:616]), reference.fine)
-    assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 0.5
-    assert match.height_ratio == pytest.approx(1, abs=0.02)
-    assert match.score > 0.5
-    assert match.shift_cells == pytest.approx((0, 0), abs=0.3)
-    assert technique.match(technique.encode(textured(4, 512, 512)), reference.fine).score < 0.1
 
 
 def test_a_region_that_many_resemble_agrees_once():
@@ -135,3 +119,63 @@ def test_a_picture_supports_its_own_step_entirely():
     assert (own.back, own.likeness, own.log_rank) == (1.0, 1.0, 0.0)
     moved = support(asking, regions, regions, asking, (5.0, 0.0))
     assert moved.back == 0.0
+
+
+SIDE = 31
+
+
+def pairs(shift, turn_deg, scale, side=SIDE, wrong=0.0, seed=0):
+    """Numbers of the regions of a query and of those of the place that they lie on, a part of them wrong."""
+    numbers = np.arange(side * side)
+    y, x = np.divmod(numbers, side)
+    at = (x - (side - 1) / 2 + 1j * (y - (side - 1) / 2)) * scale * np.exp(1j * math.radians(turn_deg)) + complex(
+        *shift
+    )
+    to_x, to_y = (np.rint(part + (SIDE - 1) / 2).astype(int) for part in (at.real, at.imag))
+    inside = (to_x >= 0) & (to_x < SIDE) & (to_y >= 0) & (to_y < SIDE)
+    best = np.where(inside, to_y * SIDE + to_x, 0)
+    rng = np.random.default_rng(seed)
+    scattered = rng.random(len(best)) < wrong
+    best[scattered | ~inside] = rng.integers(0, SIDE * SIDE, np.count_nonzero(scattered | ~inside))
+    return (numbers, side), (best, SIDE)
+
+
+def align(asking, best, shift_cells):
+    return aligned(asking, best, FineMatch(0.5, shift_cells=shift_cells, rotation_deg=350.0, height_ratio=2.0))
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn_deg", "scale"), [((0.0, 0.0), 0.0, 1.0), ((3.3, -5.6), 7.0, 1.18), ((-8.2, 2.4), -7.4, 0.84)]
+)
+@pytest.mark.parametrize("wrong", [0.0, 0.7])
+def test_shift_rotation_and_scale_are_found_among_pairs_that_are_wrong(shift, turn_deg, scale, wrong):
+    found = align(*pairs(shift, turn_deg, scale, wrong=wrong), shift_cells=tuple(np.rint(shift)))
+    assert found.shift_cells == pytest.approx(shift, abs=0.15)
+    assert found.rotation_deg == pytest.approx((350 + turn_deg) % 360, abs=0.7)
+    assert found.height_ratio == pytest.approx(2 * scale, abs=0.03)
+
+
+def test_a_smaller_or_larger_view_lies_with_its_middle_at_the_shift():
+    for side in (15, 45, 63):
+        found = align(*pairs((2.4, 1.3), 5.0, 1.1, side), shift_cells=(2.0, 1.0))
+        assert found.shift_cells == pytest.approx((2.4, 1.3), abs=0.15)
+        assert found.rotation_deg == pytest.approx(355.0, abs=0.7)
+
+
+def test_the_covariance_is_that_of_pairs_which_lie_off():
+    exact = align(*pairs((0.0, 0.0), 0.0, 1.0), shift_cells=(0.0, 0.0))
+    assert exact.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
+    mixed = align(*pairs((0.0, 0.0), 0.0, 1.0, wrong=0.8), shift_cells=(0.0, 0.0))
+    assert mixed.covariance_cells2[0] > 1 / 12
+
+
+def is_as_it_was(match):
+    return match.covariance_cells2 is None and (match.rotation_deg, match.height_ratio) == (350.0, 2.0)
+
+
+def test_pairs_of_different_places_and_too_few_are_not_aligned():
+    asking, best = pairs((0.0, 0.0), 0.0, 1.0)
+    assert is_as_it_was(align((asking[0][:7], SIDE), (best[0][:7], SIDE), (0.0, 0.0)))
+    assert is_as_it_was(align(asking, best, (40.0, 40.0)))
+    same = np.zeros(20, int)
+    assert is_as_it_was(align((same, SIDE), (same, SIDE), (0.0, 0.0))), "one point has no rotation"

@@ -1,11 +1,11 @@
 """The techniques that take the feature map of a network, on the backbone that edgevpr ships."""
 
-import hashlib
 from functools import cache
 
 import numpy as np
 import pytest
 from pictures import textured
+from tiny_networks import CARD, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import create
@@ -111,38 +111,16 @@ def test_what_cannot_be_is_said_before_take_off(name, settings, error, says):
         technique(name, **settings)
 
 
-def write_network(folder, name, side, shift):
-    """A card `name` and its network: 4 channels, `side` x `side`, of a picture of 32x32, averages plus `shift`."""
-    onnx = pytest.importorskip("onnx", reason="writing a network for this test needs the package onnx")
-    step = 32 // side
-    weights = onnx.numpy_helper.from_array(np.full((4, 1, step, step), step**-2, np.float32), "weights")
-    bias = onnx.numpy_helper.from_array(np.full(4, shift, np.float32), "bias")
-    picture, features = (
-        onnx.helper.make_tensor_value_info(*each)
-        for each in (("picture", 1, [1, 1, 32, 32]), ("features", 1, [1, 4, side, side]))
-    )
-    node = onnx.helper.make_node("Conv", ["picture", "weights", "bias"], ["features"], strides=[step, step])
-    graph = onnx.helper.make_graph([node], "g", [picture], [features], [weights, bias])
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
-    content = model.SerializeToString()
-    (folder / f"{name}.onnx").write_bytes(content)
-    (folder / f"{name}.yaml").write_text(
-        f"title: {name}\nfile: {name}.onnx\nsha256: {hashlib.sha256(content).hexdigest()}\nlicence: MIT\n"
-        "source: a test\ninput: {layout: NCHW, height: 32, width: 32, colour: grey, equalise: false, resize: area, "
-        "scale: 0.004, mean: [0.0]}\noutputs: {features: features}\nsimilarity: cosine\n"
-    )
-
-
 def test_a_picture_without_any_region_says_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-    write_network(tmp_path, "dim", 8, -0.2)  # active where it is brighter than 50
+    write_network(tmp_path, "dim", fault="below zero in the dark", card={"input": {**CARD["input"], "mean": [0.0]}})
     sha256 = open_backbone("dim", "features").sha256
     for kind, count in (("regions", 12), ("bow", 40)):
         words = np.random.default_rng(0).random((count, 4)).astype(np.float16)
         np.savez(tmp_path / f"dim_{kind}{count}.npz", words=words, model_sha256=sha256)
     for name in ("region_vlad", "cross_region_bow"):
         it = technique(name, model="dim")
-        night, day = it.encode(np.full((32, 32), 9, np.uint8)), it.encode(textured(1))
+        night, day = it.encode(np.zeros((32, 32), np.uint8)), it.encode(textured(1))
         assert (night.quality, day.quality) == (0, 1)
         scores, _ = it.coarse_scores(night, np.stack([day.coarse, night.coarse]), None)
         assert scores.tolist() == [0, 0]

@@ -1,6 +1,7 @@
 """ONNX files of a few hundred bytes, whole and broken, with their cards."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -41,22 +42,10 @@ def write_network(folder: Path, name: str = "tiny", fault: str | None = None, ca
 
 
 def write_card(path: Path, changes: dict) -> Path:
-    """The card `CARD` with some keys changed."""
+    """The card `CARD` with some keys changed. JSON is YAML."""
     values = {**CARD, **changes}
-    path.write_text("".join(f"{key}: {_flow(value)}\n" for key, value in values.items()))
+    path.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))
     return path
-
-
-def _flow(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_flow, value)) + "]"
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
 def _network(fault: str | None):
@@ -69,6 +58,8 @@ def _network(fault: str | None):
         weights[:], bias[:] = 0, -1
     if fault == "no bias":
         bias[:] = 0
+    if fault == "below zero in the dark":
+        bias[:] = -0.2
     size: list = [1, 1, HEIGHT, WIDTH]
     if fault == "dynamic batch":
         size[0] = "batch"
@@ -76,7 +67,7 @@ def _network(fault: str | None):
         size = [1, 1, HEIGHT, WIDTH + 8]
     nodes = [
         helper.make_node("Conv", ["picture", "weights", "bias"], ["conv"], strides=[2, 2]),
-        helper.make_node("Relu", ["conv"], ["features"]),
+        helper.make_node("Identity" if fault == "below zero in the dark" else "Relu", ["conv"], ["features"]),
         helper.make_node("AveragePool", ["features"], ["pooled"], kernel_shape=[5, 7], strides=[5, 7]),
         helper.make_node("Flatten", ["pooled"], ["descriptor"]),
     ]
