@@ -80,14 +80,14 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     to_crs, _, _ = grid("EPSG:32632", 0.5, 400)
     picture = np.full((1, 400, 400), 90, np.uint8)
     picture[..., :150] = 0
-    source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 20.0)
+    source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 40.0)
     kept = frames_of(source)
     assert 0 < len(kept) < source.total
     assert source.without_data == source.total - len(kept)
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 
-    turned = source_of(marked_raster(tmp_path / "turned.tif", turned_deg=45), 40.0, 20.0)
+    turned = source_of(marked_raster(tmp_path / "turned.tif", turned_deg=45), 40.0, 40.0)
     assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
 
 
@@ -147,8 +147,8 @@ def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
 
 def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
-    every = {frame.name: frame.position for frame in frames_of(source_of(path, 80.0, 20.0))}
-    some = frames_of(source_of(path, 80.0, 20.0, Area((), ((waypoint(60, 60),),))))
+    every = {frame.name: frame.position for frame in frames_of(source_of(path, 80.0, 30.0))}
+    some = frames_of(source_of(path, 80.0, 30.0, Area((), ((waypoint(60, 60),),))))
     assert 2 <= len(some) < len(every)
     for frame in some:
         there = every[frame.name]
@@ -159,9 +159,9 @@ def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
 
 def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
-    whole = frames_of(source_of(path, 80.0, 20.0))
+    whole = frames_of(source_of(path, 80.0, 40.0))
     asked = [whole[4], whole[2]]
-    cut = frames_of(source_of(path, 80.0, 20.0, only=[each.name for each in asked]))
+    cut = frames_of(source_of(path, 80.0, 40.0, only=[each.name for each in asked]))
     assert [each.name for each in cut] == sorted(each.name for each in asked)
     assert np.array_equal(cut[0].image, whole[2].image)
 

@@ -5,8 +5,8 @@ from collections import Counter
 import cv2
 import numpy as np
 import pytest
-from fakes import FakeClock
 from pictures import textured
+from walks import map_of, query_meter
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
@@ -19,9 +19,6 @@ from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
-from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import Logistic
 from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
@@ -39,11 +36,6 @@ AHEAD = create("cohog", {"w1": 208})
 def frame(number, **more):
     position = Position(50 + 0.002 * number, 8.0)
     return Frame(image=textured(number, 240, 320), name=f"{number}.png", t_mono_s=0.0, position=position, **more)
-
-
-def meter():
-    clock = FakeClock()
-    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
 def at_hand(*frames):
@@ -66,32 +58,33 @@ def few(monkeypatch):
 
 @pytest.fixture
 def place_map(tmp_path):
-    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
-        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter())
+    with PlaceMap.open_for_adding(map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)))) as place_map:
         yield place_map
 
 
 def calibrated(place_map, pictures, technique=AHEAD, **more):
-    return calibrate(technique, place_map, CONFIG, meter(), pictures, lambda frames, total: frames, **more)
+    return calibrate(technique, place_map, CONFIG, query_meter(), pictures, lambda frames, total: frames, **more)
 
 
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
     index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
     pictures = [(number + 1, Levelled(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
-    answers = list(ask(AHEAD, place_map, index, rule, meter(), [*pictures, (99, pictures[0][1])]))
+    answers = list(ask(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
     assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}
     assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert all(each.right for each in answers if each.way == THERE)
     assert not any(each.right for each in answers if each.way != THERE)
-    again = list(ask(AHEAD, place_map, index, rule, meter(), pictures))
+    again = list(ask(AHEAD, place_map, index, rule, query_meter(), pictures))
     assert again == answers
-    assert list(ask(AHEAD, place_map, index, rule, meter(), pictures, seed=1)) != answers
+    assert list(ask(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
 
 
 def test_a_picture_that_says_nothing_is_an_answer_without_evidence(place_map):
     index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
     shown = np.zeros((240, 320), bool)
-    answers = list(ask(AHEAD, place_map, index, rule, meter(), [(1, Levelled(frame(0).image, shown, UNKNOWN_VIEW))]))
+    answers = list(
+        ask(AHEAD, place_map, index, rule, query_meter(), [(1, Levelled(frame(0).image, shown, UNKNOWN_VIEW))])
+    )
     assert [(each.right, each.evidence) for each in answers] == [(False, None)] * 3
 
 
@@ -130,7 +123,7 @@ def test_a_map_that_is_too_small_and_a_technique_without_confidence_are_refused(
 def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
-    build_map([frame(20)], AHEAD, place_map, meter())
+    build_map([frame(20)], AHEAD, place_map, query_meter())
     found = calibrated(place_map, at_hand(*map(frame, (*range(PLACES), 20)))[0])
     assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
 
@@ -139,8 +132,8 @@ def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:60] = allowed[190:] = False
     mask = Mask(allowed, sha256="display")
-    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
-        build_map(map(frame, range(PLACES)), AHEAD, place_map, meter(), Preparation(mask=mask))
+    path = map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)), Preparation(mask=mask))
+    with PlaceMap.open_for_adding(path) as place_map:
         pictures, _ = at_hand(*map(frame, range(PLACES)))
         with pytest.raises(UsageError, match="mask"):
             calibrated(place_map, pictures)
@@ -155,10 +148,10 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     def levelling():
         return Levelling(Lens(60.0), below=True, is_live=False)
 
-    with PlaceMap.create(tmp_path / "m.gpkg", down.spec) as place_map:
-        build_map(tilted, down, place_map, meter(), Preparation(levelling=levelling()))
+    path = map_of(tmp_path / "m.gpkg", down, tilted, Preparation(levelling=levelling()))
+    with PlaceMap.open_for_adding(path) as place_map:
         with pytest.raises(UsageError, match=" 0 places"):
-            calibrated(place_map, at_hand(*tilted)[0], down)
+            calibrated(place_map, at_hand(tilted[0])[0], down)
         found = calibrated(place_map, at_hand(*tilted)[0], down, preparation=Preparation(levelling=levelling()))
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
@@ -173,8 +166,7 @@ def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
         image = np.clip(waves + noise, 0, 255).astype(np.uint8)
         return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
 
-    with PlaceMap.create(tmp_path / "m.gpkg", AHEAD.spec) as place_map:
-        build_map(map(water, range(PLACES)), AHEAD, place_map, meter())
+    with PlaceMap.open_for_adding(map_of(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
         found = calibrated(place_map, at_hand(*map(water, range(PLACES)))[0])
     assert found.looks_alike
     assert found.accepted < 0.3

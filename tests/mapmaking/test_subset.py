@@ -6,21 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pictures import textured
+from walks import map_of
 
-from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
 from edgevpr.core.quadkeys import keys_at
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.missions import Area, Waypoint, read_area
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import unwatched
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text
-from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0
@@ -29,12 +26,6 @@ SIDE, STEP_M = 5, 100.0
 
 def at(east_m, north_m):
     return moved(*HOME, east_m, north_m)
-
-
-def write_map(path, frames):
-    technique = create("hog")
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, technique, place_map, meter_of(load_config(None), load_board("this")))
 
 
 def frame(column, row):
@@ -51,8 +42,10 @@ def tiles(tmp_path_factory):
     keys = keys_at(*points.T, 17)
     assert len(set(keys)) >= 4
     for key in set(keys):
-        write_map(folder / f"{key}.gpkg", [each for each, own in zip(frames, keys, strict=True) if own == key])
-    write_map(folder / "whole.gpkg", frames)
+        map_of(
+            folder / f"{key}.gpkg", create("hog"), [each for each, own in zip(frames, keys, strict=True) if own == key]
+        )
+    map_of(folder / "whole.gpkg", create("hog"), frames)
     return folder
 
 
