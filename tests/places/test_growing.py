@@ -9,7 +9,7 @@ from ranking import rank
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import Frame, Position
-from edgevpr.places.index import GrowingIndex, bytes_per_place, load_index
+from edgevpr.places.index import GrowingIndex, best_places, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 
 
@@ -156,3 +156,33 @@ def test_a_place_damaged_since_it_was_read_is_left_out_when_all_is_packed_anew(e
     assert_same(again.index, growing.index)
     learn(empty_map, again, [16])
     assert again.index.place_ids.tolist() == [1, 2, *range(4, 18)]
+
+
+def track(east_m):
+    lon_deg = np.asarray(east_m, float) / 111_195
+    return np.zeros(len(lon_deg)), lon_deg
+
+
+def test_gaps_stay_even_however_densely_a_stretch_was_mapped():
+    crowded = np.concatenate((np.arange(0, 100, 10), 100 + np.arange(0, 10, 0.1), np.arange(120, 220, 10)))
+    lat, lon = track(crowded)
+    kept = best_places(lat, lon, np.ones(len(crowded)), 22)
+    gaps = np.diff(crowded[kept])
+    assert len(kept) == 22
+    assert gaps.max() <= 21
+    assert gaps.min() > 4
+
+
+def test_of_two_places_side_by_side_the_one_that_says_more_stays():
+    lat, lon = track([0, 50, 51, 100])
+    assert 1 in best_places(lat, lon, np.array([1, 0.9, 0.2, 1]), 3)
+    assert 2 in best_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 7])
+def test_places_without_positions_are_thinned_along_their_order(capacity):
+    nowhere = np.full(20, np.nan)
+    kept = best_places(nowhere, nowhere, np.ones(20), capacity)
+    assert len(kept) == capacity
+    if capacity > 2:
+        assert np.diff(kept).max() <= 8

@@ -35,9 +35,15 @@ def ruler_map(whole_map, tmp_path):
         yield Ruler(), place_map
 
 
-def test_the_index_is_contiguous_and_of_the_size_promised(ruler_map):
+@pytest.fixture
+def ruler(ruler_map):
+    """A technique, its map, and the index of all places."""
     technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+    return technique, place_map, load_index(place_map, technique, 10_000)
+
+
+def test_the_index_is_contiguous_and_of_the_size_promised(ruler):
+    technique, _, index = ruler
     assert len(index) == 25
     assert index.nbytes == 25 * bytes_per_place(technique.spec)
     assert index.rows.flags.c_contiguous
@@ -71,9 +77,8 @@ def test_an_empty_map_is_refused(tmp_path):
         load_index(place_map, Ruler(), 10_000)
 
 
-def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_all_places_are_compared_unless_candidates_are_limited(ruler):
+    technique, place_map, index = ruler
     query = technique.encode(43)
     everything = rank(technique, query, place_map, index)
     assert technique.compared == 25
@@ -86,9 +91,8 @@ def test_all_places_are_compared_unless_candidates_are_limited(ruler_map):
     assert few[0].place.source_image == "44"
 
 
-def test_margin_is_to_the_best_place_elsewhere(ruler_map):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_margin_is_to_the_best_place_elsewhere(ruler):
+    technique, place_map, index = ruler
     ranking = rank(technique, technique.encode(20), place_map, index)
     # 11 m a number: 16 and 24 are 44 m away, 12 and 28 are 89 m.
     assert margin(ranking, index, 40.0) == pytest.approx(1 - 1 / 5)
@@ -98,9 +102,8 @@ def test_margin_is_to_the_best_place_elsewhere(ruler_map):
     assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
 
 
-def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(ruler_map):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(ruler):
+    technique, place_map, index = ruler
     query = technique.encode(43)
     ranking = rank(technique, query, place_map, index, candidates=3, apart_m=150.0)
     assert technique.compared == 3 + 5
@@ -123,9 +126,8 @@ def within(index, *numbers):
     return np.isin(index.place_ids, [1 + number // 4 for number in numbers])
 
 
-def test_places_out_of_reach_are_no_candidates(ruler_map):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_places_out_of_reach_are_no_candidates(ruler):
+    technique, place_map, index = ruler
     query = technique.encode(43)
     allowed = within(index, *range(64, 100, 4))
     technique.compared = 0
@@ -137,9 +139,8 @@ def test_places_out_of_reach_are_no_candidates(ruler_map):
     assert named(ranking, index, place_map, 1)[0].place.source_image == "44"
 
 
-def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler_map):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler):
+    technique, place_map, index = ruler
     query = technique.encode(20)
     alone = rank(technique, query, place_map, index, 20, 40.0, within(index, 80))
     assert len(alone.slots) == 1 + 5
@@ -182,10 +183,9 @@ class Turned(Ruler):
         return found if hypotheses is None or 2 in hypotheses else FineMatch(0.0)
 
 
-def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_compared(ruler_map):
-    _, place_map = ruler_map
+def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_compared(ruler):
+    _, place_map, index = ruler
     technique = Turned()
-    index = load_index(place_map, technique, 10_000)
     query = technique.encode(43)
     few = rank(technique, query, place_map, index, 14)
     assert sum(len(hypotheses) for hypotheses in technique.tried) == 14
@@ -248,10 +248,9 @@ class Hasty(Ruler):
         return 1 / (1 + abs(float(fine[0]) + 5 - float(query.fine[0]))), hypotheses
 
 
-def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_full(ruler_map):
-    _, place_map = ruler_map
+def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_full(ruler):
+    _, place_map, index = ruler
     technique = Hasty()
-    index = load_index(place_map, technique, 10_000)
     ranking = rank(technique, technique.encode(41), place_map, index, 8, 5.0)
     assert len(technique.glanced) == 8
     assert technique.compared == 3
@@ -262,10 +261,9 @@ def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_ful
     assert (np.diff(ranking.scores) <= 0).all()
 
 
-def test_a_rival_is_one_that_looked_best_elsewhere(ruler_map):
-    _, place_map = ruler_map
+def test_a_rival_is_one_that_looked_best_elsewhere(ruler):
+    _, place_map, index = ruler
     technique = Hasty()
-    index = load_index(place_map, technique, 10_000)
     # All three that are compared are neighbours, within 150 m of 40: so five rivals are compared as well.
     ranking = rank(technique, technique.encode(41), place_map, index, 12, 150.0)
     assert technique.compared == 8
@@ -279,9 +277,8 @@ def test_a_rival_is_one_that_looked_best_elsewhere(ruler_map):
 
 
 @pytest.mark.parametrize("candidates", [3, None])
-def test_where_the_scan_counts_it_is_part_of_the_score(ruler_map, candidates):
-    technique, place_map = ruler_map
-    index = load_index(place_map, technique, 10_000)
+def test_where_the_scan_counts_it_is_part_of_the_score(ruler, candidates):
+    technique, place_map, index = ruler
     query = technique.encode(43)
     plain = rank(technique, query, place_map, index, candidates)
     scanned, _ = technique.coarse_scores(query, index.rows, index.mean)
