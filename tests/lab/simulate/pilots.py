@@ -14,6 +14,7 @@ from mavlink_peers import PATIENCE_S
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.lab.simulate.generated import ORIGIN
+from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ARDUPILOT = os.environ.get("EDGEVPR_ARDUPILOT")  # the folder of a built ArduPilot
@@ -25,6 +26,20 @@ _DEFAULTS = {"plane": "models/plane.parm", "copter": "default_params/copter.parm
 _MODELS = {"plane": "plane", "copter": "quad"}
 _QUIET = {"FS_GCS_ENABLE": 0, "TERRAIN_ENABLE": 0, "FS_GCS_ENABL": 0, "FS_LONG_ACTN": 0, "THR_FAILSAFE": 0}
 FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+
+
+def state_at(t_mono_s, lat_deg, lon_deg, alt_m=600.0, velocity_m_s=(0.0, 0.0, 0.0), accuracy_m=1.0):
+    """What edgevpr says of a position; velocity: east, north, down."""
+    return MotionState(
+        t_mono_s=t_mono_s,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=alt_m,
+        velocity_m_s=velocity_m_s,
+        accuracy_m=accuracy_m,
+        alt_accuracy_m=1.0,
+        speed_accuracy_m_s=0.3,
+    )
 
 
 class Pilot:

@@ -9,9 +9,10 @@ import statistics
 from itertools import pairwise
 
 import pytest
-from pilots import ARDUPILOT, FIX, pilot_of
+from pilots import ARDUPILOT, FIX, pilot_of, state_at
 
 from edgevpr.core.geodesy import moved
+from edgevpr.mavlink import messages
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, DENIED, FAILED, UNSUPPORTED = (
@@ -204,27 +205,7 @@ def test_a_copter_without_any_gps_has_no_position_soon_and_no_fix_prevents_that(
 
 def _play_gps(pilot, truth, east_m: float = 0.0) -> None:
     """Send the true position as a second GPS would."""
-    lat_deg, lon_deg = moved(truth.lat_int / 1e7, truth.lon_int / 1e7, east_m, 0.0)
-    ms = round(pilot.now_s * 1000)
-    pilot.send(
-        mavlink.MAVLink_gps_input_message(
-            time_usec=ms * 1000,
-            gps_id=1,
-            ignore_flags=0,
-            time_week_ms=ms,
-            time_week=2300,
-            fix_type=3,
-            lat=round(lat_deg * 1e7),
-            lon=round(lon_deg * 1e7),
-            alt=truth.alt,
-            hdop=0.8,
-            vdop=1.0,
-            vn=truth.vn,
-            ve=truth.ve,
-            vd=truth.vd,
-            speed_accuracy=0.3,
-            horiz_accuracy=1.0,
-            vert_accuracy=1.0,
-            satellites_visible=12,
-        )
-    )
+    at = *moved(truth.lat_int / 1e7, truth.lon_int / 1e7, east_m, 0.0), truth.alt
+    message = messages.gps_input(state_at(pilot.now_s, *at, (truth.ve, truth.vn, truth.vd)), 1, pilot.now_s, 1.7e9)
+    message.satellites_visible = 12
+    pilot.send(message)

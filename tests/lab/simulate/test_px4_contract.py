@@ -7,11 +7,10 @@ import math
 import struct
 
 import pytest
-from pilots import FIX, PX4, pilot_of
+from pilots import FIX, PX4, pilot_of, state_at
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.wire import mavlink, parameter_value
 
 ACCEPTED, NOT_NOW = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_TEMPORARILY_REJECTED
@@ -105,19 +104,6 @@ def test_a_receiver_that_it_does_not_use_is_seen_in_its_flags_and_nothing_else(p
     pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
 
 
-def there_at(pilot, lat_deg, lon_deg):
-    return MotionState(
-        t_mono_s=pilot.now_s,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_m=0.0,
-        velocity_m_s=(0.0, 0.0, 0.0),
-        accuracy_m=1.0,
-        alt_accuracy_m=3.0,
-        speed_accuracy_m_s=1.0,
-    )
-
-
 def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(pilot):
     set_whole(pilot, "EKF2_GPS_CTRL", 0)
     set_whole(pilot, "EKF2_EV_CTRL", 1)
@@ -130,7 +116,7 @@ def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(pilo
         there = moved(*place(pilot), 0.0, 2.0)
         answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
         for _ in range(60):
-            pilot.send(messages.vision_position(there_at(pilot, *there), origin))
+            pilot.send(messages.vision_position(state_at(pilot.now_s, *there, alt_m=0.0), origin))
             pilot.wait(0.1)
         assert flags(pilot) & (FUSES | FUSES_ANY) == FUSES_ANY
         assert distance_m(*place(pilot), *there) < 1.5
@@ -152,7 +138,7 @@ def test_positions_of_message_296_are_fused_and_never_answered(pilot):
         there = moved(*place(pilot), 0.0, 2.0)
         answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
         for _ in range(60):
-            pilot.send(messages.position_sensor(there_at(pilot, *there)))
+            pilot.send(messages.position_sensor(state_at(pilot.now_s, *there, alt_m=0.0)))
             pilot.wait(0.1)
         assert flags(pilot) & FUSES
         assert distance_m(*place(pilot), *there) < 1.5
