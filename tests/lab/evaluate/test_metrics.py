@@ -1,65 +1,14 @@
-"""The figures against literal transcriptions of the equations, and against published similarity matrices."""
+"""The figures of quality, by scikit-learn and for any scores at all: with ties, one query, none right, all right."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from edgevpr.lab.evaluate import metrics
-
-
-def literal_curve(scores, correct):
-    """2.1 and 2.2, one threshold after the other."""
-    points = []
-    for threshold in sorted(set(scores), reverse=True):
-        true_positives = sum(1 for s, c in zip(scores, correct, strict=True) if c and s >= threshold)
-        false_positives = sum(1 for s, c in zip(scores, correct, strict=True) if not c and s >= threshold)
-        false_negatives = sum(1 for s, c in zip(scores, correct, strict=True) if c and s < threshold)
-        right = true_positives + false_negatives
-        points.append((true_positives / (true_positives + false_positives), true_positives / right if right else 0.0))
-    return points
-
-
-def literal_auc(points):
-    """2.3, term by term."""
-    total = 0.0
-    for (p, r), (p_next, r_next) in pairwise(points):
-        total += (p + p_next) / 2 * (r_next - r)
-    return total
-
-
-def literal_roc_auc(scores, correct):
-    wins = [
-        1.0 if right > wrong else 0.5 if right == wrong else 0.0
-        for right, is_right in zip(scores, correct, strict=True)
-        if is_right
-        for wrong, also_right in zip(scores, correct, strict=True)
-        if not also_right
-    ]
-    return sum(wins) / len(wins) if wins else None
-
-
-@pytest.mark.parametrize("distinct", [3, 7, 1000])
-@pytest.mark.parametrize("share_right", [0.1, 0.5, 0.9])
-def test_the_curve_and_its_figures_agree_with_a_literal_transcription(distinct, share_right):
-    random = np.random.default_rng(distinct)
-    for _ in range(20):
-        scores = random.integers(distinct, size=40) / distinct
-        correct = random.random(40) < share_right
-        precision, recall = metrics.precision_recall(scores, correct)
-        points = literal_curve(scores.tolist(), correct.tolist())
-        assert np.array_equal(np.column_stack([precision, recall]), points)
-        assert metrics.auc(precision, recall) == pytest.approx(literal_auc(points), abs=1e-12)
-        full_recall = [p for p, r in points if r == 1]
-        assert metrics.precision_at_100_recall(precision, recall) == (full_recall[0] if full_recall else 0)
-        certain = max([r for p, r in points if p == 1], default=0)
-        assert metrics.recall_at_100_precision(precision, recall) == certain
-        smallest = min(r for _, r in points)
-        highest = max(p for p, r in points if r == smallest)
-        assert metrics.extended_precision(precision, recall) == (highest + certain) / 2
-        expected = literal_roc_auc(scores.tolist(), correct.tolist())
-        assert metrics.roc_auc(scores, correct) == (expected if expected is None else pytest.approx(expected))
+from edgevpr.lab.evaluate.metrics import figures, interval
 
 
 def test_recall_at_k_counts_queries_with_a_right_reference_among_the_first_k():
@@ -83,3 +32,68 @@ def test_pcu_of_the_slowest_technique_is_its_precision():
     assert metrics.pcu(0.62, 0.83, 0.83) == pytest.approx(0.62)
     # Table 6.1: CoHOG on Gardens Point, 0.90 at 0.02 s against Cross-Region-BoW's 0.83 s.
     assert metrics.pcu(0.90, 0.02, 0.83) == pytest.approx(0.9 * math.log10(50.5))
+
+
+# Few distinct scores, so that ties are usual; and the rank of the first right one, infinite where there is none.
+QUERIES = st.lists(
+    st.tuples(st.integers(-3, 3), st.sampled_from([0.0, 1.0, 4.0, 7.0, 30.0, float("inf")])), min_size=1, max_size=60
+)
+
+
+def arrays(queries):
+    scores, ranks = (np.array(column, float) for column in zip(*queries, strict=True))
+    return scores, ranks
+
+
+@pytest.mark.slow
+@settings(deadline=None)
+@given(QUERIES)
+def test_every_figure_is_a_share_and_they_fit_each_other(queries):
+    scores, ranks = arrays(queries)
+    found, right = figures(scores, ranks), ranks == 0
+    shares = [value for key, value in found.items() if isinstance(value, float)]
+    assert all(0 <= share <= 1 for share in shares)
+    assert found["recall_at_1"] <= found["recall_at_5"] <= found["recall_at_10"]
+    assert found["recall_at_1"] == right.mean()
+    assert found["auc"] <= found["auc_from_zero"] + 1e-12
+    if right.any():
+        assert found["precision_at_100_recall"] >= found["recall_at_1"] - 1e-12
+    else:
+        assert found["auc"] == found["recall_at_100_precision"] == 0
+    if right.all():
+        assert found["precision_at_100_recall"] == found["recall_at_100_precision"] == found["auc_from_zero"] == 1
+    assert (found["roc_auc"] is None) == (right.all() or not right.any())
+
+
+@pytest.mark.slow
+@settings(deadline=None)
+@given(QUERIES)
+def test_scikit_learn_says_the_same(queries):
+    sklearn = pytest.importorskip("sklearn.metrics")
+    scores, ranks = arrays(queries)
+    right = ranks == 0
+    if not right.any():
+        return
+    precision, recall = metrics.precision_recall(scores, right)
+    theirs = sklearn.precision_recall_curve(right, scores)
+    ours = np.column_stack([precision, recall])
+    assert np.allclose(ours, np.column_stack([theirs[0][-2::-1], theirs[1][-2::-1]])[: len(ours)])
+    assert metrics.auc_from_zero(precision, recall) == pytest.approx(sklearn.auc(theirs[1], theirs[0]), abs=1e-12)
+    assert metrics.auc(precision, recall) == pytest.approx(np.trapezoid(precision, recall), abs=1e-12)
+    assert metrics.precision_at_100_recall(precision, recall) == max(precision[recall == 1])
+    certain = max(recall[precision == 1], default=0)
+    assert metrics.recall_at_100_precision(precision, recall) == certain
+    highest = max(precision[recall == min(recall)])
+    assert metrics.extended_precision(precision, recall) == (highest + certain) / 2
+    if not right.all():
+        assert metrics.roc_auc(scores, right) == pytest.approx(sklearn.roc_auc_score(right, scores), abs=1e-12)
+
+
+@pytest.mark.slow
+def test_an_interval_covers_what_the_queries_were_drawn_from():
+    random = np.random.default_rng(5)
+    covered = 0
+    for _ in range(200):
+        low, high = interval(random.random(100) < 0.8)
+        covered += low <= 0.8 <= high
+    assert covered > 0.88 * 200
