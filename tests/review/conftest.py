@@ -6,21 +6,13 @@ from dataclasses import replace
 import cv2
 import pytest
 from browser import driven
-from fakes import FakeClock, FakeLink, FakeSource, receiver_at, to_autopilot
+from fakes import FakeClock, FakeLink, FakeSource, receiver_at
+from flights import Flight
 from pictures import textured
 
 from edgevpr.cli.main import main
-from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.aboard import start_fields
-from edgevpr.runtime.flight.flight import Flight
-from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.herald import Herald
-from edgevpr.runtime.flight.metering import FlightMeter
-from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.world import Crew, Stop
-from edgevpr.runtime.recognise.opening import open_recogniser
 
 PLACES, SEEN = 8, 10  # the last pictures are of nothing in the map
 STEP_DEG = 0.001  # of latitude: 111 m
@@ -53,27 +45,12 @@ def flown(tmp_path_factory):
         receiver = receiver_at((lat_deg, 8.00126), 1.0, clock())
         return replace(aircraft, lat_deg=lat_deg, t_heard_s=clock(), gps=receiver)
 
-    place_map = folder / "map.gpkg"
-    config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0", "source.rate_hz": 1.0})
-    board, recogniser = load_board(config.board), open_recogniser(config, load_board(config.board), narrowed=True)
     link = FakeLink(clock, vehicle=vehicle)
-    link.listener = Navigator(config.mavlink.min_accuracy_m, 1.0)
+    flight = Flight(folder / "map.gpkg", folder / "flight.jsonl", clock, link, **{"source.rate_hz": 1.0})
+    recogniser = flight.recogniser
+    start = start_fields(flight.config, flight.board.name, recogniser.technique.spec, recogniser.place_map)
     source = FakeSource([Frame(image=each, name=name, t_mono_s=0.0) for name, each in pictures.items()], clock)
-    with recogniser.place_map, FlightLog(folder / "flight.jsonl", clock=clock) as log:
-        start = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
-        log.write("start", **start, decided={"rule": recogniser.rule})
-        crew = Crew(
-            recogniser=recogniser,
-            source=source,
-            link=link,
-            autopilot=to_autopilot(link, link.listener, clock, log),
-            flight_log=log,
-            herald=Herald(log, link),
-            meter=FlightMeter(config.battery, board, clock.clock),
-            clock=clock.clock,
-            stop=Stop(),
-        )
-        Flight(config, crew).run()
+    flight.fly(source, start={**start, "decided": {"rule": recogniser.rule}})
     return folder
 
 

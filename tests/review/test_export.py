@@ -7,6 +7,7 @@ from collections import Counter
 
 from logs import query, write_log
 
+from edgevpr.cli.main import main
 from edgevpr.review.export import features_of, write_csv, write_geojson
 from edgevpr.review.logged import read_flight
 
@@ -53,3 +54,23 @@ def test_a_flight_without_positions_has_no_points(tmp_path):
     assert features == []
     assert json.loads(written(write_geojson, features))["features"] == []
     assert written(write_csv, features) == "kind,lat_deg,lon_deg\n"
+
+
+def test_export_writes_a_file_or_standard_output(tmp_path, capsys):
+    at = {"lat_deg": 51.0, "lon_deg": 8.0}
+    log = write_log(tmp_path / "log", ("query", query("a", located=at, position=None, fix=None)))
+    for form in ("geojson", "csv"):
+        out = tmp_path / f"out.{form}"
+        assert main(["export", str(log), f"--{form}", str(out)]) == 0
+        assert capsys.readouterr().out == f"{out}: 1 points\n"
+        assert main(["export", str(log), f"--{form}", "-"]) == 0
+        assert capsys.readouterr().out == out.read_text("utf-8")
+        assert "51" in out.read_text("utf-8")
+
+
+def test_export_never_writes_over_the_log(tmp_path, capsys):
+    log = write_log(tmp_path / "log")
+    before = log.read_bytes()
+    assert main(["export", str(log), "--csv", str(log)]) == 2
+    assert "another name" in capsys.readouterr().err
+    assert log.read_bytes() == before

@@ -6,7 +6,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from browser import Opened, show
+from browser import Opened
 from logs import query, write_log
 
 from edgevpr.cli.main import main
@@ -166,20 +166,7 @@ def test_what_cannot_be_done_is_said_in_a_sentence(tmp_path, monkeypatch, capsys
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_a_browser_asks_for_nothing_and_complains_of_nothing(made, tmp_path):
-    nasty = query(NASTY, reason=NASTY, accepted=False)
-    (tmp_path / "nasty.html").write_text(
-        page(write_log(tmp_path / "log", ("query", nasty), ("query", query("b")))), "utf-8", "backslashreplace"
-    )
-    for each in (made, tmp_path / "nasty.html"):
-        shown = show(each)
-        assert "match accepted" in shown.content
-        assert (shown.console, shown.requests) == ([], [])
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_the_page_judges_a_real_flight_as_it_was_judged(made, browser):
+def test_the_page_judges_a_real_flight_as_it_was_judged_and_asks_for_nothing(made, browser):
     with Opened(browser, made) as page:
         said = page.inner_text("#would")
     assert said.startswith("0 more accepted, 0 fewer, of ")
