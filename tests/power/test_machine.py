@@ -17,29 +17,13 @@ def test_without_control_groups_the_machine_is_the_limit(tree):
     assert machine.cores(root) == len(os.sched_getaffinity(0))
 
 
-def test_the_memory_limit_of_the_service_binds(tree):
-    root = tree(
-        {
-            "proc/meminfo": MEMINFO,
-            "proc/self/cgroup": SERVICE,
-            "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "536870912\n",
-            "sys/fs/cgroup/system.slice/memory.max": "max\n",
-        }
-    )
-    assert machine.ram_limit_mb(root) == 536.870912
+@pytest.mark.parametrize(("above", "limit_mb"), [("max", 536.870912), ("100000000", 100.0)])
+def test_the_memory_limits_of_the_service_and_of_a_group_above_bind(tree, above, limit_mb):
+    slice_of_system = "sys/fs/cgroup/system.slice"
+    limits = {f"{slice_of_system}/edgevpr.service/memory.max": "536870912\n", f"{slice_of_system}/memory.max": above}
+    root = tree({"proc/meminfo": MEMINFO, "proc/self/cgroup": SERVICE} | limits)
+    assert machine.ram_limit_mb(root) == limit_mb
     assert machine.ram_mb(root) == 2048.0
-
-
-def test_the_limit_of_a_group_above_binds_too(tree):
-    root = tree(
-        {
-            "proc/meminfo": MEMINFO,
-            "proc/self/cgroup": SERVICE,
-            "sys/fs/cgroup/system.slice/edgevpr.service/memory.max": "536870912\n",
-            "sys/fs/cgroup/system.slice/memory.max": "100000000\n",
-        }
-    )
-    assert machine.ram_limit_mb(root) == 100.0
 
 
 @pytest.mark.parametrize(("quota", "expected"), [("50000 100000", 0.5), ("max 100000", None)])
