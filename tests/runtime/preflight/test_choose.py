@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_costs import REGIONS, VECTOR
+from example_costs import REGIONS, VECTOR, found
 
 from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
@@ -28,18 +28,6 @@ from edgevpr.runtime.preflight.choose import (
 from edgevpr.runtime.preflight.probe import probe
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
-
-
-def found(recall, wrong=0):
-    return {
-        "recall_at_1": recall,
-        "sets": 2,
-        "queries": 100,
-        "asked": 120,
-        "accepted": 30,
-        "accepted_wrong": wrong,
-        "accepted_elsewhere": wrong,
-    }
 
 
 @pytest.fixture
@@ -176,10 +164,10 @@ def test_a_large_map_is_scanned_whole_and_compared_in_part_and_a_query_is_prepar
 
 def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
     two_stages = dataclasses.replace(REGIONS, candidates=20)
-    found = fit(board(), two_stages, places=50_000, rate_hz=1, budget_mb=100)
-    assert not found.misfit
-    assert found.map_ram_mb == pytest.approx(50.0)
-    assert found.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
+    fitting = fit(board(), two_stages, places=50_000, rate_hz=1, budget_mb=100)
+    assert not fitting.misfit
+    assert fitting.map_ram_mb == pytest.approx(50.0)
+    assert fitting.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
     assert not fit(board(), two_stages, 100_000, 1, 100).misfit
     assert "RAM" in fit(board(), two_stages, 100_100, 1, 100).misfit
 
@@ -208,9 +196,9 @@ def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(mon
 
 
 def test_where_no_fix_could_be_sent_in_time_it_does_not_fit_at_any_rate():
-    found = fit(board(), REGIONS, places=1300, rate_hz=0.1, budget_mb=100)
-    assert found.t_query_s == pytest.approx(5.3)
-    assert found.misfit == f"does not fit: {choosing.too_late(5.3)}"
+    slow = fit(board(), REGIONS, places=1300, rate_hz=0.1, budget_mb=100)
+    assert slow.t_query_s == pytest.approx(5.3)
+    assert slow.misfit == f"does not fit: {choosing.too_late(5.3)}"
     assert not fit(board(), REGIONS, places=1225, rate_hz=0.1, budget_mb=100).misfit
 
 
