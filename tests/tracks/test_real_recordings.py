@@ -14,57 +14,24 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 CACHE = Path(os.environ.get("EDGEVPR_RECORDINGS") or Path.home() / ".cache" / "edgevpr-recordings")
 TIMEOUT_S = 5
+DJI = "JuanIrache/DJI_SRT_Parser/b6ed7901b0f77dc8864eaeaf153914482bfba6da/samples"
+PX4 = "PX4/pyulog/3cf17793f14709713ab297d3743314c658874068/test"
+PYMAVLINK = "ArduPilot/pymavlink/b4c7ca298cfac46aa841994d5d3288143e2fa7e5/tests"
+VIEWER = "ArduPilot/UAVLogViewer/c048ae207a105540d762a72ef8701565540d8d4a/src/assets"
+GPXPY = "tkrajina/gpxpy/017d9961ee9aa86ccdbf5bb50a4e2341d5c42f4b/test_files"
+GOPRO = "gopro/gpmf-parser/9a7150632892c7356c91145c889016f07b0ed48d/samples"
+AGUNG = "spwoodcock/drone-testdata-agung-2/40b1e3d2a1950b97260c129b120db63d3245e464"
 # Project, commit and file; what it is, how many positions it has, and about where and for how many seconds.
 RECORDINGS = {
-    "JuanIrache/DJI_SRT_Parser/b6ed7901b0f77dc8864eaeaf153914482bfba6da/samples/mavic_pro.SRT": (
-        "subtitles",
-        468,
-        (-20.25, 149.03),
-        467,
-    ),
-    "JuanIrache/DJI_SRT_Parser/b6ed7901b0f77dc8864eaeaf153914482bfba6da/samples/matrice_300.srt": (
-        "subtitles",
-        381,
-        (36.61, -6.11),
-        380,
-    ),
-    "JuanIrache/DJI_SRT_Parser/b6ed7901b0f77dc8864eaeaf153914482bfba6da/samples/MAVIC3.srt": (
-        "subtitles",
-        1938,
-        (3.41, -3.38),
-        246,
-    ),
-    "PX4/pyulog/3cf17793f14709713ab297d3743314c658874068/test/sample_px4_events.ulg": ("PX4", 109, (47.4, 8.55), 21),
-    "ArduPilot/pymavlink/b4c7ca298cfac46aa841994d5d3288143e2fa7e5/tests/test.BIN": (
-        "ArduPilot",
-        12,
-        (-35.36, 149.17),
-        1,
-    ),
-    "ArduPilot/UAVLogViewer/c048ae207a105540d762a72ef8701565540d8d4a/src/assets/vtol.tlog": (
-        "telemetry",
-        744,
-        (-35.36, 149.16),
-        208,
-    ),
-    "tkrajina/gpxpy/017d9961ee9aa86ccdbf5bb50a4e2341d5c42f4b/test_files/cerknicko-jezero.gpx": (
-        "GPX",
-        296,
-        (45.77, 14.36),
-        7190,
-    ),
-    "gopro/gpmf-parser/9a7150632892c7356c91145c889016f07b0ed48d/samples/max-heromode.mp4": (
-        "GoPro",
-        191,
-        (33.13, -117.33),
-        11,
-    ),
-    "spwoodcock/drone-testdata-agung-2/40b1e3d2a1950b97260c129b120db63d3245e464/image_metadata.csv": (
-        "GPSLatitude",
-        1817,
-        (-8.29, 115.46),
-        None,
-    ),
+    f"{DJI}/mavic_pro.SRT": ("subtitles", 468, (-20.25, 149.03), 467),
+    f"{DJI}/matrice_300.srt": ("subtitles", 381, (36.61, -6.11), 380),
+    f"{DJI}/MAVIC3.srt": ("subtitles", 1938, (3.41, -3.38), 246),
+    f"{PX4}/sample_px4_events.ulg": ("PX4", 109, (47.4, 8.55), 21),
+    f"{PYMAVLINK}/test.BIN": ("ArduPilot", 12, (-35.36, 149.17), 1),
+    f"{VIEWER}/vtol.tlog": ("telemetry", 744, (-35.36, 149.16), 208),
+    f"{GPXPY}/cerknicko-jezero.gpx": ("GPX", 296, (45.77, 14.36), 7190),
+    f"{GOPRO}/max-heromode.mp4": ("GoPro", 191, (33.13, -117.33), 11),
+    f"{AGUNG}/image_metadata.csv": ("GPSLatitude", 1817, (-8.29, 115.46), None),
 }
 
 

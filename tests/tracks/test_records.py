@@ -84,50 +84,41 @@ def test_a_gpx_track_goes_by_the_time_and_one_without_times_is_refused(tmp_path)
         read_record(path)
 
 
-# Each form with the position, altitude, height and (heading, roll, pitch) that it says.
+# Each form with the altitude, height and (heading, roll, pitch) that it says.
 SUBTITLES = {
-    "phantom": ("HOME(8.5,50.1) 2017.08.05 14:11:51\nGPS(8.5,50.2,16) BAROMETER:1.9\nISO:100", 50.2, None, 1.9, None),
-    "old": ("HOME(8.5,50.1) 2017.8.5 14:11:51\nGPS(8.5,50.2,16) Hb:2.9 Hs:1.9", 50.2, None, 2.9, None),
-    "matrice": ("2022.06.21 16:06:17\nGPS(50.2,8.5,310.0M) BAROMETER:0.3M", 50.2, None, 0.3, None),
-    "mini": ("F/2.8, SS 30, GPS (8.5000, 50.2000, 17), D 221.21m, H 200.70m, H.S n/a", 50.2, None, 200.7, None),
+    "phantom": ("HOME(8.5,50.1) 2017.08.05 14:11:51\nGPS(8.5,50.2,16) BAROMETER:1.9\nISO:100", None, 1.9, None),
+    "old": ("HOME(8.5,50.1) 2017.8.5 14:11:51\nGPS(8.5,50.2,16) Hb:2.9 Hs:1.9", None, 2.9, None),
+    "matrice": ("2022.06.21 16:06:17\nGPS(50.2,8.5,310.0M) BAROMETER:0.3M", None, 0.3, None),
+    "mini": ("F/2.8, SS 30, GPS (8.5000, 50.2000, 17), D 221.21m, H 200.70m, H.S n/a", None, 200.7, None),
     "rtk": (
         "GPS (8.5, 50.2, 15), HOME (8.4, 50.1, -57.98m), D 698.70m, H 85.80m, H.S 0.00m/s, "
         "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-90.0°, 0.0°, -70.0°)",
-        50.2,
-        None,
-        85.8,
-        (290.0, 0.0, 0.0),
+        *(None, 85.8, (290.0, 0.0, 0.0)),
     ),
-    "mavic 2": ("[latitude : 50.2] [longtitude : 8.5] [altitude: 213.9] </font>", 50.2, 213.9, None, None),
-    "mavic 3": ("[latitude: 50.2] [longitude: 8.5] [rel_alt: -2.4 abs_alt: 130.4] </font>", 50.2, 130.4, -2.4, None),
+    "mavic 2": ("[latitude : 50.2] [longtitude : 8.5] [altitude: 213.9] </font>", 213.9, None, None),
+    "mavic 3": ("[latitude: 50.2] [longitude: 8.5] [rel_alt: -2.4 abs_alt: 130.4] </font>", 130.4, -2.4, None),
     "enterprise": (
         "[latitude: 50.2] [longtitude: 8.5] [rel_alt: 4.1 abs_alt: 485.4] [Drone: Yaw:-17.9, Pitch:-1.4, Roll:1.1]",
-        50.2,
-        485.4,
-        4.1,
-        (342.1, None, None),
+        *(485.4, 4.1, (342.1, None, None)),
     ),
     "thermal": (
         "[latitude: 50.2] [longitude: 8.5] [rel_alt: 80.5 abs_alt: 327.0]\n[drone_yaw: 10.0 drone_roll: 2.0]\n"
         "[gb_yaw: -100.0 gb_pitch: -80.0 gb_roll: 0.0]",
-        50.2,
-        327.0,
-        80.5,
-        (260.0, 0.0, 10.0),
+        *(327.0, 80.5, (260.0, 0.0, 10.0)),
     ),
 }
 
 
 @pytest.mark.parametrize("form", SUBTITLES)
 def test_subtitles_of_each_form_are_read(tmp_path, form):
-    block, lat_deg, alt_m, height_m, turned = SUBTITLES[form]
+    block, alt_m, height_m, turned = SUBTITLES[form]
     text = "".join(f"{at + 1}\n00:00:{at:02},500 --> 00:00:{at + 1:02},500\n{block}\n\n" for at in range(3))
     (tmp_path / "film.SRT").write_text("\ufeff" + text)
     record = read_record(tmp_path / "film.SRT")
     assert not record.is_utc
     assert record.track.t_s == (0.5, 1.5, 2.5)
     tag = record.track.tags[0]
-    assert (tag.position.lat_deg, tag.position.lon_deg) == (lat_deg, 8.5)
+    assert (tag.position.lat_deg, tag.position.lon_deg) == (50.2, 8.5)
     assert (tag.position.alt_m, tag.height_m) == (alt_m, height_m)
     told = (tag.heading_deg, tag.roll_deg, tag.pitch_deg)
     assert told == (pytest.approx(turned, abs=1e-6) if turned and turned[1] is not None else turned or (None,) * 3)
