@@ -4,9 +4,8 @@ import json
 import shutil
 import sys
 
-import cv2
 import pytest
-from pictures import textured
+from pictures import textured, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.mapmaking import calibrate
@@ -24,20 +23,11 @@ def few(monkeypatch):
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    """Pictures with positions, a film of them, and pictures of another flight of the same names."""
+    """Pictures with positions, and those of another flight of the same names."""
     folder = tmp_path_factory.mktemp("flight")
-    film = cv2.VideoWriter(str(folder / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
-    rows = ["file,lat,lon"]
-    for name in ("ref", "other"):
-        (folder / name).mkdir()
-    for number in range(PLACES):
-        picture = textured(number, 240, 320)
-        cv2.imwrite(str(folder / "ref" / f"{number}.png"), picture)
-        cv2.imwrite(str(folder / "other" / f"{number}.png"), textured(50 + number, 240, 320))
-        film.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
-        rows.append(f"{number}.png,{50 + number * 0.002:.6f},8.0")
-    film.release()
-    (folder / "ref" / "positions.csv").write_text("\n".join(rows) + "\n")
+    pictures = [textured(number, 240, 320) for number in range(PLACES)]
+    write_flight(folder / "ref", pictures, step_deg=0.002)
+    write_flight(folder / "other", [textured(50 + number, 240, 320) for number in range(PLACES)])
     return folder
 
 
@@ -57,14 +47,6 @@ def bare_map(flight, tmp_path_factory):
 @pytest.fixture
 def bare(bare_map, tmp_path):
     return shutil.copy(bare_map, tmp_path / "m.gpkg")
-
-
-@pytest.fixture
-def mapped(bare, flight, capsys):
-    """A calibrated map."""
-    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
-    capsys.readouterr()
-    return bare
 
 
 def calibration_in(path):
@@ -119,11 +101,13 @@ def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, co
 
 
 @pytest.mark.slow
-def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(mapped, bare_map, tmp_path, capsys):
-    assert main(["map", "shrink", str(mapped), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
-    assert calibration_in(tmp_path / "small.gpkg") == calibration_in(mapped)
+def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(bare, bare_map, flight, tmp_path, capsys):
+    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
+    assert main(["map", "shrink", str(bare), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
+    assert calibration_in(tmp_path / "small.gpkg") == calibration_in(bare)
+    capsys.readouterr()
     merged = tmp_path / "merged.gpkg"
-    assert main(["map", "merge", str(merged), str(mapped), str(bare_map)]) == 0
+    assert main(["map", "merge", str(merged), str(bare), str(bare_map)]) == 0
     assert f"calibrate {merged}" in capsys.readouterr().out
     assert calibration_in(merged) is None
     assert main(["map", "merge", str(tmp_path / "both.gpkg"), str(bare_map), str(bare_map)]) == 0

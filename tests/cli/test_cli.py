@@ -97,24 +97,6 @@ def test_more_precision_accepts_no_more(capsys, flight, valley):
 
 
 @pytest.mark.slow
-def test_eval_prints_the_promised_keys(capsys, flight):
-    result = run_json(
-        capsys, "eval", "--query", flight / "query", "--ref", flight / "ref",
-        "--ground-truth", flight / "ground_truth.csv", "--techniques", "hog,cohog",
-        "--param", "cohog.entropy=filled_bins", "--json",
-    )["techniques"]  # fmt: skip
-    promised = {
-        *("recall_at_1", "recall_at_5", "recall_at_10", "precision_at_100_recall", "auc", "ep", "pcu"),
-        *("t_encode_s", "t_match_s", "t_match_per_ref_s", "descriptor_bytes", "u_encode", "u_match", "ah_total"),
-    }
-    assert set(result) == {"hog", "cohog"}
-    for each in result.values():
-        assert promised <= set(each)
-    assert result["cohog"]["recall_at_1"] == 1.0
-    assert result["cohog"]["parameters"]["entropy"] == "filled_bins"
-
-
-@pytest.mark.slow
 def test_the_technique_is_picked_and_the_reason_logged(capsys, caplog, flight, tmp_path):
     with caplog.at_level("INFO"):
         built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
@@ -338,10 +320,8 @@ def test_the_shell_is_told_how_a_line_may_go_on(tmp_path):
     assert (tmp_path / "said").read_text().strip() == "--known"
 
 
-@pytest.mark.parametrize(
-    "path", [[], ["map"], ["map", "build"], ["match"], ["run"], ["eval"], ["profile"], ["simulate"], ["models"]]
-)
-def test_every_command_explains_itself(capsys, path):
+@pytest.mark.parametrize("path", [[], ["map"], ["simulate"], ["models"]])
+def test_every_group_of_commands_explains_itself(capsys, path):
     with pytest.raises(SystemExit) as exit_code:
         main([*path, "--help"])
     assert exit_code.value.code == 0

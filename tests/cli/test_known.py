@@ -4,7 +4,7 @@ import json
 
 import cv2
 import pytest
-from pictures import textured
+from pictures import from_height
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.recognise.hints import TOLD_REACH_M
@@ -15,12 +15,6 @@ PLACES = 6
 A_METRE_DEG = 1 / 111_195  # of latitude
 
 
-def picture(place, height_ratio):
-    middle_px = round(384 * height_ratio / 2)
-    seen = textured(place, 800, 800)[400 - middle_px : 400 + middle_px, 400 - middle_px : 400 + middle_px]
-    return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_LINEAR)
-
-
 def make(folder, turned_deg=(None,) * PLACES, height_m=(None,) * PLACES, height_ratio=1.0, places_known=True):
     """A set of places 200 m apart, mapped from 100 m, and a query over each. `turned_deg` is what positions.csv says
     of the heading of each query, truly that of its place, less that of the place; None: nothing."""
@@ -29,9 +23,9 @@ def make(folder, turned_deg=(None,) * PLACES, height_m=(None,) * PLACES, height_
         (folder / side).mkdir(parents=True)
     for place in range(PLACES):
         where = f"{50 + 200 * place * A_METRE_DEG:.7f},8"
-        cv2.imwrite(str(folder / "ref" / f"r{place}.png"), picture(place, 1.0))
+        cv2.imwrite(str(folder / "ref" / f"r{place}.png"), from_height(place, 1.0))
         cv2.imwrite(
-            str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(picture(place, height_ratio), alpha=0.8)
+            str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(from_height(place, height_ratio), alpha=0.8)
         )
         rows.append(f"r{place}.png,{where},{50 * place},100" if places_known else f"r{place}.png,,,,")
         turned, height = turned_deg[place], height_m[place]

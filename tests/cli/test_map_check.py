@@ -5,10 +5,9 @@ import json
 import shutil
 import sqlite3
 
-import cv2
 import pytest
 from full_disk import no_file_larger_than
-from pictures import textured
+from pictures import textured, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.places.mapfile import PlaceMap
@@ -18,13 +17,7 @@ from edgevpr.places.mapfile import PlaceMap
 def flight(tmp_path_factory):
     """Six pictures with positions and times."""
     folder = tmp_path_factory.mktemp("flight")
-    (folder / "images").mkdir()
-    rows = ["file,lat,lon,time"]
-    for number in range(6):
-        name = f"{number}.png"
-        cv2.imwrite(str(folder / "images" / name), textured(number, 240, 320))
-        rows.append(f"{name},{50 + number * 0.001:.6f},8.0,{1.7e9 + number}")
-    (folder / "positions.csv").write_text("\n".join(rows) + "\n")
+    write_flight(folder / "images", [textured(number, 240, 320) for number in range(6)], start_s=1.7e9)
     return folder
 
 

@@ -4,7 +4,7 @@ import json
 
 import cv2
 import pytest
-from pictures import textured
+from pictures import textured, write_flight
 from tiny_networks import write_network
 
 from edgevpr.cli.main import main
@@ -17,23 +17,11 @@ from edgevpr.techniques import create, vectors
 
 
 @pytest.fixture
-def models(tmp_path, monkeypatch):
-    folder = tmp_path / "models"
-    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
-    write_network(folder, "tiny")
-    return folder
-
-
-@pytest.fixture
-def flight(tmp_path):
-    """Six pictures, the same darker as queries, and the truth."""
-    for split in ("ref", "query"):
-        (tmp_path / split).mkdir()
-    for number in range(6):
-        cv2.imwrite(str(tmp_path / "ref" / f"{number}.png"), textured(number))
-        cv2.imwrite(str(tmp_path / "query" / f"{number}.png"), cv2.convertScaleAbs(textured(number), alpha=0.9))
-    truth = ["query_file,ref_files", *(f"{number}.png,{number}.png" for number in range(6))]
-    (tmp_path / "truth.csv").write_text("\n".join(truth))
+def flight(tmp_path, models):
+    """Six pictures and the same darker as queries, beside a folder of models with one of our own."""
+    write_network(models, "tiny")
+    for split, darker in (("ref", 1.0), ("query", 0.9)):
+        write_flight(tmp_path / split, [cv2.convertScaleAbs(textured(number), alpha=darker) for number in range(6)])
     return tmp_path
 
 
@@ -47,7 +35,6 @@ def test_the_forms_have_the_same_names_everywhere():
     assert create("hog").spec.forms == FORMS == vectors.FORMS
 
 
-@pytest.mark.usefixtures("models")
 def test_one_map_serves_all_forms(capsys, flight):
     path = built(flight, "--technique", "calc", "--param", "model=tiny")
     content = path.read_bytes()
@@ -61,7 +48,6 @@ def test_one_map_serves_all_forms(capsys, flight):
     assert "Weights of tiny" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("models")
 def test_the_form_of_the_configuration_is_flown_and_said(flight):
     path = built(flight, "--technique", "calc", "--param", "model=tiny")
     config = load_config(None, {"map": str(path), "match.form": "1bit"})

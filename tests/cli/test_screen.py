@@ -2,7 +2,6 @@
 
 import logging
 import os
-import subprocess
 import sys
 
 import cv2
@@ -16,8 +15,13 @@ from edgevpr.core.text import decoded_name, printable, shown, without_passwords
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 
 
-def said(argv, **more):
-    return subprocess.run([sys.executable, "-m", "edgevpr", *argv], capture_output=True, timeout=60, **more)
+def said(capfd, *words):
+    """The exit code of a command, and all that it and its libraries print."""
+    try:
+        code = main([str(word) for word in words])
+    except SystemExit as ended:
+        code = ended.code
+    return code, *capfd.readouterr()
 
 
 @pytest.mark.parametrize(
@@ -69,35 +73,38 @@ def test_a_message_is_one_line_and_a_traceback_keeps_its_own():
 
 
 @pytest.mark.slow
-def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path):
+def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path, capfd):
     for number, folder in enumerate(("ref", "query")):
         (tmp_path / folder).mkdir()
         picture = cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes()
         (tmp_path / folder / REDDENING).write_bytes(picture)
         (tmp_path / folder / f"{number}\x1b[0m.jpg").write_bytes(b"no image")
-    built = said(["map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"])
-    assert built.returncode == 1
-    matched = said(["match", tmp_path / "m.gpkg", "--images", tmp_path / "query"])
-    assert b"1\\x1b[0m.jpg is not an image" in matched.stderr
-    assert matched.stdout.count(b"\\x1b[31m.jpg") == 2
-    assert b"\x1b" not in built.stdout + built.stderr + matched.stdout + matched.stderr
+    code, *built = said(
+        capfd, "map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"
+    )
+    assert code == 1
+    _, out, err = said(capfd, "match", tmp_path / "m.gpkg", "--images", tmp_path / "query")
+    assert "1\\x1b[0m.jpg is not an image" in err
+    assert out.count("\\x1b[31m.jpg") == 2
+    assert "\x1b" not in "".join([*built, out, err])
 
 
 @pytest.mark.slow
-def test_the_password_of_a_camera_is_not_printed(tmp_path):
+def test_the_password_of_a_camera_is_not_printed(tmp_path, capfd):
     (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
-    checked = said(["check", "--config", tmp_path / "c.yaml"])
-    assert b"http://pilot:***@127.0.0.1:9/cam" in checked.stdout
-    refused = said(["map", "build", tmp_path / "m.gpkg", "--images", "rtsp://pilot:secret@127.0.0.1/cam"])
-    assert (refused.returncode, b"rtsp://pilot:***@127.0.0.1/cam is live" in refused.stderr) == (1, True)
-    assert b"secret" not in checked.stdout + checked.stderr + refused.stdout + refused.stderr
+    _, *checked = said(capfd, "check", "--config", tmp_path / "c.yaml")
+    assert "http://pilot:***@127.0.0.1:9/cam" in checked[0]
+    build = "map", "build", tmp_path / "m.gpkg", "--images", "rtsp://pilot:secret@127.0.0.1/cam"
+    code, *refused = said(capfd, *build)
+    assert (code, "rtsp://pilot:***@127.0.0.1/cam is live" in refused[1]) == (1, True)
+    assert "secret" not in "".join([*checked, *refused])
 
 
-def test_a_wrong_flag_is_repeated_without_its_escapes():
-    refused = said(["match", "m.gpkg", "--images", "x", "\x1b[31m"])
-    assert refused.returncode == 2
-    assert b"\\x1b[31m" in refused.stderr
-    assert b"\x1b" not in refused.stderr
+def test_a_wrong_flag_is_repeated_without_its_escapes(capfd):
+    code, _, err = said(capfd, "match", "m.gpkg", "--images", "x", "\x1b[31m")
+    assert code == 2
+    assert "\\x1b[31m" in err
+    assert "\x1b" not in err
 
 
 def test_a_form_that_does_not_exist_is_refused(capsys):
