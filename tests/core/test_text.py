@@ -1,6 +1,62 @@
-import pytest
+"""Progress on a terminal (a real pty) and into a file."""
 
-from edgevpr.core.text import nines
+import io
+import os
+
+import pytest
+from fakes import FakeClock
+
+from edgevpr.core.text import nines, progress, waiting
+
+
+def test_a_file_gets_a_line_for_every_tenth():
+    out = io.StringIO()
+    assert list(progress(range(200), 200, "cohog: queries", out)) == list(range(200))
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 11
+    assert lines[0] == "cohog: queries  1/200  0 %"
+    assert lines[-1] == "cohog: queries  200/200  100 %"
+
+
+def test_a_terminal_sees_one_line_redrawn():
+    reader, writer = os.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        assert list(progress("abcd", 4, "map", terminal)) == list("abcd")
+        drawn = ""
+        while "\n" not in drawn:  # a terminal passes on what it has: perhaps not all at once
+            drawn += os.read(reader, 4096).decode()
+    os.close(reader)
+    assert drawn.split("\r")[:4] == ["map  1/4  25 %", "map  2/4  50 %", "map  3/4  75 %", "map  4/4  100 %"]
+    assert drawn.count("\n") == 1
+
+
+def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
+    reader, writer = os.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        for each in ("waiting for the source", "for the link", ""):
+            waiting(each, terminal)
+        drawn = ""
+        while drawn.count("\r") < 3:
+            drawn += os.read(reader, 4096).decode()
+    os.close(reader)
+    assert [line.rstrip() for line in drawn.split("\r")] == ["waiting for the source", "for the link", "", ""]
+    assert {len(line) for line in drawn.split("\r")[:3]} == {79}
+
+
+def test_the_time_that_is_left_is_told_once_it_can_be_known():
+    out, clock = io.StringIO(), FakeClock()
+
+    def slow():
+        for each in range(40):
+            clock.now_s += 20.0
+            yield each
+
+    list(progress(slow(), 40, "sets", out, clock))
+    lines = out.getvalue().splitlines()
+    assert lines[0] == "sets  1/40  2 %, 13 min left"
+    assert "sets  36/40  90 %, 80 s left" in lines
+    assert len(lines) == 40, "no line is older than 5 s"
+    assert lines[-1] == "sets  40/40  100 %"
 
 
 @pytest.mark.parametrize(("probability", "said"), [(0.5, "0.5000"), (0.9999997, "0.99999970"), (1.0, "0." + 15 * "9")])
