@@ -97,7 +97,7 @@ def test_places_of_the_same_ground_are_heard_together():
 
 
 def test_places_that_contradict_each_other_are_refused():
-    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(8, 10), east_m=10)], CELLS)
+    found = located([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(aside=(0.0, 0.0)))
     assert "positions" in found.objection
 
 
