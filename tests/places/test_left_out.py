@@ -106,6 +106,14 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
     assert (verdict.accepted, verdict.reason) == (False, "a place that cannot be read may be the right one")
 
 
+@pytest.mark.parametrize(("number", "may_be_right"), [(90, True), (110, True), (80, False), (120, False)])
+def test_a_place_left_out_may_be_right_if_it_is_one_of_the_three_likeliest(ruler, number, may_be_right):
+    technique, place_map, index = ruler
+    place_map.left_out[1 + number // 10] = "gone"
+    ranking = rank(technique, technique.encode(104), place_map, index)
+    assert (number // 10 in ranking.unread) is may_be_right
+
+
 def test_where_most_cannot_be_read_the_file_is_at_fault_and_all_come_back_with_it(ruler):
     technique, place_map, index = ruler
     fine = place_map.db.execute("SELECT fine, place_id FROM places").fetchall()
