@@ -89,7 +89,7 @@ def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
 @pytest.mark.parametrize("vehicle", ["px4-plane", "arducopter"])
 def test_whatever_the_autopilot_and_its_channel(fly, tmp_path, vehicle):
     with autopilot(vehicle, "--no-gps") as link:
-        ended(fly("--link", link, "--rate-hz", "4"))
+        ended(fly("--link", link, "--rate-hz", "8"))
     again, _ = is_the_same(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
 
@@ -136,7 +136,7 @@ def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_pa
     assert len(of_kind(again.lines, "query")) >= 2, "what is half a second old is on the disk"
     tape = recordings(tmp_path / "recorded")[-1] / TAPE
     first, rest = tape.read_bytes().split(b"\n", 1)
-    for share in (0.1, 0.37, 0.6, 0.83):  # a power cut, at any byte
+    for share in (0.1, 0.6):  # a power cut, at any byte
         tape.write_bytes(first + b"\n" + rest[: round(share * len(rest))])
         shorter, _ = is_the_same(log)
         assert len(shorter.lines) <= len(again.lines)
