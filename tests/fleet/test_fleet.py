@@ -34,7 +34,7 @@ photos = pytest.importorskip("edgevpr.fleet.photos")
 worker = pytest.importorskip("edgevpr.fleet.worker")
 pyogrio = pytest.importorskip("pyogrio")
 pytestmark = pytest.mark.slow
-PER_TILE = 20
+PER_TILE = 10
 
 
 def unshown(items, total, label):
@@ -112,7 +112,7 @@ def places_of(folder):
 
 @pytest.fixture(scope="module")
 def orthophoto(tmp_path_factory):
-    return textured_raster(tmp_path_factory.mktemp("raster") / "o.tif", side_px=800)
+    return textured_raster(tmp_path_factory.mktemp("raster") / "o.tif", side_px=720)
 
 
 @pytest.fixture(scope="module")
