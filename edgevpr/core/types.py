@@ -12,6 +12,7 @@ from edgevpr.core.contract import FineMatch
 # ArduPilot treats an older frame as 5 s old, and would then correct the position by too little: no such fix is sent.
 FIX_MAX_AGE_S = 5.0
 _FRESH_S = 1.0
+FRAME_TIME_SD_S = 0.03  # standard deviation of the time of a frame: what a camera takes to expose and to send varies
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +100,10 @@ class Vehicle:
 class Frame:
     """One picture and the data known of it (None: unknown).
 
-    `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: seconds of the monotonic clock. `t_utc_s`: seconds since
-    1970. `heading_deg`: 0..360 clockwise from true north. `roll_deg`, `pitch_deg`: of the airframe, positive with the
-    right wing down, and with the nose up; of a camera on a gimbal, its deviation from straight down. `height_m`: above
-    the ground.
+    `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: time of taking, seconds of the monotonic clock; `t_sd_s`:
+    its standard deviation. `t_utc_s`: seconds since 1970. `heading_deg`: 0..360 clockwise from true north.
+    `roll_deg`, `pitch_deg`: of the airframe, positive with the right wing down, and with the nose up; of a camera on a
+    gimbal, its deviation from straight down. `height_m`: above the ground.
     """
 
     image: np.ndarray
@@ -115,6 +116,7 @@ class Frame:
     pitch_deg: float | None = None
     height_m: float | None = None
     pose: Pose | None = None
+    t_sd_s: float = FRAME_TIME_SD_S
 
 
 @dataclass(frozen=True, slots=True)

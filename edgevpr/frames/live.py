@@ -10,6 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
+from edgevpr.frames.age import UnstampedTime
 from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
 from edgevpr.frames.source import Source
 
@@ -17,6 +18,7 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take less than three pictures a second
 _DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
+_LATE = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
 
 
 class DeviceCapture:
@@ -25,14 +27,18 @@ class DeviceCapture:
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
+        self._time = UnstampedTime(clock())
 
     def read(self) -> Shot | None:
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
+            asked_s = self._clock()
             there, read = self._capture.read()
             if there:
                 image: Image = np.asarray(read, np.uint8)
                 plane = image if image.ndim == 2 else image[:, :, 1]
-                return Shot(t_mono_s=self._clock(), look=coarse(plane), pixels=lambda: image)
+                came_s = self._clock()
+                sd_s = self._time.taken(asked_s, came_s).sd_s
+                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=coarse(plane), pixels=lambda: image)
         return None
 
     def release(self) -> None:
@@ -74,7 +80,7 @@ class LiveSource(Source):
             return None
         number, shot = newest
         name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s)
+        return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s)
 
     def close(self) -> None:
         """Stop the capture thread; return after about half a second at most."""
@@ -133,5 +139,7 @@ class LiveSource(Source):
         silent_s = self._clock() - self._last_new_s
         if self._same >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
             self.condition, self.state = Condition.FROZEN, "frozen: the same picture over and over"
+        elif refusal is Refusal.LATE and silent_s > _DAMAGED_S:
+            self.condition, self.state = Condition.LATE, _LATE
         elif not self._same and silent_s > _DAMAGED_S:
             self.condition, self.state = Condition.DAMAGED, "damaged: no picture is whole"

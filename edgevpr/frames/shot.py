@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
+from edgevpr.core.types import FRAME_TIME_SD_S
 
 _LOOK_PX = (60, 80)  # least rows and columns of a coarse copy
 _BANDS = 12
@@ -28,12 +29,14 @@ _MOVES_ALWAYS = 0.75  # least share of pictures in which a band changed; a band 
 
 class Condition(Enum):
     """The condition of a source. OPENING: until the first picture comes or the opening fails. RUNNING: new and complete
-    pictures come. DAMAGED: pictures come, but none is complete. FROZEN: the same picture comes again and again. LOST:
-    no pictures come, and the source is being reopened. ENDED: no more pictures will come."""
+    pictures come. DAMAGED: pictures come, but none is complete. LATE: pictures come, but their age is unknown. FROZEN:
+    the same picture comes again and again. LOST: no pictures come, and the source is being reopened. ENDED: no more
+    pictures will come."""
 
     OPENING = auto()
     RUNNING = auto()
     DAMAGED = auto()
+    LATE = auto()
     FROZEN = auto()
     LOST = auto()
     ENDED = auto()
@@ -44,8 +47,8 @@ class Refusal(Enum):
 
     DAMAGED: it is incomplete, or was decoded with the help of an incomplete one.
     PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before.
-    LATE: its age is unknown, because it was buffered before the source was opened or arrived out of order; or it was
-    skipped, because decoding lags behind."""
+    LATE: its age is unknown, because it was buffered before the source was opened, arrived out of order, or has a time
+    stamp that does not keep time; or it was skipped, because decoding lags behind."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"
@@ -56,12 +59,14 @@ class Refusal(Enum):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
     """A complete picture. `t_mono_s`: time at which it was taken, as far as known, at most that of its arrival (seconds
-    of the monotonic clock). `look`: coarse grey copy, uint8 (h, w). `pixels`: function that converts and returns the
-    picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for pictures that are used."""
+    of the monotonic clock); `t_sd_s`: its standard deviation in seconds. `look`: coarse grey copy, uint8 (h, w).
+    `pixels`: function that converts and returns the picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for
+    pictures that are used."""
 
     t_mono_s: float
     look: Image
     pixels: Callable[[], Image]
+    t_sd_s: float = FRAME_TIME_SD_S
 
 
 class OpeningError(Exception):

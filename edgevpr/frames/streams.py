@@ -1,18 +1,16 @@
-"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken, estimated by the
-stamps of the stream (`StampedTime`) or without (`UnstampedTime`). A thread receives packets as they come (`Arrivals`),
-the thread of `frames.live` decodes them (`StreamCapture`)."""
+"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). A
+thread receives packets as they come (`Arrivals`), the thread of `frames.live` decodes them (`StreamCapture`)."""
 
-import math
 import threading
 from collections import deque
 from collections.abc import Callable
 from queue import Queue
-from statistics import median
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from edgevpr.core.arrays import Image
+from edgevpr.frames.age import StampedTime, Taken, UnstampedTime
 from edgevpr.frames.causes import TransportError
 from edgevpr.frames.decoding import Fetched, WholePictures, open_pictures
 from edgevpr.frames.rtp import describe_rtp
@@ -36,12 +34,6 @@ _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watc
 _BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # prefixes of pixel formats whose first plane is the brightness
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
 _TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
-_RESTART_S = 5.0  # a larger change of the delay: the sender has restarted, or something has held the stream up
-_BACKLOG_S = 0.005  # a picture with a delay shorter than the least so far by more than this was in a backlog
-_IN_TIME = 3  # pictures in a row not in a backlog after which there is none any more
-_WAITED_S = 0.002  # a picture that was returned sooner than this was in a buffer already
-_USUAL_OF, _AS_USUAL = 9, 1.5  # number of waits whose median is the usual one, and the multiple of it that is normal
-_WINDOW_S, _STEADY_S = 5.0, 0.2  # delays that vary by less for so long are due to the path, and not to congestion
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | Snapshots":
@@ -106,7 +98,7 @@ class StreamCapture:
             if arrival is None:
                 return None
             fetched, asked_s, t_mono_s = arrival
-            came_s = self._unstamped.taken_s(asked_s, t_mono_s)
+            came = self._unstamped.taken(asked_s, t_mono_s)
             self._note_stamp(fetched, t_mono_s)
             waited_s = self._clock() - t_mono_s
             if waited_s > _TOO_OLD_S or (waited_s > _BEHIND_S and self._arrivals.can_begin_anew()):
@@ -114,7 +106,7 @@ class StreamCapture:
             pictures = self._whole.decode(fetched)
             if isinstance(pictures, Refusal):
                 return pictures
-            self._ready.extend(self._shot(picture, came_s, t_mono_s) for picture in pictures)
+            self._ready.extend(self._shot(picture, came, t_mono_s) for picture in pictures)
         return self._ready.popleft()
 
     def release(self) -> None:
@@ -126,18 +118,19 @@ class StreamCapture:
         if self._stamped is None or packet.pts is None:
             return
         order = packet.pts if packet.dts is None else packet.dts
-        self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, t_mono_s)
+        self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, t_mono_s, packet.size)
         if self._stamped.is_live:
             self._whole.caught_up()
 
-    def _shot(self, picture: "VideoFrame", came_s: float, arrived_s: float) -> Shot | Refusal:
-        taken_s: float | None = came_s
+    def _shot(self, picture: "VideoFrame", came: Taken, arrived_s: float) -> Shot | Refusal:
+        taken: Taken | None = came
         if self._stamped:
             stamp = picture.pts
-            taken_s = None if stamp is None else self._stamped.taken_s(stamp * self._unit_s, arrived_s)
-        if taken_s is None:
+            taken = None if stamp is None else self._stamped.taken(stamp * self._unit_s, arrived_s)
+        if taken is None:
             return Refusal.LATE
-        return Shot(t_mono_s=taken_s, look=self._look(picture), pixels=lambda: self._whole.pixels(picture))
+        look = self._look(picture)
+        return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=lambda: self._whole.pixels(picture))
 
     def _look(self, picture: "VideoFrame") -> Image:
         if not picture.format.name.startswith(_BYTES_OF_LUMA) or picture.format.components[0].bits != 8:
@@ -188,70 +181,3 @@ class Arrivals:
                 self._waiting.put((fetched, asked_s, self._clock()))
         finally:
             self._waiting.put(None)
-
-
-class StampedTime:
-    """Estimates when pictures were taken, from the stream's time stamps.
-
-    The stamps count from an unknown zero. The delay of a picture is its arrival time minus its stamp. The least delay
-    so far is assumed to be that of a picture that arrives at once; a picture with a longer delay is older by the
-    difference. A larger value replaces the least delay only if delays have been steady for five seconds, as after a
-    clock drift or a pause of the sender; in a congested network they vary. `is_live`: True once the pictures that were
-    buffered before the opening have been fetched."""
-
-    def __init__(self) -> None:
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        self.is_live, self._in_time = False, 0
-        self._order_s, self._order_delay_s = -math.inf, math.nan
-        self._least_order_delay_s = self._least_s = math.inf
-        self._window: list[tuple[float, float, float]] = []
-
-    def arrived(self, stamp_s: float, order_s: float, t_mono_s: float) -> None:
-        """Record the arrival at `t_mono_s` of a picture with the stamp `stamp_s`. `order_s` is its decoding time stamp,
-        which differs only in streams that send pictures in another order than they were taken. All in seconds."""
-        delay_s, order_delay_s = t_mono_s - stamp_s, t_mono_s - order_s
-        if order_s < self._order_s or abs(order_delay_s - self._order_delay_s) > _RESTART_S:
-            self._begin_anew()
-        self._in_time = self._in_time + 1 if order_delay_s > self._least_order_delay_s - _BACKLOG_S else 0
-        self.is_live = self.is_live or self._in_time >= _IN_TIME
-        self._order_s, self._order_delay_s = order_s, order_delay_s
-        self._least_order_delay_s = min(self._least_order_delay_s, order_delay_s)
-        self._look_back(t_mono_s, delay_s, order_delay_s)
-        self._least_s = min(self._least_s, delay_s)
-
-    def taken_s(self, stamp_s: float, t_mono_s: float) -> float | None:
-        """Return the time at which the picture with the stamp `stamp_s` was taken, at most its arrival `t_mono_s`. None
-        while pictures that were buffered before the opening are still being fetched: their age is unknown."""
-        return min(t_mono_s, stamp_s + self._least_s) if self.is_live else None
-
-    def _look_back(self, t_mono_s: float, delay_s: float, order_delay_s: float) -> None:
-        if self._window and t_mono_s - self._window[0][0] > _WINDOW_S:
-            _, delays_s, order_delays_s = zip(*self._window, strict=True)
-            if max(order_delays_s) - min(order_delays_s) < _STEADY_S:
-                self._least_s = min(delays_s)
-            self._window.clear()
-        self._window.append((t_mono_s, delay_s, order_delay_s))
-
-
-class UnstampedTime:
-    """Estimates when pictures were taken, for streams without time stamps (MJPEG over HTTP). Only the time spent
-    waiting for each picture is known.
-
-    After a wait of usual length, the picture has just arrived. After a longer wait it may have been delayed on its way,
-    by as much as the wait. A picture returned without any wait was in a buffer, at most since the last wait ended."""
-
-    def __init__(self, opened_s: float) -> None:
-        self._since_s = opened_s
-        self._waits_s: deque[float] = deque(maxlen=_USUAL_OF)
-
-    def taken_s(self, asked_s: float, t_mono_s: float) -> float:
-        """Return the earliest time at which the picture can have arrived whose fetch began at `asked_s` and ended at
-        `t_mono_s`. All in seconds of the monotonic clock."""
-        wait_s = t_mono_s - asked_s
-        if wait_s > _WAITED_S:
-            usual_s = median(self._waits_s) if len(self._waits_s) == _USUAL_OF else 0.0
-            self._since_s = t_mono_s if wait_s <= _AS_USUAL * usual_s else asked_s
-            self._waits_s.append(wait_s)
-        return self._since_s

@@ -11,8 +11,8 @@ KINDS = ("udp", "tcp", "http", "rtsp")
 WIDTH, HEIGHT = 160, 120
 
 
-def start_ffmpeg(*output: str) -> subprocess.Popen:
-    picture = ["-re", "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=60"]
+def start_ffmpeg(*output: str, rate: float = 1.0) -> subprocess.Popen:
+    picture = ["-readrate", str(rate), "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=60"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "5", *output]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL)
 
@@ -23,9 +23,10 @@ def stop(process: subprocess.Popen) -> None:
 
 
 class FfmpegCamera:
-    """MPEG-TS over UDP or TCP, or MJPEG over HTTP."""
+    """MPEG-TS over UDP or TCP, or MJPEG over HTTP. Its time stamps run `rate` times as fast as the clock."""
 
-    def __init__(self, kind: str):
+    def __init__(self, kind: str, rate: float = 1.0):
+        self._rate = rate
         port = free_port()
         self.uri = f"{kind}://127.0.0.1:{port}"
         self._output = {
@@ -36,7 +37,7 @@ class FfmpegCamera:
         self._process: subprocess.Popen | None = None
 
     def switch_on(self) -> None:
-        self._process = start_ffmpeg(*self._output)
+        self._process = start_ffmpeg(*self._output, rate=self._rate)
 
     def switch_off(self) -> None:
         stop(self._process)

@@ -11,6 +11,7 @@ from fakes import FakeClock
 from live_sources import PATIENCE_S, wait_for
 
 from edgevpr.core.errors import SourceError
+from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.live import DeviceCapture, LiveSource
 from edgevpr.frames.shot import Condition, Refusal, Shot
 from edgevpr.frames.source import open_source
@@ -78,6 +79,26 @@ def test_a_slow_reader_gets_the_newest_frame_of_a_stream(cameras, opened):
 
 
 @pytest.mark.network
+@pytest.mark.process
+@pytest.mark.slow
+def test_a_camera_that_delivers_fewer_pictures_than_it_stamps_gives_no_old_ones(cameras, opened):
+    """It stamps 60 pictures a second and delivers 15: by its stamps they would be 4 s old after 6 s."""
+    camera = cameras.FfmpegCamera("tcp", rate=0.25)
+    camera.switch_on()
+    try:
+        source = opened(camera.uri)
+        begun_s = next_frame(source).t_mono_s
+
+        def is_new():
+            frame = source.read(0.05)
+            return frame and frame.t_mono_s - begun_s > 6 and source.latency_s < 0.5 and frame.t_sd_s < 0.3
+
+        assert wait_for(is_new)
+    finally:
+        camera.switch_off()
+
+
+@pytest.mark.network
 def test_a_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened, capfd):
     with socket.socket() as closed:  # bound but not listening: every connection is refused
         closed.bind(("127.0.0.1", 0))
@@ -131,8 +152,8 @@ def test_the_newest_frame_wins_and_the_others_are_counted():
         camera.taken.acquire()
     frame = source.read(0)
     assert frame.image[0, 0, 0] == 36
-    assert frame.name == "frame 000004 t=10.000 s"
-    assert frame.t_mono_s == 10
+    assert frame.name == "frame 000004 t=16.000 s"
+    assert frame.t_mono_s == 16
     assert source.dropped == 4
     assert source.read(0) is None
     camera.pictures.put(None)
@@ -232,6 +253,26 @@ def test_a_picture_that_is_older_than_the_one_before_is_refused_and_the_age_of_t
     assert frame.t_mono_s == 998.1
     assert source.refused["late"] == 1
     assert source.latency_s == pytest.approx(2.0)
+
+
+def test_a_source_of_unknown_age_is_late_after_five_seconds_and_says_why():
+    _, condition, state, frame = condition_after([shot(1), *[Refusal.LATE] * 51])
+    assert condition is Condition.LATE
+    assert state.startswith("late: the age of its pictures is unknown")
+    assert frame.name.startswith("frame 000000 ")
+
+
+def test_a_picture_of_a_device_that_may_have_waited_is_known_less_well_in_time():
+    """Ten pictures at their usual intervals, then one that was there already, after a second without a read."""
+    camera = SteppedCamera()
+    reads_s = [(0.1 * number, 0.1 * number + 0.1) for number in range(10)] + [(2.0, 2.0005)]
+    times_s = iter([0.0, *(time_s for read_s in reads_s for time_s in read_s)])
+    capture = DeviceCapture(camera, times_s.__next__)
+    for number in range(len(reads_s)):
+        camera.pictures.put(np.full((20, 20, 3), number, np.uint8))
+    sds_s = [capture.read().t_sd_s for _ in reads_s]
+    assert sds_s[9] == FRAME_TIME_SD_S
+    assert sds_s[10] == pytest.approx(1 / np.sqrt(3), rel=0.01)
 
 
 def test_the_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch):

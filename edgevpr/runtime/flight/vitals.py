@@ -22,7 +22,7 @@ from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _HEALTH_S, _MINUTE_S = 1.0, 60.0
-_TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged"}
+_TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
 
 _log = logging.getLogger(__name__)
 

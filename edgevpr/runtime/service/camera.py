@@ -20,7 +20,7 @@ from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.service.finding import Finding, device, fine, looked_at, wrong
 
 FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
-_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED)
+_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
 _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
 _BY_LIBCAMERA = ("media*", "video*", "dma_heap/*")  # devices below /dev that it opens
