@@ -10,7 +10,7 @@ from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
+from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
@@ -59,8 +59,8 @@ class Air:
     With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right),
     as by a compass that is wrong, and its match shows that where it `shows_turn`;
     without `matches`, no place is accepted. Without GPS, a frame is taken every `stride_s` for its stride only
-    (None: none is). `gps_off_m` (2,) is by how much the receiver is wrong; the autopilot
-    follows it until it `reject_gps`."""
+    (None: none is). The times of its frames have the standard deviation `t_sd_s`. `gps_off_m` (2,) is by how much the
+    receiver is wrong; the autopilot follows it until it `reject_gps`."""
 
     def __init__(
         self,
@@ -80,12 +80,13 @@ class Air:
         attitude=(0.0, 0.0),
         stride_sd_m=None,
         stride_s=None,
+        t_sd_s=FRAME_TIME_SD_S,
         seed=7,
     ):
         self.navigator, self.rng = navigator, np.random.default_rng(seed)
         self.speed_m_s, self.velocity_sd, self.fix_sd_m, self.attitude = speed_m_s, velocity_sd, fix_sd_m, attitude
         self.gusts, self.noise_sd_m = gusts, math.hypot(fix_sd_m, other_sd_m)
-        self.said_sd_m = said_sd_m or fix_sd_m
+        self.said_sd_m, self.t_sd_s = said_sd_m or fix_sd_m, t_sd_s
         self.wind, self.map_off, self.bias = map(np.array, (wind, map_off, bias))
         self.every_steps, self.late_steps = round(every_s / _STEP_S), round(late_s / _STEP_S)
         self.stride_steps = stride_s and round(stride_s / _STEP_S)
@@ -182,6 +183,7 @@ class Air:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
         where = Position(*moved(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
+        event.frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event.stride = self._stride(step)
         if self.shows_turn:
             event.picture = Levelled(_PICTURE, None, replace(event.view, up_deg=0.0))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 from edgevpr.core.geodesy import distance_m, moved, offset_m
-from edgevpr.core.types import Vehicle
+from edgevpr.core.types import FRAME_TIME_SD_S, Vehicle
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
@@ -22,10 +22,10 @@ from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import over_ground
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Standard deviations that are added to that of a fix: the attitude is known to half a degree, and the time of a frame
-# to some hundredths of a second.
-_ATTITUDE_SD, _TIME_SD_S = math.tan(math.radians(0.5)), 0.03
+# Standard deviation that is added to that of a fix, beside that of the time of its frame: half a degree.
+_ATTITUDE_SD = math.tan(math.radians(0.5))
 _UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
+_UNKNOWN_SPEED_M_S = 15.0  # of an aircraft that reports none
 _LOST_M = 50.0  # a position is sent up to this error
 _LOST_S = 60.0  # and, as a single fix, for so long after a match
 # By accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends so long
@@ -87,6 +87,7 @@ class Navigator(Listener):
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._given_s = OutputWatch(), -math.inf
         self._height_ratio = 1.0
+        self._shared_sd_m = map_sd_m  # of the error that the last fixes share
 
     @property
     def has_gps(self) -> bool:
@@ -156,9 +157,10 @@ class Navigator(Listener):
             return Advice(None, "the place has no position")
         if event.view.reason:
             return Advice(None, f"not sent: {event.view.reason}, so it does not show what is under the aircraft")
-        fix = Fix(seen.position.lat_deg, seen.position.lon_deg, seen.accuracy_m, seen.t_s)
         with self._lock:
-            vehicle = self._vehicle
+            vehicle, late_m = self._vehicle, self._late_m(event)
+            accuracy_m = math.hypot(seen.accuracy_m, late_m)
+            fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
             if vehicle is None or not vehicle.is_fresh_at(now_s):
                 return self._unheard(fix, now_s)
             if vehicle.velocity_m_s is None:
@@ -172,6 +174,7 @@ class Navigator(Listener):
             if verdict.why:
                 return Advice(None, verdict.why, is_held=True)
             self._navigation.hear_fix(compared, verdict)
+            self._shared_sd_m = math.hypot(self._map_sd_m, late_m)
             if seen.lean:
                 self._lean_s = seen.t_s
             return self._improved(vehicle, vehicle.velocity_m_s, now_s)
@@ -286,12 +289,20 @@ class Navigator(Listener):
         tilt_sd = _ATTITUDE_SD if has_attitude else _UNTOLD_ATTITUDE_SD
         return HeardFrame(
             t_s=event.frame.t_mono_s,
-            sd_m=math.hypot(tilt_sd * height_m, _TIME_SD_S * speed_m_s),
+            sd_m=math.hypot(tilt_sd * height_m, event.frame.t_sd_s * speed_m_s),
             lean_s2=0.0 if is_apart else height_m / GRAVITY_M_S2,
             stride=stride,
             scale_sd=abs(ratio - 1.0),
             alike_m=_ALIKE_SHARE * (event.view.footprint_m or 0.0),
         )
+
+    def _late_m(self, event: Recognition) -> float:
+        """Return by how much (metres, standard deviation) frames put the aircraft wrongly whose time is known worse
+        than usual: in one direction, so that several of them say no more than one."""
+        vehicle, t_sd_s = event.vehicle or self._vehicle, event.frame.t_sd_s if event.frame else 0.0
+        known = vehicle and vehicle.velocity_m_s
+        speed_m_s = math.hypot(*known) if known else _UNKNOWN_SPEED_M_S
+        return speed_m_s * math.sqrt(max(0.0, t_sd_s**2 - FRAME_TIME_SD_S**2))
 
     def _known(self, t_s: float) -> Whereabouts | None:
         estimate = self._navigation.at(t_s)
@@ -341,7 +352,7 @@ class Navigator(Listener):
 
     def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
-        return max(self._map_sd_m, estimate.accuracy_m)
+        return max(self._shared_sd_m, estimate.accuracy_m)
 
 
 class Slew:

@@ -132,7 +132,9 @@ class Sightings:
         if view.reason or (view.aside is None and view.lean_m is None) or where is None or where.heading_deg is None:
             return False
         t_s, height_m = event.frame.t_mono_s, where.height_m or vehicle.height_m
-        seen = positioned(event, HeardFrame(t_s=t_s, sd_m=_ATTITUDE_SD * (height_m or 0.0)))
+        in_time_m = event.frame.t_sd_s * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
+        frame_sd_m = math.hypot(_ATTITUDE_SD * (height_m or 0.0), in_time_m)
+        seen = positioned(event, HeardFrame(t_s=t_s, sd_m=frame_sd_m))
         look = self._look(vehicle, height_m, seen.turn_deg or 0.0) if seen else None
         if seen is None or look is None or not vehicle.is_fresh_at(t_s):
             return False

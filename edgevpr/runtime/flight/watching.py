@@ -45,7 +45,7 @@ _GPS_WITHIN_S = 30.0  # the matches in a row must be no older
 _GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _REPORTED_AGAIN = 2.0  # times the distance that was last reported
-_TIME_SD_S = 0.1  # between a position of the receiver and a frame
+_GPS_TIME_SD_S = 0.1  # of a position of the receiver, beside that of the frame
 _ATTITUDE_SD = math.tan(math.radians(1.0))
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
 _MOUNT = "ahead_deg", "right_deg"
@@ -188,7 +188,7 @@ class GpsWatch:
         vehicle = event.vehicle
         if event.frame is None or event.view.reason or vehicle is None or vehicle.gps is None:
             return
-        in_time_m = _TIME_SD_S * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
+        in_time_m = math.hypot(_GPS_TIME_SD_S, event.frame.t_sd_s) * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
         tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
         frame = HeardFrame(t_s=event.frame.t_mono_s, sd_m=math.hypot(tilt_m, in_time_m))
         seen = positioned(event, frame)

@@ -8,6 +8,7 @@ import pytest
 from air import Air, lengths
 
 from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
@@ -140,6 +141,28 @@ def test_where_the_attitude_is_unknown_a_fix_says_less():
     told, less = (air.fly(20).sent[-1][1].accuracy_m for air in (level, untold))
     assert told < 5
     assert less > 10
+
+
+@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT, Channel.SENSOR, Channel.VISION])
+def test_accuracy_contains_the_error_of_a_frames_time(channel):
+    """At 15 m/s, 0.3 s are 4.5 m; frames err alike by it, so that many of them say no more than one."""
+    claims_m = []
+    for t_sd_s in (FRAME_TIME_SD_S, 0.3):
+        navigator = Navigator(1.0, 1.0)
+        navigator.hear_channel(channel)
+        air = lost(navigator, wind=WIND, fix_sd_m=1.0, t_sd_s=t_sd_s).fly(40)
+        claims_m.append(navigator.accuracy_m(air.t_s))
+    assert claims_m[0] < 2.5
+    assert claims_m[1] > 4.5
+    if channel is Channel.COMMAND:
+        assert air.sent[-1][1].accuracy_m > 4.5
+
+
+def test_fix_for_an_autopilot_that_reports_no_velocity_contains_the_error_of_time():
+    air = Air(Navigator(1.0, 1.0), t_sd_s=0.3)
+    air.is_silent = True
+    fix = air.fly(10).sent[-1][1]
+    assert fix.accuracy_m > 0.29 * 15
 
 
 def test_after_a_silence_of_the_link_nothing_is_said_until_it_is_over_and_then_it_goes_on():
