@@ -30,12 +30,14 @@ _JUDGE_EVERY_S = 0.5
 _MAX_PICTURES = 2000  # kept to find a trend
 _SPANS_S = (30.0, 6.0, 2.0, 0.7)  # in which a trend is looked for
 _MIN_PICTURES = 8  # of a span
+_COVERED_SHARE = 0.8  # of a span, from the first picture to the last
 _COLUMNS = 5  # arrival, order, stamp, sum of bytes, delay above the least then
 _SECTIONS = 6  # of a span; the least delay of each is that of the path alone
 _MIN_RISE_S = 0.06  # less is no trend
 _RAGGED_SHARE = 1 / 6  # of the rise: sections that are farther from a straight line are no trend but congestion
 _STRAIGHT_SHARE = 1 / 10  # with sections that are nearer, all of the span has the same rate
-_HALF = 0.4  # share of the bytes that tells both causes apart
+_HALF = 0.4  # share of the bytes that a clock is below, and a full link above
+_FULL = 0.55  # share above which a link is certainly full: large pictures take their time in others too
 _START_S = 10.0  # a stream that is younger has no usual rate
 _SPAN_AT_START_S = 2.0  # that shows another rate, and
 _SPAN_LATER_S = 6.0  # for a stream that kept the right one before: a short congestion is likelier
@@ -149,19 +151,24 @@ class StampedTime:
         order_delay_s = came_s - self.rate * order_s
         is_new = came_s[-1] - self._begun_s < _START_S
         for span_s in _SPANS_S:
-            first = min(int(np.searchsorted(came_s, came_s[-1] - span_s)), max(0, len(came_s) - _MIN_PICTURES))
-            is_covered = came_s[-1] - came_s[first] > 0.8 * span_s
-            trend = envelope_growth(came_s[first:], order_delay_s[first:]) if is_covered else None
-            if trend:
+            first = _first_of(came_s, span_s)
+            if first is not None and (trend := envelope_growth(came_s[first:], order_delay_s[first:])):
                 self._follow_trend(window[first:], *trend, span_s, is_new)
                 return
         if came_s[-1] - self._doubted_s > _DOUBT_LASTS_S:
             self._max_known_age_s = math.inf
+        if (first := _first_of(came_s, _SPAN_AT_START_S)) is not None:
+            above_s = order_delay_s[first:] - self._least_order_delay_s
+            if above_s.min() > _MAX_DOUBTFUL_AGE_S and np.ptp(above_s) < _STEADY_S:
+                # All are late by the same: so the sender has paused, or the network holds all of them up.
+                self._max_known_age_s, self._doubted_s = _MAX_DOUBTFUL_AGE_S, came_s[-1]
         if came_s[-1] - self._settled_s > _STEADY_SPAN_S:
             self._settled_s = came_s[-1]
             first = int(np.searchsorted(came_s, came_s[-1] - _STEADY_SPAN_S))
             if np.ptp(order_delay_s[first:]) < _STEADY_S and share_of_bytes(window[first:])[0] < _HALF:
                 self._least_s = float(np.min((came_s - self.rate * stamp_s)[first:]))
+                self._least_order_delay_s = float(order_delay_s[first:].min())
+                self._max_known_age_s = math.inf
 
     def _follow_trend(self, window: Doubles, growth: float, is_straight: bool, span_s: float, is_new: bool) -> None:
         """Decide what a delay means that has changed steadily by `growth` seconds per second, in these pictures."""
@@ -169,7 +176,7 @@ class StampedTime:
         least_share, most_share = share_of_bytes(window)
         if growth > 0:
             needed_s = _SPAN_AT_START_S if is_new else _SPAN_LATER_S
-            is_congested = least_share > _HALF
+            is_congested = _FULL < least_share < 1 / _FULL
             max_known_age_s = _MAX_DOUBTFUL_AGE_S
         else:
             # Pictures that come ever sooner after a congestion are less old each, until the least delay is reached.
@@ -187,13 +194,19 @@ class StampedTime:
         self.rate = 1.0 if abs(rate - 1) < _SNAP else rate
         self.is_live = True
         self._keep(len(window))
-        delay_s = came_s - self.rate * stamp_s
-        self._least_s = float(delay_s.min())
-        self._least_order_delay_s = float(np.min(came_s - self.rate * order_s))
-        self._scatter_s = 0.0 if self.rate == 1.0 else float(np.median(delay_s) - self._least_s)
+        self._least_s = float(np.min(came_s - self.rate * stamp_s))
+        order_delay_s = came_s - self.rate * order_s
+        self._least_order_delay_s = float(order_delay_s.min())
+        self._scatter_s = 0.0 if self.rate == 1.0 else float(np.median(order_delay_s) - self._least_order_delay_s)
         if abs(self.rate / self._logged_rate - 1) > _LOGGED_CHANGE:
             self._logged_rate = self.rate
             _log.warning("the stream's time stamps run at %.2f of the true rate: they are corrected", 1 / self.rate)
+
+
+def _first_of(came_s: Doubles, span_s: float) -> int | None:
+    """Return the first picture of the last `span_s` seconds; None if there are none from most of them, or too few."""
+    first = min(int(np.searchsorted(came_s, came_s[-1] - span_s)), max(0, len(came_s) - _MIN_PICTURES))
+    return first if came_s[-1] - came_s[first] > _COVERED_SHARE * span_s else None
 
 
 def envelope_growth(came_s: Doubles, delay_s: Doubles) -> tuple[float, bool] | None:
