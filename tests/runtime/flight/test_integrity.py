@@ -10,7 +10,7 @@ from air import GPS_SD_M, HOME, Air, lengths, match_at
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import moved
-from edgevpr.core.types import Position
+from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -121,6 +121,14 @@ def test_gps_watch_allows_for_an_attitude_error_that_pictures_show(tmp_path, sho
             lean = Lean((shown, 0.0), 0.02) if off_m else None
             watch.tell(match_at(there, float(second), vehicle, 1.0, (1,), View(), lean))
     assert watch.is_wrong is is_wrong
+
+
+@pytest.mark.parametrize(("t_sd_s", "is_wrong"), [(FRAME_TIME_SD_S, True), (1.0, False)])
+def test_gps_watch_allows_for_the_time_of_a_frame(watched, t_sd_s, is_wrong):
+    """At 15 m/s a second is 15 m: then 30 m prove nothing."""
+    air = watched(t_sd_s=t_sd_s).fly(20)
+    air.gps_off_m = np.array([30.0, 0.0])
+    assert air.fly(40).watch.is_wrong is is_wrong
 
 
 def test_gps_watch_reports_a_distance_again_when_it_has_doubled(watched):
