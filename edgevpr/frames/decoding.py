@@ -3,17 +3,18 @@ does not. Imported only when a stream or video file is opened, because the libra
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import av
 import av.logging
-import numpy as np
-from av.video.reformatter import VideoReformatter
 
+from edgevpr.core.arrays import Image
 from edgevpr.frames.causes import explain_failure
 from edgevpr.frames.images import jpeg_is_whole
+from edgevpr.frames.pixels import PixelConverter
 from edgevpr.frames.shot import OpeningError, Refusal, StreamFacts
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ class WholePictures:
         self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory
         self._codec.options = {"err_detect": "explode"}  # damaged data is an error, and not filled in
         self._packets = container.demux(self.stream)
-        self._reformatter = VideoReformatter()
+        self._converter = PixelConverter()
         self._is_backlog_doubtful = are_missed
         self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
         self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
@@ -146,10 +147,15 @@ class WholePictures:
             return self._refuse()
         return self._decoded(packet)
 
-    def pixels(self, picture: "VideoFrame", form: str = "bgr24") -> np.ndarray:
-        """Return the pixels of a picture, uint8: (H, W, 3) BGR, or (H, W) for the form "gray". Maps and queries are
-        both converted here, so that equal pictures give equal pixels."""
-        return self._reformatter.reformat(picture, format=form, interpolation="BICUBIC").to_ndarray()
+    def look(self, picture: "VideoFrame") -> Image:
+        """Return a coarse grey copy of a picture, see `Shot.look`."""
+        return self._converter.look(picture)
+
+    def conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
+        """Return a function that converts a picture to pixels, uint8 (H, W, 3) BGR or (H, W) grey. Another thread may
+        call it. Maps and queries are both converted here, so that equal pictures give equal pixels."""
+        aspect = self._codec.sample_aspect_ratio or self.stream.sample_aspect_ratio
+        return self._converter.conversion(picture, float(aspect or 1))
 
     def close(self) -> None:
         """Close the file or the connection."""

@@ -16,6 +16,7 @@ import numpy as np
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.files import read_file
+from edgevpr.frames.depth import DepthRange
 
 if "OPENCV_LOG_LEVEL" not in os.environ:
     # OpenCV 4 has the function in `cv2`, OpenCV 5 in a submodule; level 0 is silent in both.
@@ -64,11 +65,12 @@ def counting_order(name: str) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
-def read_image(path: str | Path) -> Image:
+def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
     """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated as its EXIF data say, without transparency.
+    An image of 16 bits is shown over the range `depth` of the images before it (None: over its own).
 
-    Raises ImageError for a file that is missing, no regular file, cut short, no image, not 8 bit, smaller than 16x16
-    pixels, or larger than `MAX_PIXELS`.
+    Raises ImageError for a file that is missing, no regular file, cut short, no image, neither of 8 nor of 16 bits,
+    smaller than 16x16 pixels, or larger than `MAX_PIXELS`.
     """
     try:
         data = read_file(path, _MAX_FILE_BYTES)
@@ -88,16 +90,18 @@ def decode_image(data: bytes, path: str) -> Image:
         if _STARTS.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     # A program that has imported OpenCV before edgevpr has another limit there: so the size is checked here as well.
-    if image is None or image.dtype != np.uint8 or image.shape[0] * image.shape[1] > MAX_PIXELS:
+    if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(
-            f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file of 8 bits a channel "
-            f"and at most {MAX_PIXELS / 1e6:.0f} megapixels."
+            f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file of 8 or 16 bits a "
+            f"channel and at most {MAX_PIXELS / 1e6:.0f} megapixels."
         )
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
         raise ImageError(
             f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
         )
+    if image.dtype == np.uint16:
+        return (depth or DepthRange()).to_8_bits(image.astype(np.uint16, copy=False))
     return image  # type: ignore[return-value]  # its dtype has been checked
 
 

@@ -16,6 +16,7 @@ from edgevpr.core.config import SOURCES
 from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageError
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame
+from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
@@ -116,6 +117,7 @@ class FolderSource(RecordingSource):
         self._unread = [(name, path) for name, path in paths.items() if self.is_wanted(name)][::-1]
         self.total = len(self._unread)
         self._clock = clock
+        self._depth = DepthRange()
         if not self._unread:
             self.end()
 
@@ -127,7 +129,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = read_image(path)
+            image = read_image(path, self._depth)
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise

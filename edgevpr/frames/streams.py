@@ -7,14 +7,11 @@ from collections.abc import Callable
 from queue import Queue
 from typing import TYPE_CHECKING, TypeAlias
 
-import numpy as np
-
-from edgevpr.core.arrays import Image
 from edgevpr.frames.age import StampedTime, Taken, UnstampedTime
 from edgevpr.frames.causes import TransportError
 from edgevpr.frames.decoding import Fetched, WholePictures, open_pictures
 from edgevpr.frames.rtp import describe_rtp
-from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts, coarse
+from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
 from edgevpr.frames.webpictures import PartsFile, Snapshots, open_request
 
 if TYPE_CHECKING:
@@ -31,7 +28,6 @@ _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
 _UDP_OPTIONS = {"rtsp_transport": "udp"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
-_BYTES_OF_LUMA = ("yuv", "nv12", "nv21", "gray")  # prefixes of pixel formats whose first plane is the brightness
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
 _TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
 
@@ -129,15 +125,8 @@ class StreamCapture:
             taken = None if stamp is None else self._stamped.taken(stamp * self._unit_s, arrived_s)
         if taken is None:
             return Refusal.LATE
-        look = self._look(picture)
-        return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=lambda: self._whole.pixels(picture))
-
-    def _look(self, picture: "VideoFrame") -> Image:
-        if not picture.format.name.startswith(_BYTES_OF_LUMA) or picture.format.components[0].bits != 8:
-            return coarse(self._whole.pixels(picture, "gray"))
-        plane = picture.planes[0]
-        rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
-        return coarse(rows[: picture.height, : picture.width])
+        look, pixels = self._whole.look(picture), self._whole.conversion(picture)
+        return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=pixels)
 
 
 # A packet, and when the call that fetched it began and returned (seconds, monotonic).

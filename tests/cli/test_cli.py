@@ -159,11 +159,11 @@ def test_unusable_images_are_named_and_the_others_mapped(capsys, flight, tmp_pat
     (folder / "cut.png").write_bytes((folder / "0.png").read_bytes()[:2000])
     (folder / "text.jpg").write_text("no picture")
     cv2.imwrite(str(folder / "dot.png"), np.zeros((1, 1), np.uint8))
-    cv2.imwrite(str(folder / "deep.png"), np.zeros((40, 40), np.uint16))
+    cv2.imwrite(str(folder / "deep.tif"), np.zeros((40, 40), np.float32))
     path = tmp_path / "m.gpkg"
     assert main(["map", "build", str(path), "--images", str(folder), "--technique", "cohog"]) == 1
     said = capsys.readouterr().err
-    for name in ("cut.png", "text.jpg", "dot.png", "deep.png"):
+    for name in ("cut.png", "text.jpg", "dot.png", "deep.tif"):
         assert any(name in line for line in said.splitlines())
     assert run_json(capsys, "map", "info", path, "--json")["places"] == 6
 

@@ -1,0 +1,67 @@
+"""Pictures of more than 8 bits a channel, such as those of thermal cameras. They hold counts, of which a scene takes a
+small part somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
+images are all read as defined here, so that a map and a flight show the same.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgevpr.core.arrays import Image
+
+Counts: TypeAlias = NDArray[np.uint16]
+Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
+
+_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots are outside
+_MIN_SPAN_COUNTS = 64  # a picture of sensor noise only stays flat
+_PICTURES_TO_FOLLOW = 30  # time constant: what passes through a picture does not change the grey levels of the rest
+_MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene is another one
+_MIN_USED_SHARE = 0.25  # of the range that a picture must use, else it would have too little contrast
+_SAMPLE_PX = (60, 80)  # least rows and columns of the sample that the percentiles are computed from
+
+
+class DepthRange:
+    """The range of counts of one source, which follows its pictures slowly, in the order in which they are passed."""
+
+    def __init__(self) -> None:
+        self._low = 0.0
+        self._high = 0.0
+
+    def update(self, counts: Counts) -> Limits:
+        """Return the range to show this picture with, uint16 (H, W[, C]). It begins with the picture's own range, and
+        does so again when a picture does not fit."""
+        sample = sample_counts(counts)
+        low, high = find_limits(sample)
+        clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
+        has_contrast = high - low >= _MIN_USED_SHARE * (self._high - self._low)
+        is_known = self._high > 0 and has_contrast and clipped_share <= _MAX_CLIPPED_SHARE
+        gain = 1 / _PICTURES_TO_FOLLOW if is_known else 1.0
+        self._low += gain * (low - self._low)
+        self._high += gain * (high - self._high)
+        return round(self._low), round(self._high)
+
+    def to_8_bits(self, counts: Counts) -> Image:
+        """Return the picture in grey levels, uint8 of the same shape; its counts update the range first."""
+        return to_8_bits(counts, self.update(counts))
+
+
+def sample_counts(counts: Counts) -> Counts:
+    """Return every n-th row and column of a picture, enough of them for percentiles."""
+    height, width = counts.shape[:2]
+    return counts[:: max(1, height // _SAMPLE_PX[0]), :: max(1, width // _SAMPLE_PX[1])]
+
+
+def find_limits(sample: Counts) -> Limits:
+    """Return the range of counts of a picture by its percentiles."""
+    low, high = (int(count) for count in np.percentile(sample, _PERCENTILES))
+    missing = max(0, _MIN_SPAN_COUNTS - (high - low))
+    low = max(0, low - missing // 2)
+    return low, max(high, low + _MIN_SPAN_COUNTS)
+
+
+def to_8_bits(counts: Counts, limits: Limits) -> Image:
+    """Return a picture in grey levels, uint8 of the same shape; counts outside of `limits` become black or white."""
+    low, high = limits
+    levels = (np.clip(counts, low, high).astype(np.float32) - low) * (255 / (high - low))
+    return np.asarray(np.rint(levels), np.uint8)

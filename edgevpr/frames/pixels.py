@@ -1,0 +1,102 @@
+"""Conversion of decoded pictures of any pixel format to the pixels that edgevpr works with: 8 bits, square."""
+
+import logging
+import re
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from av.video.reformatter import VideoReformatter
+from numpy.typing import NDArray
+
+from edgevpr.core.arrays import Image
+from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
+from edgevpr.frames.shot import coarse
+
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+
+# Formats whose first plane is the brightness: the kind, the bits of a channel (none: 8) and the order of its two bytes.
+_LUMA_FIRST = re.compile(r"(gray|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
+_SQUARE_TOLERANCE = 0.01  # pixels count as square within it: the positions are off by less than by other errors
+_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more than this, or less than 1/4, is wrong
+_log = logging.getLogger(__name__)
+
+
+class PixelConverter:
+    """Converts the pictures of one stream or file. `look` and `conversion` are called by the thread that decodes, for
+    every picture and in order; the functions that `conversion` returns may be called by any thread.
+
+    Grey pictures of more than 8 bits hold counts, and are shown over their own range (`frames.depth`). The levels of
+    coloured video of more than 8 bits are defined, like those of 8 bits."""
+
+    def __init__(self) -> None:
+        self._of_thread = threading.local()  # FFmpeg's converter hangs or crashes if two threads use it at once
+        self._depth = DepthRange()
+        self._aspect = 1.0
+
+    def look(self, picture: "VideoFrame") -> Image:
+        """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.look`. That of counts is shown over its own
+        range, so that the copies of a frozen picture are equal."""
+        layout = _layout(picture)
+        if layout is None:
+            return coarse(self._gray_or_bgr(picture, "gray"))
+        plane = _first_plane(picture, layout)
+        if not _is_counts(layout):
+            return np.asarray(coarse(plane) >> (int(layout[2] or 8) - 8), np.uint8)
+        sample = sample_counts(plane)
+        return to_8_bits(sample, find_limits(sample))
+
+    def conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
+        """Return a function that converts a picture to uint8 (H, W, 3) BGR, or (H, W) grey for counts, with square
+        pixels. `aspect` is the width of its pixels over their height."""
+        width_px, layout = self._square_width_px(picture, aspect), _layout(picture)
+        if layout is None or not _is_counts(layout):
+            return lambda: self._gray_or_bgr(picture, "bgr24", width_px)
+        limits = self._depth.update(_first_plane(picture, layout))
+        return lambda: to_8_bits(_first_plane(self._reformat(picture, picture.format.name, width_px), layout), limits)
+
+    def _square_width_px(self, picture: "VideoFrame", aspect: float) -> int:
+        """Return how wide a picture is with square pixels of the same height; announce a change of their shape."""
+        if abs(aspect - 1) <= _SQUARE_TOLERANCE:
+            aspect = 1.0
+        is_usable = 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
+        width_px = round(picture.width * aspect) if is_usable else picture.width
+        if aspect != self._aspect:
+            self._aspect = aspect
+            stated = f"pixels {aspect:.3g} times as wide as high"
+            size = f"{picture.width} x {picture.height}"
+            if is_usable:
+                _log.info("%s: pictures of %s are resampled to %d x %d", stated, size, width_px, picture.height)
+            else:
+                _log.warning("%s cannot be right, pictures of %s are used as they are", stated, size)
+        return width_px
+
+    def _gray_or_bgr(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> Image:
+        return np.asarray(self._reformat(picture, form, width_px).to_ndarray(), np.uint8)
+
+    def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None) -> "VideoFrame":
+        converter: VideoReformatter | None = getattr(self._of_thread, form, None)
+        if converter is None:
+            converter = VideoReformatter()
+            setattr(self._of_thread, form, converter)
+        return converter.reformat(picture, width=width_px, format=form, interpolation="BICUBIC")
+
+
+def _layout(picture: "VideoFrame") -> re.Match[str] | None:
+    """Return how the brightness lies in the first plane, by `_LUMA_FIRST`; None if it has to be computed. Rows from the
+    bottom to the top cannot be read in place."""
+    return None if picture.planes[0].line_size < 0 else _LUMA_FIRST.fullmatch(picture.format.name)
+
+
+def _is_counts(layout: re.Match[str]) -> bool:
+    return layout[1] == "gray" and layout[2] is not None
+
+
+def _first_plane(picture: "VideoFrame", layout: re.Match[str]) -> NDArray[Any]:
+    """Return the first plane of a picture, uint8 or uint16 (H, W), without a copy."""
+    dtype = np.dtype({"le": "<u2", "be": ">u2"}[layout[3]] if layout[2] else np.uint8)
+    plane = picture.planes[0]
+    rows = np.frombuffer(memoryview(plane), dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    return rows[: picture.height, : picture.width]

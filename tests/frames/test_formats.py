@@ -1,0 +1,206 @@
+"""Pixel formats of streams, videos and images: depth, range and shape of the pixels, and converters of two threads."""
+
+import itertools
+import threading
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from edgevpr.frames.decoding import open_pictures
+from edgevpr.frames.depth import DepthRange
+from edgevpr.frames.images import read_image
+from edgevpr.frames.source import open_source, read_to_end
+
+SIZE_PX = (256, 64)
+RAMP = np.repeat(np.arange(256, dtype=np.uint8)[None, :], SIZE_PX[1], 0)
+SCENE = cv2.GaussianBlur(np.random.default_rng(3).normal(128, 400, (240, 320)), (0, 0), 3)
+CLOSE_TO_FULL_WHITE = 5  # levels: FFmpeg's fast conversion of yuv420p, which is as exact as flights and maps ever were
+
+
+def write_video(path: Path, pictures, pixel_format: str, codec: str = "ffv1", **settings) -> Path:
+    """Write frames of PyAV, or pictures uint8 (H, W, 3) BGR; `settings` are of the stream or of its codec."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10, options=settings.pop("options", {}))
+        for index, picture in enumerate(pictures):
+            frame = picture
+            if isinstance(picture, np.ndarray):
+                frame = av.VideoFrame.from_ndarray(picture, "bgr24").reformat(format=pixel_format)
+            if not index:
+                stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, pixel_format
+                for name, value in settings.items():
+                    setattr(stream.codec_context, name, value)
+            frame.pts = index
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    return [frame.image for frame in read_to_end(open_source(str(path), live=False), pytest.fail) if frame]
+
+
+def as_counts(grey: np.ndarray, counts_per_level: float = 4, black: int = 7600) -> np.ndarray:
+    """Turn a picture into what a thermal camera gives: a thousand counts somewhere in the middle of 16 bits."""
+    return (black + counts_per_level * np.clip(grey, 0, 255)).astype(np.uint16)
+
+
+def thermal_flight() -> list[np.ndarray]:
+    return [as_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixel_format", ["yuv420p10le", "yuyv422", "gray16le"])
+def test_two_threads_convert_the_pictures_of_one_stream(pixel_format, tmp_path):
+    """Two threads in one converter of FFmpeg hang or crash, and take memory without end."""
+    codec = "rawvideo" if pixel_format == "yuyv422" else "ffv1"
+    whole = open_pictures(str(write_video(tmp_path / "a.nut", [cv2.merge([RAMP] * 3)] * 8, pixel_format, codec)), {})
+    assert whole is not None
+    pictures = [picture for fetched in iter(whole.fetch, None) for picture in whole.decode(fetched)]
+    finished = []
+
+    def convert() -> None:
+        for picture in itertools.islice(itertools.cycle(pictures), 400):
+            whole.look(picture)
+            whole.conversion(picture)()
+        finished.append(True)
+
+    def resident_mb() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+    before_mb = resident_mb()
+    threads = [threading.Thread(target=convert, daemon=True) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert len(finished) == 3
+    assert resident_mb() - before_mb < 50
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "codec", "color_range", "levels"),
+    [
+        ("yuv420p", "libx264", 1, CLOSE_TO_FULL_WHITE),
+        ("yuv420p", "libx264", 2, 2),
+        ("yuv420p", "libx265", 2, 2),
+        ("yuv422p", "libx264", 1, 2),
+        ("yuv422p", "libx264", 2, 2),
+        ("yuv420p10le", "libx264", 1, 2),
+        ("yuv420p10le", "libx264", 2, 2),
+        ("yuv422p10le", "ffv1", 1, 2),
+        ("yuv420p12le", "rawvideo", 1, 2),
+        ("nv12", "rawvideo", 1, 2),
+        ("yuyv422", "rawvideo", 1, 2),
+        ("gray", "ffv1", 0, 0),
+        ("yuvj422p", "mjpeg", 2, 3),
+    ],
+)
+def test_a_ramp_of_grey_keeps_its_levels_in_every_format(pixel_format, codec, color_range, levels, tmp_path):
+    frame = av.VideoFrame.from_ndarray(cv2.merge([RAMP] * 3), "bgr24")
+    frame = frame.reformat(format=pixel_format, src_color_range=2, dst_color_range=color_range)
+    options = {"libx264": {"qp": "1"}, "libx265": {"crf": "4", "x265-params": "log-level=none"}}.get(codec, {})
+    quality = {"qmin": 1, "qmax": 1} if codec == "mjpeg" else {}
+    settings = {"options": options, "color_range": color_range, **quality}
+    (image,) = frames_of(write_video(tmp_path / "ramp.nut", [frame], pixel_format, codec, **settings))
+    assert np.abs(image[SIZE_PX[1] // 2].astype(int) - RAMP[0][:, None]).max() <= levels
+
+
+def test_counts_are_the_same_from_a_folder_and_from_a_video(tmp_path):
+    flight = thermal_flight()
+    for index, counts in enumerate(flight):
+        cv2.imwrite(str(tmp_path / f"{index}{('.png', '.tif')[index % 2]}"), counts)
+    images = frames_of(tmp_path)
+    assert all(image.std() > 50 for image in images)
+    for form in ("gray16le", "gray16be"):
+        video = [av.VideoFrame.from_ndarray(counts, "gray16le").reformat(format=form) for counts in flight]
+        path = write_video(tmp_path / f"{form}.nut", video, form, "rawvideo")
+        assert all((image == frame).all() for image, frame in zip(images, frames_of(path), strict=True))
+
+
+def test_video_of_12_bits_of_grey_shows_its_own_range_with_square_pixels(tmp_path):
+    flight = [as_counts(np.roll(SCENE, 8 * step, 1), 32, 16_000) for step in range(3)]  # 16 times the counts of 12 bits
+    video = [av.VideoFrame.from_ndarray(counts, "gray16le").reformat(format="gray12le") for counts in flight]
+    options = {"x265-params": "log-level=none:lossless=1"}
+    aspect = Fraction(3, 2)
+    path = write_video(tmp_path / "a.mkv", video, "gray12le", "libx265", options=options, sample_aspect_ratio=aspect)
+    images = frames_of(path)
+    assert len(images) == 3
+    assert all(image.std() > 50 and image.shape == (240, 480) for image in images)
+
+
+def test_an_image_of_16_bits_shows_its_own_range(tmp_path):
+    cv2.imwrite(str(tmp_path / "thermal.png"), as_counts(SCENE))
+    image = read_image(tmp_path / "thermal.png")
+    assert (image.dtype, image.shape) == (np.uint8, SCENE.shape)
+    assert np.corrcoef(image.ravel(), np.clip(SCENE, 0, 255).ravel())[0, 1] > 0.99
+    cv2.imwrite(str(tmp_path / "colour.png"), cv2.merge([as_counts(SCENE), as_counts(SCENE), as_counts(SCENE, 2)]))
+    colour = read_image(tmp_path / "colour.png")
+    assert colour.shape == (*SCENE.shape, 3)
+    assert colour[..., 0].mean() > colour[..., 2].mean() + 20, "one range for all channels"
+
+
+def test_a_hot_object_that_passes_leaves_the_grey_levels_of_the_ground():
+    depth = DepthRange()
+    before, *_ = (depth.to_8_bits(counts) for counts in thermal_flight())
+    with_fire = thermal_flight()[0]
+    with_fire[:, :40] = 20_000  # an eighth of the picture
+    for _ in range(2):
+        shown = depth.to_8_bits(with_fire)
+    assert (shown[:, :40] == 255).all()
+    assert shown[:, 40:].std() > 0.3 * before[:, 40:].std()
+
+
+def test_a_picture_that_does_not_fit_the_range_is_shown_over_its_own():
+    depth = DepthRange()
+    flight = thermal_flight()
+    first, *_ = (depth.to_8_bits(counts) for counts in flight)
+    moved = depth.to_8_bits(flight[0] + np.uint16(3000))  # as after the calibration of a thermal camera's shutter
+    assert np.abs(first.astype(int) - moved).mean() < 12
+    narrow = depth.to_8_bits(as_counts(SCENE, 0.5))
+    assert narrow.std() > 0.8 * first.std()
+
+
+def test_noise_without_a_scene_is_not_made_a_picture():
+    noise = np.random.default_rng(1).normal(8000, 2, (240, 320)).astype(np.uint16)
+    assert DepthRange().to_8_bits(noise).std() < 12
+    for count in (0, 65535):
+        assert DepthRange().to_8_bits(np.full((240, 320), count, np.uint16)).std() == 0
+
+
+def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
+    flight = [
+        av.VideoFrame.from_ndarray(counts, "gray16le") for counts in [*thermal_flight(), *[thermal_flight()[3]] * 3]
+    ]
+    whole = open_pictures(str(write_video(tmp_path / "a.nut", flight, "gray16le")), {})
+    assert whole is not None
+    looks = [whole.look(picture) for fetched in iter(whole.fetch, None) for picture in whole.decode(fetched)]
+    assert (looks[-1] == looks[-2]).all()
+    assert np.abs(looks[0].astype(int) - looks[1]).mean() > 3
+
+
+@pytest.mark.parametrize("extension", [".mkv", ".ts", ".mp4"])
+@pytest.mark.parametrize(("aspect", "width_px"), [("16/11", 465), ("8/9", 284), ("1/1", 320), ("200/201", 320)])
+def test_pixels_that_are_not_square_are_resampled(aspect, width_px, extension, tmp_path, caplog):
+    caplog.set_level("INFO")
+    circle = np.zeros((240, 320, 3), np.uint8)
+    axes = (round(160 / (width_px / 320)) // 2, 80)
+    cv2.ellipse(circle, (160, 120), axes, 0, 0, 360, (255, 255, 255), -1)
+    path = write_video(
+        tmp_path / f"a{extension}", [circle] * 3, "yuv420p", "libx264", sample_aspect_ratio=Fraction(aspect)
+    )
+    images = frames_of(path)
+    assert {image.shape for image in images} == {(240, width_px, 3)}
+    *_, width, height = cv2.boundingRect((images[0][..., 1] > 128).astype(np.uint8))
+    assert width == pytest.approx(height, abs=3)
+    assert caplog.text.count("resampled") == (width_px != 320)
+
+
+def test_a_shape_of_pixels_that_cannot_be_right_is_reported_and_not_used(tmp_path, caplog):
+    black = [np.zeros((64, 64, 3), np.uint8)] * 2
+    path = write_video(tmp_path / "a.mkv", black, "yuv420p", "libx264", sample_aspect_ratio=Fraction(9))
+    assert {image.shape for image in frames_of(path)} == {(64, 64, 3)}
+    assert caplog.text.count("cannot be right") == 1
