@@ -78,10 +78,10 @@ def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
     except MemoryError:
         raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
-    return decode_image(data, str(path))
+    return decode_image(data, str(path), depth)
 
 
-def decode_image(data: bytes, path: str) -> Image:
+def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Image:
     """Decode the content of an image file, as `read_image` does; `path` names it in the errors."""
     if _is_incomplete(data):
         raise ImageError(f"{path} is empty, cut short or damaged: copy it again from the camera.")

@@ -13,6 +13,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.age import UnstampedTime
 from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
 from edgevpr.frames.source import Source
+from edgevpr.frames.twins import TwinCheck
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
@@ -61,6 +62,7 @@ class LiveSource(Source):
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
         self._open_capture = open_capture
+        self._twins = TwinCheck()
         self._clock = clock
         self._t_start_s = clock()
         self._captured = self._same = 0
@@ -80,7 +82,8 @@ class LiveSource(Source):
             return None
         number, shot = newest
         name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        return Frame(image=shot.pixels(), name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s)
+        image = self._twins.require_single(shot.pixels())
+        return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s)
 
     def close(self) -> None:
         """Stop the capture thread; return after about half a second at most."""

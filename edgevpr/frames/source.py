@@ -21,6 +21,7 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, Refusal, StreamFacts
+from edgevpr.frames.twins import TwinCheck
 
 _READ_TIMEOUT_S = 1.0
 _SNAPSHOT_PERIOD_S = 0.5
@@ -79,6 +80,7 @@ class RecordingSource(Source):
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
+        self._twins = TwinCheck()
         self._only = None if only is None else frozenset(only)
 
     def is_wanted(self, name: str) -> bool:
@@ -129,7 +131,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = read_image(path, self._depth)
+            image = self._twins.require_single(read_image(path, self._depth))
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise

@@ -10,6 +10,8 @@ from contextlib import suppress
 from urllib.parse import unquote, urlsplit
 
 from edgevpr.core.errors import ImageError
+from edgevpr.core.types import FRAME_TIME_SD_S
+from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
 
@@ -79,7 +81,7 @@ class Snapshots:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
         self._period_s = min(period_s, _MAX_PERIOD_S)
         self._due_s = self._asked_s = clock()
-        self._data, self._is_kept = b"", False
+        self._data, self._is_kept, self._depth = b"", False, DepthRange()
 
     def read(self) -> Shot | Refusal | None:
         time.sleep(max(0.0, self._due_s - self._clock()))
@@ -88,8 +90,9 @@ class Snapshots:
         try:
             request = Request(self._uri, self._timeout_s)
             data = request.take(None)
+            answered_s = self._clock()
             request.close()
-            image = decode_image(data, "the snapshot")
+            image = decode_image(data, "the snapshot", self._depth)
         except ImageError:
             return Refusal.DAMAGED
         except _FAILURES:
@@ -98,7 +101,8 @@ class Snapshots:
         self._data = data
         plane = image if image.ndim == 2 else image[:, :, 1]
         taken_s = before_s if self._is_kept else self._asked_s
-        return Shot(t_mono_s=taken_s, look=coarse(plane), pixels=lambda: image)
+        sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else answered_s - self._asked_s)
+        return Shot(t_mono_s=taken_s, t_sd_s=sd_s, look=coarse(plane), pixels=lambda: image)
 
     def release(self) -> None:
         """Do nothing: no connection is open between two requests."""

@@ -1,5 +1,6 @@
 """Pixel formats of streams, videos and images: depth, range and shape of the pixels, and converters of two threads."""
 
+import contextlib
 import itertools
 import threading
 from fractions import Fraction
@@ -10,10 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from edgevpr.core.errors import ImageError
 from edgevpr.frames.decoding import open_pictures
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source, read_to_end
+from edgevpr.frames.twins import TwinCheck
 
 SIZE_PX = (256, 64)
 RAMP = np.repeat(np.arange(256, dtype=np.uint8)[None, :], SIZE_PX[1], 0)
@@ -204,3 +207,48 @@ def test_a_shape_of_pixels_that_cannot_be_right_is_reported_and_not_used(tmp_pat
     path = write_video(tmp_path / "a.mkv", black, "yuv420p", "libx264", sample_aspect_ratio=Fraction(9))
     assert {image.shape for image in frames_of(path)} == {(64, 64, 3)}
     assert caplog.text.count("cannot be right") == 1
+
+
+def stereo_pair(picture: np.ndarray, shift_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """The views of both eyes, the second one shifted, brighter, lower and with noise of its own."""
+    noise = np.random.default_rng(shift_px).normal(0, 3, picture.shape)
+    other = np.roll(picture, (1, shift_px), (0, 1)) * 1.1 + 5 + noise
+    return picture, np.clip(other, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("join", [np.hstack, np.vstack, lambda pair: np.hstack(pair)[:, ::2]])
+@pytest.mark.parametrize("shift_px", [1, 12])
+def test_both_pictures_of_a_stereo_camera_in_one_are_refused(join, shift_px):
+    check = TwinCheck()
+    for step in range(12):
+        scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
+        with pytest.raises(ImageError, match=r"half of the picture show the same.*videocrop"):
+            check.require_single(join(stereo_pair(scene, shift_px)))
+    for _ in range(10):
+        with contextlib.suppress(ImageError):
+            check.require_single(SCENE.astype(np.uint8))
+    check.require_single(SCENE.astype(np.uint8))
+
+
+def test_ground_that_repeats_itself_is_not_taken_for_a_stereo_picture():
+    rows, columns = np.indices((240, 320))
+    noise = np.random.default_rng(1).normal(0, 5, rows.shape)
+    crops = 120 + 40 * np.sin((columns + 0.3 * rows) / 4)
+    road = np.where(abs(columns - 160) < 12, 200, 90)
+    houses = np.where((columns % 64 < 35) & (rows % 60 < 30), 60, 140)
+    for ground in (crops, road, houses, np.full(rows.shape, 90)):
+        picture = np.clip(ground + noise, 0, 255).astype(np.uint8)
+        for turned in (picture, picture.T.copy()):
+            check = TwinCheck()
+            for _ in range(15):
+                check.require_single(turned)
+
+
+def test_a_folder_of_stereo_pictures_gives_no_frame_and_says_why(tmp_path):
+    for step in range(3):
+        scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
+        cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(stereo_pair(scene, 4)))
+    problems = []
+    assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
+    assert len(problems) == 3
+    assert all("left and the right half" in str(problem) for problem in problems)

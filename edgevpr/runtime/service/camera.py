@@ -6,7 +6,7 @@ import re
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 from edgevpr.core.config import SourceConfig
@@ -25,6 +25,7 @@ _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
 _BY_LIBCAMERA = ("media*", "video*", "dma_heap/*")  # devices below /dev that it opens
 _BOOT = "boot/firmware/config.txt"
+_ARGUS_SOURCE, _ARGUS_SOCKET = "nvarguscamerasrc", "tmp/argus_socket"
 
 
 def camera_findings(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
@@ -38,7 +39,21 @@ def camera_findings(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
         found = looked_at("camera", lambda: require_program(uri))
         if found.ok and not uri.startswith("gst:"):
             found = _ribbon(uri, found.message, root)
+        if found.ok and _ARGUS_SOURCE in uri:
+            found = _argus(found.message, root)
         yield found
+
+
+def _argus(program: str, root: Path) -> Finding:
+    """Check the socket of the daemon that reads the ribbon camera of a Jetson."""
+    if (root / _ARGUS_SOCKET).is_socket():
+        return fine("camera", f"{_ARGUS_SOURCE} by {program}, its daemon listens at /{_ARGUS_SOCKET}")
+    return wrong(
+        "camera",
+        f"/{_ARGUS_SOCKET} is not there, through which {_ARGUS_SOURCE} reads the camera: start its daemon, or pass the "
+        "socket into the container; the service takes it in when it starts.",
+        "sudo systemctl restart nvargus-daemon, then restart edgevpr",
+    )
 
 
 def _ribbon(uri: str, program: str, root: Path) -> Finding:
@@ -90,10 +105,15 @@ def _frame_size(source: Source, uri: str) -> tuple[int, int]:
     is_hopeless = False
     while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
         is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
-        with suppress(ImageError):
-            if frame := source.read(0.25):
-                height, width = frame.image.shape[:2]
-                return width, height
+        try:
+            frame = source.read(0.25)
+        except ImageError:
+            if source.is_live:  # not damaged, but of a kind that the flight would refuse
+                raise
+            continue
+        if frame:
+            height, width = frame.image.shape[:2]
+            return width, height
     waited_s = time.monotonic() - begin_s
     raise SourceError(
         f"{uri}: no frame came in {waited_s:.0f} s ({source.state}): start the camera or the stream, or "

@@ -1,6 +1,7 @@
 """What `edgevpr check` and `doctor` say of cameras: program, devices, cable, and a frame that fits the lens."""
 
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from distorted_cameras import wide
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import write_png
+from edgevpr.frames.shot import Condition
+from edgevpr.frames.source import Source
+from edgevpr.runtime.service import camera
 from edgevpr.runtime.service.camera import camera_findings, frame_seen
 
 FAKE = Path(__file__).parents[2] / "frames/fake_rpicam.py"
@@ -90,3 +94,51 @@ def test_a_frame_is_held_against_the_lens(tmp_path):
     write_png(folder / "1.png", grey[60:420])
     with pytest.raises(ImageError, match="640x360"):
         frame_seen(source)
+
+
+def test_a_camera_that_sends_both_pictures_of_a_stereo_pair_is_wrong(monkeypatch):
+    """Of a live source the first picture decides: the flight would refuse those after it, too."""
+
+    class Stereo(Source):
+        is_live, ended, condition, state = True, False, Condition.RUNNING, "streaming"
+
+        def read(self, timeout_s):
+            raise ImageError("both halves show the same")
+
+    monkeypatch.setattr(camera, "open_source", lambda *_, **__: Stereo())
+    with pytest.raises(ImageError, match="both halves"):
+        frame_seen(load_config(None, {"source.uri": "tcp://127.0.0.1:1"}).source)
+
+
+def test_the_daemon_of_a_jetsons_ribbon_camera_is_looked_for(root, tmp_path, monkeypatch):
+    (tmp_path / "gst-launch-1.0").write_text("#!/bin/sh\n")
+    (tmp_path / "gst-launch-1.0").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    uri = "gst: nvarguscamerasrc sensor-id=0 ! nvvidconv ! video/x-raw,format=BGRx"
+    (without,) = camera_findings(uri, root)
+    assert (without.ok, len(without.changes)) == (False, 1)
+    assert "/tmp/argus_socket is not there" in without.message
+    monkeypatch.chdir(root)  # the path of a socket has at most 107 bytes
+    (root / "tmp").mkdir()
+    with socket.socket(socket.AF_UNIX) as daemon:
+        daemon.bind("tmp/argus_socket")
+        (found,) = camera_findings(uri, root)
+    assert found.ok
+    (other,) = camera_findings("gst: v4l2src", root)
+    assert other.ok
+    assert "argus" not in other.message
+
+
+@pytest.mark.parametrize("error", [KeyError, OSError])
+def test_a_user_without_a_name_is_named_by_the_number(error, root, monkeypatch):
+    def nobody():
+        raise error
+
+    monkeypatch.setattr("getpass.getuser", nobody)
+    (free,) = camera_findings("/dev/video0", root)
+    assert free.ok
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr("edgevpr.runtime.service.finding._NOBODYS_GROUPS", ())
+    (denied,) = camera_findings("/dev/video0", root)
+    assert f"may not be used by user {os.getuid()} (" in denied.message
+    assert denied.changes == (f"--group-add {Path('/dev/null').stat().st_gid}",)
