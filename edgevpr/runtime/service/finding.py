@@ -90,19 +90,29 @@ def device(what: str, path: str, root: Path = Path("/")) -> Finding:
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name
     mode = f"group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
-    may_use, user = os.access(file, os.R_OK | os.W_OK), getpass.getuser()
+    may_use, user = os.access(file, os.R_OK | os.W_OK), _user_name()
     held, changes = _held(file.resolve(), root) if what == "serial" else _opened(file.resolve(), root)
     if held:
         return wrong(what, f"{path} ({mode}) is not free: {held}.", *changes)
-    denied = f"{path} may not be used by {user} ({mode})"
+    denied = f"{path} may not be used by {user or f'user {os.getuid()}'} ({mode})"
     if not may_use and group in _NOBODYS_GROUPS:
         why = ": a login shell on it is the usual reason" if changes else ""
         return wrong(what, f"{denied}{why}.", *(changes or ("install the udev rules 99-edgevpr.rules of edgevpr",)))
+    if not may_use and user is None:
+        return wrong(what, f"{denied}: start the container with the group.", f"--group-add {status.st_gid}")
     if not may_use:
         return wrong(
             what, f"{denied}: log in again after the change.", f"sudo usermod --append --groups {group} {user}"
         )
     return fine(what, f"{path}, {mode}")
+
+
+def _user_name() -> str | None:
+    """Return the name of this user; None for a user of a number only, as of `docker run --user`."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # the latter from Python 3.13 on
+        return None
 
 
 def log_findings(log: LogConfig, has_link: bool) -> Iterator[Finding]:

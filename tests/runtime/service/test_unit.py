@@ -104,6 +104,20 @@ def test_serial_ports_and_cameras_stay_within_reach():
     assert unit["SupplementaryGroups"] == "dialout video"
 
 
+def test_the_socket_of_a_jetsons_camera_is_let_into_the_private_tmp():
+    unit = directives(UNIT.read_text())
+    assert unit["PrivateTmp"] == "yes"
+    assert unit["BindPaths"] == "-/tmp/argus_socket", "other boards do not have it"
+    assert "nvargus-daemon.service" in unit["After"].split()
+
+
+def test_nothing_hides_what_cameras_are_found_by():
+    """/dev/video*, /dev/media* and /run/udev, which libcamera and GStreamer read."""
+    unit = directives(UNIT.read_text())
+    hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
+    assert not hidden & unit.keys()
+
+
 def test_every_udev_rule_is_well_formed():
     rules = [line for line in (DEPLOY / "99-edgevpr.rules").read_text().splitlines() if line and line[0] != "#"]
     keys = r"(ACTION|SUBSYSTEMS?|KERNEL|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|LABEL|GOTO)"
