@@ -3,12 +3,15 @@
 import cmath
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.core.config import SourceConfig
+from edgevpr.core.config import Config, SourceConfig
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Accepted matches, and a picture's footprint over that of the map, between which nothing is said: as much is found, by
@@ -17,6 +20,10 @@ _SCALED_BY, _SCALES = 10, (0.87, 1.4)
 # Accepted matches in a row by which pictures are turned, and the least turn; with this length of the mean of their
 # directions they agree to some ten degrees. A compass is rarely wrong by so much, a camera is by 90 or 180.
 _TURNED_BY, _TURNED_DEG, _AGREE = 10, 20.0, 0.97
+_MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is tried; over poor ground ten are usual
+_MISSES_TO_TRY_AGAIN = 30
+_MAX_TRIES = 8  # each costs two queries
+_MIRRORED_TO_REPORT = 2  # tries in a row that match: one may be wrong
 
 
 class ScaleWatch:
@@ -66,3 +73,45 @@ class TurnWatch:
         turned = f"turned {turn_deg:.0f} degrees"
         said = f"pictures are {turned} against the heading: if the compass is right, set source.up_deg: {up_deg:.0f}"
         self._herald.tell("camera", Severity.WARNING, said, ground=f"pictures {turned}", topic="turn", said=said)
+
+
+class MirrorWatch:
+    """Reports once if pictures are mirrored, as by a setting of the camera: they never match. Where many queries in a
+    row have no match, and none had one before, a picture is tried flipped left to right, and top to bottom."""
+
+    def __init__(self, herald: Herald, recogniser: Recogniser, config: Config) -> None:
+        self._herald, self._recogniser = herald, recogniser
+        self._meter = meter_of(config, recogniser.meter.board)  # its own: that of the flight may be recorded
+        self._misses = self._tries = self._matches = 0
+        self._next_try = _MISSES_TO_TRY
+
+    def tell(self, event: Recognition) -> None:
+        """Count a query without a match, and try its picture mirrored if it is time to."""
+        if event.accepted:
+            self._tries = _MAX_TRIES
+        has_ground = event.is_query and not (event.failed or event.says_nothing or event.view.reason)
+        if self._tries == _MAX_TRIES or event.frame is None or not has_ground:
+            return
+        self._misses += 1
+        if self._misses < self._next_try:
+            return
+        is_mirrored = self._matches_mirrored(event, 1) or self._matches_mirrored(event, 0)
+        self._tries += 1
+        self._matches = self._matches + 1 if is_mirrored else 0
+        self._next_try = self._misses + (1 if is_mirrored else _MISSES_TO_TRY_AGAIN)
+        if self._matches == _MIRRORED_TO_REPORT:
+            self._tries = _MAX_TRIES
+            said = "pictures are mirrored, so none can match: switch mirror or flip off in the camera's settings"
+            self._herald.tell(
+                "camera", Severity.WARNING, said, ground="pictures are mirrored", topic="mirror", said=said
+            )
+
+    def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
+        """Search the whole map for the flipped picture, by nothing that the flight knows."""
+        assert event.frame is not None
+        now, settings = self._recogniser, WalkSettings(candidates=self._recogniser.candidates)
+        matcher = Matcher(now.technique, now.index, now.rule, follows=False)
+        preparation = replace(now.preparation, strides=None)
+        alone = Recogniser(matcher, now.place_map, self._meter, settings, preparation=preparation)
+        frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
+        return alone.step(frame, event.vehicle).accepted

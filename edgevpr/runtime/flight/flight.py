@@ -24,7 +24,7 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import at_recorded_rate, find_origin, look_ahead, open_map, rate_hz, say_start
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
-from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
+from edgevpr.runtime.flight.camerawatch import MirrorWatch, ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.governor import Governing
@@ -78,6 +78,7 @@ class Flight:
             Sight(herald).tell,
             ScaleWatch(herald).tell,
             TurnWatch(herald, config.source).tell,
+            MirrorWatch(herald, crew.recogniser, config).tell,
             HeightWatch(herald, crew.autopilot).tell,
             gps.tell,
             self._surveyor.tell,

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, of_kind
@@ -159,3 +160,24 @@ def test_pictures_that_are_turned_against_the_heading_are_said_once(tmp_path, tu
     for event in [missed, *events, *events]:
         watch.tell(event)
     assert [text.removeprefix("edgevpr: ").replace("-180", "180") for _, text in link.texts()] == said
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(recording, tmp_path, axis):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    pictures = [np.flip(textured(number % 8, 240, 320), axis).copy() for number in range(20)]
+    lines = flight.fly(FakeSource(pictures, clock))
+    assert not any(line["accepted"] for line in of_kind(lines, "query"))
+    assert link.texts() == [(4, "edgevpr: pictures are mirrored")]
+    (line,) = of_kind(lines, "camera")
+    assert line["said"].startswith("pictures are mirrored, so none can match: switch mirror or flip off")
+
+
+def test_pictures_of_other_ground_are_not_reported_as_mirrored(recording, tmp_path):
+    clock = FakeClock()
+    link = FakeLink(clock)
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    flight.fly(FakeSource([textured(number, 240, 320) for number in range(100, 135)], clock))
+    assert link.texts() == []
