@@ -258,6 +258,9 @@ class FakeCapture:
         self._left, self._work = iter(pictures), work
         self.is_released = False
 
+    def get(self, prop: int) -> float:
+        return 0.0
+
     def read(self) -> tuple[bool, np.ndarray | None]:
         self._work()
         picture = next(self._left, None)

@@ -8,13 +8,15 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Image
+from edgevpr.core.arrays import Array, Image
 from edgevpr.core.types import Frame
 from edgevpr.frames.age import UnstampedTime
+from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
 from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
 from edgevpr.frames.source import Source
 from edgevpr.frames.twins import TwinCheck
 
+_FORMATS_OF_COUNTS = [cv2.VideoWriter.fourcc(*name) for name in ("Y16 ", "Y12 ", "Y10 ")]  # of thermal cameras
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take less than three pictures a second
@@ -28,19 +30,29 @@ class DeviceCapture:
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
-        self._time = UnstampedTime(clock())
+        self._time, self._depth = UnstampedTime(clock()), DepthRange()
+        if int(capture.get(cv2.CAP_PROP_FOURCC)) in _FORMATS_OF_COUNTS:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits only
 
     def read(self) -> Shot | None:
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
             asked_s = self._clock()
             there, read = self._capture.read()
             if there:
-                image: Image = np.asarray(read, np.uint8)
-                plane = image if image.ndim == 2 else image[:, :, 1]
                 came_s = self._clock()
                 sd_s = self._time.taken(asked_s, came_s).sd_s
-                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=coarse(plane), pixels=lambda: image)
+                look, pixels = self._prepare(read)
+                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=look, pixels=pixels)
         return None
+
+    def _prepare(self, read: Array) -> tuple[Image, Callable[[], Image]]:
+        """Return the coarse copy of a picture, and what converts the picture."""
+        if read.dtype == np.uint16:
+            counts = np.asarray(read, np.uint16)
+            sample, limits = sample_counts(counts), self._depth.update(counts)
+            return to_8_bits(sample, find_limits(sample)), lambda: to_8_bits(counts, limits)
+        image: Image = np.asarray(read, np.uint8)
+        return coarse(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def release(self) -> None:
         self._capture.release()

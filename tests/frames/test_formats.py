@@ -15,6 +15,7 @@ from edgevpr.core.errors import ImageError
 from edgevpr.frames.decoding import open_pictures
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import read_image
+from edgevpr.frames.live import DeviceCapture
 from edgevpr.frames.source import open_source, read_to_end
 from edgevpr.frames.twins import TwinCheck
 
@@ -183,6 +184,33 @@ def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
     looks = [whole.look(picture) for fetched in iter(whole.fetch, None) for picture in whole.decode(fetched)]
     assert (looks[-1] == looks[-2]).all()
     assert np.abs(looks[0].astype(int) - looks[1]).mean() > 3
+
+
+class ThermalCamera:
+    """An opened cv2.VideoCapture of a V4L2 camera of 16 bits, which OpenCV cuts down to 8 unless it is told not to."""
+
+    def __init__(self) -> None:
+        self.converts, self.left = True, thermal_flight()
+
+    def get(self, prop: int) -> float:
+        return float(cv2.VideoWriter.fourcc(*"Y16 ")) if prop == cv2.CAP_PROP_FOURCC else 0.0
+
+    def set(self, prop: int, value: float) -> None:
+        self.converts = self.converts and prop != cv2.CAP_PROP_CONVERT_RGB
+
+    def read(self):
+        counts = self.left.pop(0)
+        return True, cv2.merge([(counts >> 8).astype(np.uint8)] * 3) if self.converts else counts
+
+
+def test_a_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path):
+    for index, counts in enumerate(thermal_flight()):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), counts)
+    capture = DeviceCapture(ThermalCamera(), clock=lambda: 1.0)
+    shots = [capture.read() for _ in thermal_flight()]
+    for shot, image in zip(shots, frames_of(tmp_path), strict=True):
+        assert (shot.pixels() == image).all()
+        assert shot.look.std() > 50
 
 
 @pytest.mark.parametrize("extension", [".mkv", ".ts", ".mp4"])

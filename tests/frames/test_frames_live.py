@@ -134,6 +134,9 @@ class SteppedCamera:
         self.taken = threading.Semaphore(0)
         self.released = threading.Event()
 
+    def get(self, prop):
+        return 0.0
+
     def read(self):
         self.taken.release()
         picture = self.pictures.get()
