@@ -80,6 +80,7 @@ def _frames(args: Namespace, unusable: list[ImageError]) -> "Iterator[Frame]":
     from edgevpr.frames.source import open_source, read_to_end
 
     with closing(open_source(args.source, step_s=_FILM_STEP_S, live=True)) as source:
+        source.twins.stop()
         if source.is_live:
             yield from live_frames(source, args.seconds)
         else:

@@ -74,7 +74,7 @@ class LiveSource(Source):
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
         self._open_capture = open_capture
-        self._twins = TwinCheck()
+        self.twins = TwinCheck()
         self._clock = clock
         self._t_start_s = clock()
         self._captured = self._same = 0
@@ -94,7 +94,7 @@ class LiveSource(Source):
             return None
         number, shot = newest
         name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        image = self._twins.require_single(shot.pixels())
+        image = self.twins.require_single(shot.pixels())
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s)
 
     def close(self) -> None:

@@ -43,7 +43,8 @@ class Source:
     `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
     `facts`: what a stream states of its pictures, None if unknown.
-    `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them."""
+    `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them.
+    `twins`: refuses pictures whose halves show the same."""
 
     is_live: bool
     ended: bool
@@ -55,6 +56,7 @@ class Source:
     state: str
     facts: StreamFacts | None = None
     step_s: float | None = None
+    twins: TwinCheck
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame (of a live source the newest), or None if there is none within `timeout_s` seconds.
@@ -80,7 +82,7 @@ class RecordingSource(Source):
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
-        self._twins = TwinCheck()
+        self.twins = TwinCheck()
         self._only = None if only is None else frozenset(only)
 
     def is_wanted(self, name: str) -> bool:
@@ -131,7 +133,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = self._twins.require_single(read_image(path, self._depth))
+            image = self.twins.require_single(read_image(path, self._depth))
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise

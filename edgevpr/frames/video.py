@@ -88,7 +88,7 @@ class VideoSource(RecordingSource):
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
                 if self.is_wanted(name):
                     tag = self._track.tag_at(self._t_s) if self._track else GeoTag()
-                    image = self._twins.require_single(self._whole.conversion(picture)())
+                    image = self.twins.require_single(self._whole.conversion(picture)())
                     return tagged(image, name, self._clock(), tag)
             if self._clock() >= deadline_s:
                 break

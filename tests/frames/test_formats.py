@@ -280,3 +280,6 @@ def test_a_folder_of_stereo_pictures_gives_no_frame_and_says_why(tmp_path):
     assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
     assert len(problems) == 3
     assert all("left and the right half" in str(problem) for problem in problems)
+    source = open_source(str(tmp_path), live=False)
+    source.twins.stop()  # as for pictures of a chequerboard
+    assert len(list(filter(None, read_to_end(source, pytest.fail)))) == 3
