@@ -10,7 +10,8 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.live import DeviceCapture, LiveSource
+from edgevpr.frames.devices import DeviceCapture
+from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 from edgevpr.lab.simulate.motion import TrueState

@@ -16,6 +16,7 @@ _LOOK_S = 1.0  # the flight writes its status once a second
 # Age of a status after which the flight is called silent (a slow frame may delay it), and after which --once takes it
 # for the last status of a flight that was killed.
 _SILENT_S, _GONE_S = 2.5, 10.0
+_LONG_S = 3.0  # age of a picture from which on seconds are enough
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
 
@@ -63,7 +64,8 @@ def _no_flight(file: str) -> tuple[str, str]:
 
 def lines_of(status: dict[str, Any]) -> list[str]:
     """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
-    latency, heat = _known(", {:.2f} s old", status["latency_s"]), _known("{:.0f} °C", status["temperature_c"])
+    age_s, heat = status["latency_s"], _known("{:.0f} °C", status["temperature_c"])
+    latency = _known(", {:.2f} s old" if (age_s or 0) < _LONG_S else ", newest picture {:.0f} s old", age_s)
     hot, throttled = ", hot" * bool(status["hot"]), ", the board slows itself down" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [

@@ -72,6 +72,7 @@ class WholePictures:
     """The complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is rejected,
     and so are all pictures after it up to the next key frame, which is decoded without others.
 
+    `is_cancelled`: set it to end a `fetch` in another thread with the next packet, be it of sound.
     FFmpeg reads ahead while it opens a stream. `are_missed`: it reported lost packets during that. As it does not say
     which packets are lost, all are rejected until `caught_up` is called."""
 
@@ -82,7 +83,8 @@ class WholePictures:
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory
         self._codec.options = {"err_detect": "explode"}  # damaged data is an error, and not filled in
-        self._packets = container.demux(self.stream)
+        self.is_cancelled = False
+        self._packets = container.demux()
         self._converter = PixelConverter()
         self._is_backlog_doubtful = are_missed
         self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
@@ -111,10 +113,10 @@ class WholePictures:
         fetch while another one decodes."""
         with av.logging.Capture() as said:
             try:
-                packet = next(self._packets, None)
+                packet = next((each for each in self._packets if self.is_cancelled or self._is_ours(each)), None)
             except (av.FFmpegError, OSError):
                 return None
-        if packet is None:
+        if packet is None or self.is_cancelled:
             return None
         if packet.is_corrupt or _is_missed(said):
             # FFmpeg reports a gap while it assembles the picture after the one that it returns.
@@ -160,6 +162,9 @@ class WholePictures:
     def close(self) -> None:
         """Close the file or the connection."""
         self.container.close()
+
+    def _is_ours(self, packet: "Packet[Any]") -> bool:
+        return bool(packet.stream.index == self.stream.index)
 
     def _decoded(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
         with av.logging.Capture():

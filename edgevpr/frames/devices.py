@@ -1,14 +1,18 @@
-"""V4L2 cameras: opening one, and the cause if that fails."""
+"""V4L2 cameras: opening one, and the cause if that fails; the pictures of one."""
 
+import contextlib
 import errno
 import fcntl
 import os
 from collections.abc import Callable
 
 import cv2
+import numpy as np
 
-from edgevpr.frames.live import DeviceCapture
-from edgevpr.frames.shot import OpeningError
+from edgevpr.core.arrays import Array, Image
+from edgevpr.frames.age import UnstampedTime
+from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
+from edgevpr.frames.shot import OpeningError, Shot, coarse
 
 _CAUSES = {
     errno.ENOENT: "not connected",
@@ -22,9 +26,10 @@ _QUERY_CAPABILITIES = 0x80685600  # VIDIOC_QUERYCAP
 _CAPABILITIES_BYTES = 104
 _DEVICE_CAPABILITIES = slice(88, 92)
 _VIDEO_CAPTURE = 0x1001  # of one plane, or of several
+_FORMATS_OF_COUNTS = [cv2.VideoWriter.fourcc(*name) for name in ("Y16 ", "Y12 ", "Y10 ")]  # of thermal cameras
 
 
-def open_device(path: str, clock: Callable[[], float]) -> DeviceCapture:
+def open_device(path: str, clock: Callable[[], float]) -> "DeviceCapture":
     """Open the V4L2 camera `path`. `clock` is the monotonic clock in seconds. Raises OpeningError with the cause."""
     capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
     if capture.isOpened():
@@ -48,3 +53,40 @@ def _explain(path: str) -> str:
     if not int.from_bytes(capabilities[_DEVICE_CAPABILITIES], "little") & _VIDEO_CAPTURE:
         return "this node of the camera has no pictures: give another one of its /dev/video numbers"
     return "in use by another program, or in no format that OpenCV reads"
+
+
+class DeviceCapture:
+    """A V4L2 camera opened with OpenCV: a `Capture`. If it cannot be opened, the first `read` returns None. OpenCV does
+    not report damaged pictures, so none is rejected here."""
+
+    def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
+        self._capture, self._clock = capture, clock
+        self._time, self._depth = UnstampedTime(clock()), DepthRange()
+        if int(capture.get(cv2.CAP_PROP_FOURCC)) in _FORMATS_OF_COUNTS:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits only
+
+    def read(self) -> Shot | None:
+        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
+            asked_s = self._clock()
+            there, read = self._capture.read()
+            if there:
+                came_s = self._clock()
+                sd_s = self._time.taken(asked_s, came_s).sd_s
+                look, pixels = self._prepare(read)
+                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=look, pixels=pixels)
+        return None
+
+    def _prepare(self, read: Array) -> tuple[Image, Callable[[], Image]]:
+        """Return the coarse copy of a picture, and what converts the picture."""
+        if read.dtype == np.uint16:
+            counts = np.asarray(read, np.uint16)
+            sample, limits = sample_counts(counts), self._depth.update(counts)
+            return to_8_bits(sample, find_limits(sample)), lambda: to_8_bits(counts, limits)
+        image: Image = np.asarray(read, np.uint8)
+        return coarse(image if image.ndim == 2 else image[:, :, 1]), lambda: image
+
+    def cancel(self) -> None:
+        """Do nothing: OpenCV's wait for a picture cannot be ended, and lasts ten seconds at most."""
+
+    def release(self) -> None:
+        self._capture.release()

@@ -1,61 +1,22 @@
-"""Live sources: cameras and network streams. A thread reads their pictures, holds the newest one, and reopens a source
-that is lost."""
+"""Live sources: cameras and network streams. The newest picture counts; a source that gives none is opened anew."""
 
-import contextlib
 import threading
 from collections.abc import Callable
 
-import cv2
-import numpy as np
-
-from edgevpr.core.arrays import Array, Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.age import UnstampedTime
-from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
-from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot, coarse
+from edgevpr.frames.calls import Conversion, Converter, Opening
+from edgevpr.frames.liveness import LOST_S, Fault, Liveness
+from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot
 from edgevpr.frames.source import Source
 from edgevpr.frames.twins import TwinCheck
 
-_FORMATS_OF_COUNTS = [cv2.VideoWriter.fourcc(*name) for name in ("Y16 ", "Y12 ", "Y10 ")]  # of thermal cameras
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 10.0
+_FIRST_WAIT_S = 0.5
+_LONGEST_WAIT_S = 10.0
 _CLOSE_TIMEOUT_S = 0.5
-_FROZEN_S, _FROZEN_PICTURES = 1.0, 3  # both are needed: a slow camera may take less than three pictures a second
-_DAMAGED_S = 5.0  # longer than streams need to recover from a lost packet
-_LATE = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
-
-
-class DeviceCapture:
-    """A V4L2 camera opened with OpenCV: a `Capture`. If it cannot be opened, the first `read` returns None. OpenCV does
-    not report damaged pictures, so none is rejected here."""
-
-    def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
-        self._capture, self._clock = capture, clock
-        self._time, self._depth = UnstampedTime(clock()), DepthRange()
-        if int(capture.get(cv2.CAP_PROP_FOURCC)) in _FORMATS_OF_COUNTS:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits only
-
-    def read(self) -> Shot | None:
-        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
-            asked_s = self._clock()
-            there, read = self._capture.read()
-            if there:
-                came_s = self._clock()
-                sd_s = self._time.taken(asked_s, came_s).sd_s
-                look, pixels = self._prepare(read)
-                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=look, pixels=pixels)
-        return None
-
-    def _prepare(self, read: Array) -> tuple[Image, Callable[[], Image]]:
-        """Return the coarse copy of a picture, and what converts the picture."""
-        if read.dtype == np.uint16:
-            counts = np.asarray(read, np.uint16)
-            sample, limits = sample_counts(counts), self._depth.update(counts)
-            return to_8_bits(sample, find_limits(sample)), lambda: to_8_bits(counts, limits)
-        image: Image = np.asarray(read, np.uint8)
-        return coarse(image if image.ndim == 2 else image[:, :, 1]), lambda: image
-
-    def release(self) -> None:
-        self._capture.release()
+_TICK_S = 0.2
+_OPENING_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
+_AGED_S = 1.0
+_MOST_HANGING = 3  # calls that have not returned: a source that hangs each time must not take ever more threads
 
 
 class LiveSource(Source):
@@ -63,98 +24,166 @@ class LiveSource(Source):
     OpeningError, it could not be opened.
 
     `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
-    Only the capture thread uses the capture, from opening to release: a call into a stream that hangs cannot be
-    interrupted. `close` waits half a second, then leaves the thread to its time-out.
+    `latency_s` grows while no new picture comes.
+
+    One thread opens the source and reads it (`Opening`), another converts the pictures that are used (`Converter`). A
+    third calls nothing that could hang: it gives up on the others if no new picture comes in time (`Liveness`), and has
+    the source opened anew after pauses that grow, for ever. `read` and `close` wait for no call that hangs.
     """
 
     def __init__(self, open_capture: Callable[[], Capture | None], clock: Callable[[], float]):
         self.is_live, self.total, self.ended = True, 0, False
-        self.condition, self.state = Condition.OPENING, "opening"
+        self.condition, self.state = Condition.OPENING, "opening, no picture yet"
         self.dropped: int = 0
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
-        self._open_capture = open_capture
         self.twins = TwinCheck()
-        self._clock = clock
+        self._open_capture, self._clock = open_capture, clock
         self._t_start_s = clock()
-        self._captured = self._same = 0
-        self._last_new_s = self._t_start_s
+        self._captured = 0
         self._last_taken_s = float("-inf")
+        self._newness = Newness()  # over all openings: a server may begin with the picture that it has kept
+        self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
-        self._arrived = threading.Condition()
+        self._conversion: Conversion | None = None
+        self._converter = Converter()
+        self._opening: Opening | None = None
+        self._is_open_noted = False
+        self._hanging: list[Callable[[], bool]] = []  # for each call that was given up: has it returned?
+        self._changed = threading.Condition()  # guards all of these
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._capture, name="capture", daemon=True)
+        self._thread = threading.Thread(target=self._keep_open, name="camera", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float) -> Frame | None:
-        with self._arrived:
-            self._arrived.wait_for(lambda: self._newest is not None, timeout_s)
-            newest, self._newest = self._newest, None
-        if newest is None or self._closing.is_set():
+        with self._changed:
+            if self._conversion is None:
+                self._changed.wait_for(lambda: self._newest is not None, timeout_s)
+                if self._newest is None or self._closing.is_set():
+                    return None
+                self._conversion = Conversion(*self._newest, self._clock())
+                self._newest = None
+                self._converter.ask(self._conversion)
+            conversion = self._conversion
+        if not conversion.done.wait(timeout_s):  # the next call waits on
             return None
-        number, shot = newest
-        name = f"frame {number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        image = self.twins.require_single(shot.pixels())
-        return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s)
+        with self._changed:
+            if conversion is not self._conversion:  # given up
+                return None
+            self._conversion = None
+            if conversion.image is None:
+                self.refused[Refusal.DAMAGED.value] += 1
+                return None
+        t_mono_s, t_sd_s = conversion.shot.t_mono_s, conversion.shot.t_sd_s
+        name = f"frame {conversion.number:06d} t={t_mono_s - self._t_start_s:.3f} s"
+        image = self.twins.require_single(conversion.image)
+        return Frame(image=image, name=name, t_mono_s=t_mono_s, t_sd_s=t_sd_s)
 
     def close(self) -> None:
-        """Stop the capture thread; return after about half a second at most."""
-        self._closing.set()
+        """Stop all threads; return after about a second at most, whether they have ended or not."""
+        with self._changed:
+            self._closing.set()
+            opening = self._opening
+        if opening:
+            opening.cancel()
+            opening.ended.wait(_CLOSE_TIMEOUT_S)
+        self._converter.end(_TICK_S)
         self._thread.join(_CLOSE_TIMEOUT_S)
         self.end()
 
-    def _capture(self) -> None:
+    def _keep_open(self) -> None:
         wait_s = 0.0
-        while not self._closing.is_set():
-            before, capture, cause = self._captured, None, "nothing there"
-            try:
-                capture = self._open_capture()
-            except OpeningError as error:
-                cause = str(error)
-            if capture is not None:
-                cause = "no picture came"
-                self._take_pictures(capture)
-                capture.release()
-            has_failed_again = wait_s and self._captured == before
+        while (opening := self._open()) is not None:
+            before = self._captured
+            fault = self._watch(opening)
+            opening.cancel()
+            self._hanging.append(opening.ended.is_set)
+            has_failed_again = wait_s and self._captured == before and fault.condition is not Condition.FROZEN
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
-            self.condition = Condition.LOST
-            self.state = f"{'lost' if self._captured else cause}, reopening in {wait_s:g} s"
+            self._liveness.reopen(fault)
+            self._set_condition(fault.condition, f"{fault.text}, reopening in {wait_s:g} s")
             self._closing.wait(wait_s)
+            self._wait_for_calls(fault)
 
-    def _take_pictures(self, capture: Capture) -> None:
-        newness, self._same, self._last_new_s = Newness(), 0, self._clock()
+    def _open(self) -> Opening | None:
+        """Begin to open the source; None if it is to be closed."""
+        with self._changed:
+            if self._closing.is_set():
+                return None
+            self._is_open_noted = False
+            self._opening = Opening(self._open_capture, self._take, self._clock)
+            return self._opening
+
+    def _watch(self, opening: Opening) -> Fault:
+        """Wait until a source that is being opened, or is open, must be opened anew, and return why."""
+        while not (opening.ended.wait(_TICK_S) or self._closing.is_set()):
+            with self._changed:
+                if fault := self._fault(opening):
+                    self._set_condition(fault.condition, fault.text)
+                    if fault.must_reopen:
+                        return fault
+        cause = "no picture came" if opening.opened_s else "nothing there"
+        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else cause), True)
+
+    def _fault(self, opening: Opening) -> Fault | None:
+        now_s, conversion = self._clock(), self._conversion
+        if self._captured and now_s - self._last_taken_s > _AGED_S:
+            self.latency_s = now_s - self._last_taken_s
+        if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_S:
+            self._converter.end()
+            self._hanging.append(lambda hung=self._converter: not hung.is_alive)  # type: ignore[misc]
+            self._converter, self._conversion = Converter(), None
+            self._newest = None  # of the same decoder
+            return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
+        if opening.opened_s is None:
+            is_late = now_s - opening.began_s > _OPENING_S
+            return Fault(Condition.LOST, "lost: the opening hangs", True) if is_late else None
+        self._note_open(opening)
+        return self._liveness.fault(now_s)
+
+    def _note_open(self, opening: Opening) -> None:
+        if not self._is_open_noted and opening.opened_s is not None:
+            self._is_open_noted = True
+            self._liveness.open(opening.opened_s)
+
+    def _wait_for_calls(self, fault: Fault) -> None:
         while not self._closing.is_set():
-            shot = capture.read()
-            if shot is None:
+            self._hanging = [has_returned for has_returned in self._hanging if not has_returned()]
+            if len(self._hanging) < _MOST_HANGING:
                 return
-            if isinstance(shot, Refusal):
-                self._refuse(shot)
-            elif refusal := newness.refusal(shot.look):
-                self._refuse(refusal)
-            elif shot.t_mono_s < self._last_taken_s:
-                self._refuse(Refusal.LATE)
+            self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls into it hang")
+            self._closing.wait(_FIRST_WAIT_S)
+
+    def _take(self, opening: Opening, shot: Shot | Refusal) -> None:
+        """Take what an opening has read, unless it has been given up."""
+        with self._changed:
+            if opening is not self._opening or opening.is_cancelled:
+                return
+            self._note_open(opening)
+            now_s = self._clock()
+            found = shot if isinstance(shot, Refusal) else self._put(shot, now_s)
+            if found is None:
+                self.facts = self.facts or opening.facts
             else:
-                self.facts = self.facts or getattr(capture, "facts", None)
-                self._put(shot)
+                self.refused[found.value] += 1
+                self._liveness.refuse(found)
 
-    def _put(self, shot: Shot) -> None:
-        now_s = self._clock()
-        self.condition, self.state = Condition.RUNNING, "streaming"
-        self.latency_s = now_s - shot.t_mono_s
-        self._same, self._last_new_s, self._last_taken_s = 0, now_s, shot.t_mono_s
-        with self._arrived:
-            self.dropped += self._newest is not None
-            self._newest = self._captured, shot
-            self._captured += 1
-            self._arrived.notify()
+    def _put(self, shot: Shot, now_s: float) -> Refusal | None:
+        """Keep a picture as the newest one, or return why it is none."""
+        if refusal := self._newness.refusal(shot.look):
+            return refusal
+        if shot.t_mono_s < self._last_taken_s:
+            return Refusal.LATE
+        if refusal := self._liveness.take(now_s):
+            return refusal
+        self._set_condition(Condition.RUNNING, "streaming")
+        self.latency_s, self._last_taken_s = now_s - shot.t_mono_s, shot.t_mono_s
+        self.dropped += self._newest is not None
+        self._newest = self._captured, shot
+        self._captured += 1
+        self._changed.notify_all()
+        return None
 
-    def _refuse(self, refusal: Refusal) -> None:
-        self.refused[refusal.value] += 1
-        self._same = self._same + 1 if refusal is Refusal.FROZEN else 0
-        silent_s = self._clock() - self._last_new_s
-        if self._same >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
-            self.condition, self.state = Condition.FROZEN, "frozen: the same picture over and over"
-        elif refusal is Refusal.LATE and silent_s > _DAMAGED_S:
-            self.condition, self.state = Condition.LATE, _LATE
-        elif not self._same and silent_s > _DAMAGED_S:
-            self.condition, self.state = Condition.DAMAGED, "damaged: no picture is whole"
+    def _set_condition(self, condition: Condition, state: str) -> None:
+        if not self.ended:
+            self.condition, self.state = condition, state

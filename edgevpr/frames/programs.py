@@ -2,7 +2,8 @@
 the ribbon cable, read by rpicam-vid; `gst: PIPELINE` is whatever GStreamer can read, by gst-launch-1.0.
 
 The program sends pictures (MJPEG) over loopback, and they are read as any stream is, with its time-outs. So the flight
-loads no library of cameras, and one that hangs does not stop it. The program ends when its reader has gone.
+loads no library of cameras, and one that hangs does not stop it. The program ends with the thread that has started it
+(setpriv), whatever ends that thread: a program left over would keep the camera.
 """
 
 import logging
@@ -11,11 +12,15 @@ import shlex
 import shutil
 import socket
 import subprocess
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from typing import IO
 
 from edgevpr.core.errors import SourceError
+from edgevpr.core.text import shown
 from edgevpr.frames.shot import OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_stream
 
@@ -30,7 +35,13 @@ _PACKAGES = {
 _SIZE_PX, _RATE_HZ, _QUALITY = (1280, 960), 10, 90
 _APPSINK = re.compile(r"!\s*appsink\b[^!]*$")  # as pipelines for OpenCV end
 _WAITING_PICTURES = 10  # of a reader that does not read: older ones are dropped
-_STARTS_S, _LOOK_S, _ENDS_S = 8.0, 0.1, 2.0  # a camera takes a second or two to start
+# From the start to the first picture. A camera takes a second or two, but GStreamer that looks for its plugins, or a
+# sensor behind several drivers, 10 s and more on a small board; and whoever is ended too early starts as slowly again.
+_FIRST_PICTURE_S = 60.0
+_LOOK_S = 0.2
+_ENDS_S = 2.0
+_WORDS_LINES = 20  # of what a program says last
+_WORDS_CHARS = 160  # a longer line explains nothing in a status
 _log = logging.getLogger(__name__)
 
 
@@ -48,9 +59,9 @@ def require_program(uri: str) -> str:
     return found
 
 
-def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture | None":
-    """Start the program for the camera `uri`, and connect to it; None if it gives no picture. `clock` is the monotonic
-    clock, in seconds."""
+def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
+    """Start the program for the camera `uri`, connect to it, and wait for its first picture for as long as it runs, a
+    minute at most. `clock` is the monotonic clock, in seconds. Raises OpeningError if it gives none."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -59,13 +70,15 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture | N
         (_pipeline if is_pipeline else _ribbon)(uri, port),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
     )
-    end_s = time.monotonic() + _STARTS_S
-    while process.poll() is None and time.monotonic() < end_s:
+    words = _LastWords(process.stderr)
+    end_s = time.monotonic() + _FIRST_PICTURE_S
+    while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
-            return ProgramCapture(open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg"), process)
+            return ProgramCapture(open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s), process)
         time.sleep(_LOOK_S)
+    exit_code = process.poll()
     why = (
         f"run `{_PIPELINE} -v` with it to see why, and end it with raw video (video/x-raw)"
         if is_pipeline
@@ -73,7 +86,10 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture | N
     )
     _log.warning("%s gives no picture: %s", uri, why)
     _end(process)
-    return None
+    name = _PIPELINE if is_pipeline else _RIBBON
+    if exit_code is None:
+        raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_S:g} s")
+    raise OpeningError(f"{name} has ended with code {exit_code}{words.after_end()}")
 
 
 class ProgramCapture:
@@ -85,6 +101,10 @@ class ProgramCapture:
     def read(self) -> Shot | Refusal | None:
         return self._stream.read()
 
+    def cancel(self) -> None:
+        self._process.terminate()
+        self._stream.cancel()
+
     def release(self) -> None:
         _end(self._process)  # first: a stream without a sender ends at once
         self._stream.release()
@@ -93,6 +113,7 @@ class ProgramCapture:
 def _ribbon(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon camera to the first who connects to `port`."""
     return [
+        *_ended_with_us("KILL"),
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -102,10 +123,16 @@ def _ribbon(uri: str, port: int) -> list[str]:
 
 def _pipeline(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a pipeline to those who connect to `port`. It does not notice that
-    they have gone, so setpriv has it ended with us."""
+    they have gone."""
     sink = f"sync=false buffers-soft-max={_WAITING_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     sent = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    return ["setpriv", "--pdeathsig", "TERM", require_program(uri), "-q", *_words(uri), *sent.split()]
+    return [*_ended_with_us("TERM"), require_program(uri), "-q", *_words(uri), *sent.split()]
+
+
+def _ended_with_us(name: str) -> tuple[str, ...]:
+    """Return the words before a command that let the kernel send it the signal `name` when our thread ends. GStreamer
+    closes its camera upon TERM; rpicam-vid has nothing to close."""
+    return "setpriv", "--pdeathsig", name
 
 
 def _words(uri: str) -> list[str]:
@@ -119,6 +146,31 @@ def _words(uri: str) -> list[str]:
             f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end."
         )
     return words
+
+
+class _LastWords:
+    """The last lines of what a program says. A thread reads them, as a program whose pipe is full hangs."""
+
+    def __init__(self, pipe: IO[bytes] | None) -> None:
+        assert pipe is not None
+        self._pipe = pipe
+        self._lines: deque[bytes] = deque(maxlen=_WORDS_LINES)
+        self._thread = threading.Thread(target=self._read, name="last words", daemon=True)
+        self._thread.start()
+
+    def after_end(self) -> str:
+        """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
+        self._thread.join(_LOOK_S)
+        lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
+        lines = [line for line in lines if line and len(line) <= _WORDS_CHARS]
+        errors = [line for line in lines if "error" in line.lower()]
+        best = errors[:1] or lines[-1:]
+        return f": {shown(best[0])}" if best else ""
+
+    def _read(self) -> None:
+        with self._pipe:
+            for line in iter(lambda: self._pipe.readline(2 * _WORDS_CHARS), b""):
+                self._lines.append(line)
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

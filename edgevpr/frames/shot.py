@@ -92,10 +92,13 @@ class StreamFacts:
 
 
 class Capture(Protocol):
-    """An open camera or stream, used by one thread from opening to release."""
+    """An open camera or stream, used by one thread from opening to release; only `cancel` is for other threads."""
 
     def read(self) -> Shot | Refusal | None:
         """Wait for the next picture and return it, or the reason why it is rejected; None if the source is lost."""
+
+    def cancel(self) -> None:
+        """Let a `read` that waits return soon, if that is possible. Returns at once."""
 
     def release(self) -> None:
         """Close the camera or the connection."""

@@ -20,7 +20,7 @@ from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
-from edgevpr.frames.shot import Capture, Condition, Refusal, StreamFacts
+from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, StreamFacts
 from edgevpr.frames.twins import TwinCheck
 
 _READ_TIMEOUT_S = 1.0
@@ -40,7 +40,8 @@ class Source:
     `ended`: no more frames will come. `total`: approximate number of frames, 0 if unknown.
     `dropped`: number of pictures not read in time; None for a recording, which drops none.
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
-    `latency_s`: seconds from the taking of the newest picture until it could be read, None if unknown.
+    `latency_s`: seconds from the taking of the newest picture until it could be read, or until now if it is the newest
+    one for long; None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
     `facts`: what a stream states of its pictures, None if unknown.
     `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them.
@@ -178,7 +179,7 @@ def open_source(
     `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
     video the table that `positions.read_track` reads (None: the .csv of the same name beside it, else frames have no
     positions).
-    `live`: allow cameras and streams, which never end. A stream that is not there yet is opened as soon as it is.
+    `live`: allow cameras and streams, which never end. One that is not there yet is opened as soon as it is.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
     for a folder that is flown by its recorded times, the `recorded_steps` (empty: it is not).
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
@@ -227,9 +228,22 @@ def is_by_program(uri: str) -> bool:
     return bool(_BY_PROGRAM.fullmatch(uri))
 
 
+def missing_cause(uri: str) -> str | None:
+    """Return why the device or the .sdp file `uri` cannot be read at present, in a few words; None: it can, or `uri` is
+    neither."""
+    if "://" in uri or is_by_program(uri):
+        return None
+    if not Path(uri).exists():
+        return f"there is nothing at {uri}"
+    if not os.access(uri, os.R_OK):
+        return f"{uri} may not be read by this user: add the user to the group of the file, often `video`"
+    return None
+
+
 def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture | None]:
     """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
-    each must be requested. Raises SourceError if that can never succeed."""
+    each must be requested. Raises SourceError if that can never succeed: a device or a file that is missing may come
+    later."""
     if is_by_program(uri):
         from edgevpr.frames.programs import open_by_program, require_program  # loads FFmpeg
 
@@ -245,14 +259,16 @@ def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callab
             raise SourceError(
                 f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
             )
-    elif not Path(uri).exists():
-        raise SourceError(f"There is nothing at `{uri}`: connect the camera or correct the name.")
-    elif not os.access(uri, os.R_OK):
-        raise SourceError(f"{uri} may not be read by this user: add the user to the group of the file, often `video`.")
     elif uri.startswith("/dev/"):
         from edgevpr.frames.devices import open_device
 
-        return lambda: open_device(uri, clock)
+        return lambda: _if_there(uri, lambda: open_device(uri, clock))
     from edgevpr.frames.streams import open_address  # loads FFmpeg
 
-    return lambda: open_address(uri, clock, period_s)
+    return lambda: _if_there(uri, lambda: open_address(uri, clock, period_s))
+
+
+def _if_there(uri: str, open_capture: Callable[[], Capture | None]) -> Capture | None:
+    if cause := missing_cause(uri):
+        raise OpeningError(cause)
+    return open_capture()

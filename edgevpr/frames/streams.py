@@ -4,8 +4,7 @@ thread receives packets as they come (`Arrivals`), the thread of `frames.live` d
 import threading
 from collections import deque
 from collections.abc import Callable
-from queue import Queue
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 from edgevpr.frames.age import StampedTime, Taken, UnstampedTime
 from edgevpr.frames.causes import TransportError
@@ -19,7 +18,10 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
-READ_TIMEOUT_S = 3.0
+# `frames.live` closes a stream that gives no picture sooner than this: so long it may wait for the second picture of a
+# slow camera. A port of UDP cannot be opened again while FFmpeg still waits at it, so that wait is short.
+READ_TIMEOUT_S = 15.0
+UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
 # packets back to wait for the missing one: at least two. It opens the addresses in an .sdp file only if these protocols
 # are allowed.
@@ -30,6 +32,9 @@ _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
 _TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
+_WAITING_BYTES = 16_000_000  # most bytes of packets that wait for decoding: five seconds of 25 Mbit/s
+_WAITING_PACKETS = 2000
+_CLOSE_S = 0.5  # longest wait for a stream to be closed
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | Snapshots":
@@ -54,22 +59,32 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     return open_stream(uri, clock)
 
 
-def open_stream(uri: str, clock: Callable[[], float], form: str | None = None) -> "StreamCapture":
+def open_stream(
+    uri: str, clock: Callable[[], float], form: str | None = None, open_timeout_s: float | None = None
+) -> "StreamCapture":
     """Open a network stream or an .sdp file, with time-outs. `clock` is the monotonic clock, in seconds; `form`
-    FFmpeg's name of a format without time stamps (None: it finds out). Raises OpeningError with the cause."""
+    FFmpeg's name of a format without time stamps (None: it finds out); `open_timeout_s` the seconds to wait for the
+    first picture (None: the usual ones). Raises OpeningError with the cause."""
     opened_s = clock()
-    return StreamCapture(_open(uri, form), clock, opened_s)
+    return StreamCapture(_open(uri, form, open_timeout_s=open_timeout_s), clock, opened_s)
 
 
-def _open(uri: str, form: str | None = None, file: "SupportsRead[bytes] | None" = None) -> WholePictures:
+def _open(
+    uri: str,
+    form: str | None = None,
+    file: "SupportsRead[bytes] | None" = None,
+    open_timeout_s: float | None = None,
+) -> WholePictures:
     options = _RAW_OPTIONS if form else _OPTIONS if "://" in uri else _SDP_OPTIONS
-    if uri.lower().startswith(("udp:", "rtp:")) and (described := describe_rtp(uri, OPEN_TIMEOUT_S)):
+    is_udp = uri.lower().startswith(("udp:", "rtp:")) or "://" not in uri
+    if is_udp and "://" in uri and (described := describe_rtp(uri, OPEN_TIMEOUT_S)):
         uri, form, options = described[0], "sdp", _SDP_OPTIONS | described[1]
-    timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
+    open_s = open_timeout_s or OPEN_TIMEOUT_S
+    timeouts_s = open_s, UDP_READ_TIMEOUT_S if is_udp else READ_TIMEOUT_S
     try:
         return open_pictures(uri, options, timeouts_s, form, file)
     except TransportError:
-        return open_pictures(uri, _UDP_OPTIONS, timeouts_s)
+        return open_pictures(uri, _UDP_OPTIONS, (open_s, UDP_READ_TIMEOUT_S))
 
 
 class StreamCapture:
@@ -82,7 +97,7 @@ class StreamCapture:
         self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
-        self._arrivals = Arrivals(whole.fetch, clock)
+        self._arrivals = Arrivals(whole.fetch, clock, whole.close)
 
     @property
     def facts(self) -> StreamFacts:
@@ -93,7 +108,9 @@ class StreamCapture:
             arrival = self._arrivals.next()
             if arrival is None:
                 return None
-            fetched, asked_s, t_mono_s = arrival
+            fetched, asked_s, t_mono_s, is_after_gap = arrival
+            if is_after_gap:
+                self._whole.skip()
             came = self._unstamped.taken(asked_s, t_mono_s)
             self._note_stamp(fetched, t_mono_s)
             waited_s = self._clock() - t_mono_s
@@ -105,9 +122,13 @@ class StreamCapture:
             self._ready.extend(self._shot(picture, came, t_mono_s) for picture in pictures)
         return self._ready.popleft()
 
+    def cancel(self) -> None:
+        self._whole.is_cancelled = True
+        self._arrivals.cancel()
+
     def release(self) -> None:
+        self.cancel()
         self._arrivals.close()
-        self._whole.close()
 
     def _note_stamp(self, fetched: Fetched, t_mono_s: float) -> None:
         packet = fetched.packet
@@ -129,44 +150,92 @@ class StreamCapture:
         return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=pixels)
 
 
-# A packet, and when the call that fetched it began and returned (seconds, monotonic).
-Arrival: TypeAlias = tuple[Fetched, float, float]
+class Arrival(NamedTuple):
+    """A packet, and when the call that fetched it began and returned (seconds, monotonic). `is_after_gap`: packets
+    before it were dropped."""
+
+    fetched: Fetched
+    asked_s: float
+    t_mono_s: float
+    is_after_gap: bool = False
 
 
 class Arrivals:
     """A queue filled by a thread that fetches packets as soon as they come. If the board decodes too slowly, packets
-    wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown."""
+    wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown. If more
+    wait than are decoded in time, all are dropped, and those to come up to the next key frame.
 
-    def __init__(self, fetch: Callable[[], Fetched | None], clock: Callable[[], float]) -> None:
-        self._fetch, self._clock, self._is_closing = fetch, clock, False
-        self._waiting: Queue[Arrival | None] = Queue()  # None: the stream is lost
-        self._thread = threading.Thread(target=self._take, name="fetch", daemon=True)
+    The thread closes the stream by `close_stream`, since only it knows when its last fetch has returned: FFmpeg cannot
+    be interrupted, and closing a stream in use would crash the process."""
+
+    def __init__(
+        self, fetch: Callable[[], Fetched | None], clock: Callable[[], float], close_stream: Callable[[], None]
+    ) -> None:
+        self._fetch, self._clock, self._close_stream = fetch, clock, close_stream
+        self._waiting: deque[Arrival] = deque()
+        self._waiting_bytes = 0
+        self._has_gap = self._is_lost = False
+        self._changed = threading.Condition()
+        self._is_unused = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fetch", daemon=True)
         self._thread.start()
 
     def next(self) -> Arrival | None:
-        """Wait for the next packet and return it; None if the stream is lost."""
-        arrival = self._waiting.get()
-        if arrival is None:
-            self._waiting.put(None)
-        return arrival
+        """Wait for the next packet and return it; None if the stream is lost or cancelled."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_lost)
+            if not self._waiting:
+                return None
+            arrival = self._waiting.popleft()
+            self._waiting_bytes -= arrival.fetched.packet.size
+            return arrival
 
     def can_begin_anew(self) -> bool:
         """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
-        with self._waiting.mutex:
-            return any(arrival and arrival[0].packet.is_keyframe for arrival in self._waiting.queue)
+        with self._changed:
+            return any(arrival.fetched.packet.is_keyframe for arrival in self._waiting)
+
+    def cancel(self) -> None:
+        """Drop all packets, and let `next` return None from now on."""
+        with self._changed:
+            self._is_lost = True
+            self._clear()
+            self._changed.notify_all()
 
     def close(self) -> None:
-        """Stop the thread, and wait until its current fetch has returned."""
-        self._is_closing = True
-        self._thread.join()
+        """Let the thread close the stream, as soon as its fetch has returned; wait half a second for it. Nothing of
+        the stream may be used any more."""
+        self.cancel()
+        self._is_unused.set()
+        self._thread.join(_CLOSE_S)
 
-    def _take(self) -> None:
+    def _run(self) -> None:
         try:
-            while not self._is_closing:
+            while not self._is_lost:
                 asked_s = self._clock()
                 fetched = self._fetch()
                 if fetched is None:
                     break
-                self._waiting.put((fetched, asked_s, self._clock()))
+                self._put(fetched, asked_s, self._clock())
         finally:
-            self._waiting.put(None)
+            with self._changed:
+                self._is_lost = True
+                self._changed.notify_all()
+            self._is_unused.wait()
+            self._close_stream()
+
+    def _put(self, fetched: Fetched, asked_s: float, t_mono_s: float) -> None:
+        with self._changed:
+            if self._waiting_bytes > _WAITING_BYTES or len(self._waiting) > _WAITING_PACKETS:
+                self._clear()
+                self._has_gap = True
+            if self._is_lost or (self._has_gap and not fetched.packet.is_keyframe):
+                return
+            self._waiting.append(Arrival(fetched, asked_s, t_mono_s, self._has_gap))
+            self._waiting_bytes += fetched.packet.size
+            self._has_gap = False
+            self._changed.notify_all()
+
+    def _clear(self) -> None:
+        self._waiting.clear()
+        self._waiting_bytes = 0

@@ -104,6 +104,9 @@ class Snapshots:
         sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else answered_s - self._asked_s)
         return Shot(t_mono_s=taken_s, t_sd_s=sd_s, look=coarse(plane), pixels=lambda: image)
 
+    def cancel(self) -> None:
+        """Do nothing: a request lasts a few seconds at most."""
+
     def release(self) -> None:
         """Do nothing: no connection is open between two requests."""
 

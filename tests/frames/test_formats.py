@@ -14,8 +14,8 @@ import pytest
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.decoding import open_pictures
 from edgevpr.frames.depth import DepthRange
+from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.images import read_image
-from edgevpr.frames.live import DeviceCapture
 from edgevpr.frames.source import open_source, read_to_end
 from edgevpr.frames.twins import TwinCheck
 

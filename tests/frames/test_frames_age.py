@@ -1,17 +1,12 @@
 """The time at which pictures of a stream were taken, by their time stamps and by when they arrived."""
 
 import math
-import queue
-import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fakes import FakeClock
 
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import StampedTime, UnstampedTime
-from edgevpr.frames.streams import Arrivals
 
 STEP_S = 0.05
 START_S = 1000.0
@@ -223,70 +218,3 @@ def test_without_stamps_one_that_comes_when_it_is_due_is_new_and_one_that_was_he
     assert time.taken(4.0, 6.0).t_s == 4.0
     assert time.taken(6.0, 6.0005).t_s == 4.0, "it was held up with it"
     assert time.taken(6.1, 6.25).t_s == 6.25
-
-
-class Sender:
-    """Sends what the test gives it; None is the end."""
-
-    def __init__(self, clock):
-        self._clock, self._sent = clock, queue.Queue()
-        self.has_ended = threading.Event()
-
-    def send(self, packet, t_mono_s):
-        self._sent.put((packet, t_mono_s))
-
-    def fetch(self):
-        packet, self._clock.now_s = self._sent.get()
-        if packet is None:
-            self.has_ended.set()
-        if isinstance(packet, Exception):
-            raise packet
-        return packet
-
-
-@pytest.fixture
-def clock():
-    return FakeClock(10.0)
-
-
-@pytest.fixture
-def sender(clock):
-    return Sender(clock)
-
-
-def packet(is_keyframe=False):
-    return SimpleNamespace(packet=SimpleNamespace(is_keyframe=is_keyframe))
-
-
-def test_packets_that_wait_have_the_time_at_which_they_came_and_the_order(clock, sender):
-    packets = [packet(), packet(), packet()]
-    for number, each in enumerate(packets):
-        sender.send(each, 11.0 + number)
-    sender.send(None, 20.0)
-    arrivals = Arrivals(sender.fetch, clock)
-    sender.has_ended.wait(60)
-    found = list(iter(arrivals.next, None))
-    assert found == [(packets[0], 10.0, 11.0), (packets[1], 11.0, 12.0), (packets[2], 12.0, 13.0)]
-    assert arrivals.next() is None, "the stream is still lost"
-
-
-def test_it_is_known_whether_a_key_frame_waits(clock, sender):
-    sender.send(packet(), 11.0)
-    sender.send(packet(is_keyframe=True), 12.0)
-    sender.send(None, 13.0)
-    arrivals = Arrivals(sender.fetch, clock)
-    sender.has_ended.wait(60)
-    arrivals.next()
-    assert arrivals.can_begin_anew()
-    arrivals.next()
-    assert not arrivals.can_begin_anew()
-
-
-def test_a_failure_while_fetching_is_the_loss_of_the_stream(clock, sender, monkeypatch):
-    failures = []
-    monkeypatch.setattr(threading, "excepthook", failures.append)
-    arrivals = Arrivals(sender.fetch, clock)
-    sender.send(MemoryError(), 11.0)
-    assert arrivals.next() is None
-    arrivals.close()
-    assert [failure.exc_type for failure in failures] == [MemoryError]

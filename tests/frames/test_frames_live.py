@@ -1,9 +1,11 @@
 """Live sources on real streams. What is asserted is what happens and in which order, never how fast."""
 
+import itertools
 import queue
 import socket
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +14,11 @@ from live_sources import PATIENCE_S, wait_for
 
 from edgevpr.core.errors import SourceError
 from edgevpr.core.types import FRAME_TIME_SD_S
-from edgevpr.frames.live import DeviceCapture, LiveSource
+from edgevpr.frames import live as live_module
+from edgevpr.frames import liveness
+from edgevpr.frames import source as source_module
+from edgevpr.frames.devices import DeviceCapture
+from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Condition, Refusal, Shot
 from edgevpr.frames.source import open_source
 
@@ -49,7 +55,8 @@ def test_a_stream_that_is_lost_is_noticed_and_opened_again_when_it_is_back(kind,
         assert not source.ended
 
         camera.switch_off()
-        wait_for(lambda: source.read(0.02) is None and source.state.startswith("lost, reopening in "))
+        wait_for(lambda: source.read(0.02) is None and source.condition is Condition.LOST)
+        assert ", reopening in " in source.state
         assert not source.ended
 
         camera.switch_on()
@@ -147,18 +154,20 @@ class SteppedCamera:
 
 
 def test_the_newest_frame_wins_and_the_others_are_counted():
-    camera, clock = SteppedCamera(), iter(range(100)).__next__
+    camera, clock = SteppedCamera(), FakeClock()
     source = LiveSource(lambda: DeviceCapture(camera, clock), clock)
     for value in range(5):
         camera.pictures.put(np.full((20, 20, 3), 9 * value, np.uint8))
     for _ in range(6):  # the sixth call means that the fifth picture has been put away
         camera.taken.acquire()
-    frame = source.read(0)
+    clock.now_s += 1.5
+    frame = next_frame(source)
     assert frame.image[0, 0, 0] == 36
-    assert frame.name == "frame 000004 t=16.000 s"
-    assert frame.t_mono_s == 16
+    assert frame.name == "frame 000004 t=0.000 s"
+    assert frame.t_mono_s == 1000.0
     assert source.dropped == 4
     assert source.read(0) is None
+    wait_for(lambda: source.latency_s == 1.5)  # it grows while no newer picture comes
     camera.pictures.put(None)
     source.close()
 
@@ -173,96 +182,154 @@ def test_the_capture_is_released_by_the_thread_that_reads_it_and_opened_anew():
     assert cameras[0].released.wait(PATIENCE_S)
     wait_for(lambda: source.state == "lost, reopening in 0.5 s")
     cameras[1].taken.acquire()  # the second is being read
-    source.read(0)
-    cameras[1].pictures.put(np.ones((20, 20, 3), np.uint8))
+    next_frame(source)
+    cameras[1].pictures.put(np.full((20, 20, 3), 90, np.uint8))
     assert next_frame(source).name.startswith("frame 000001 ")
     cameras[1].pictures.put(None)
     source.close()
     assert cameras[1].released.is_set()
 
 
-class ScriptedCapture:
-    """A capture that gives shots and refusals; `clock` steps before each, and when all are given it waits."""
-
-    def __init__(self, given, clock, step_s):
-        self._given, self._clock, self._step_s = iter(given), clock, step_s
-        self.is_done, self.may_end = threading.Event(), threading.Event()
-
-    def read(self):
-        self._clock.now_s += self._step_s
-        shot = next(self._given, None)
-        if shot is None:
-            self.is_done.set()
-            self.may_end.wait(PATIENCE_S)
-        return shot
-
-    def release(self):
-        pass
-
-
-def shot(number, t_mono_s=0.0):
+def shot(number, t_mono_s=None):
     picture = np.random.default_rng(number).integers(0, 255, (48, 64), np.uint8)
+    t_mono_s = time.monotonic() if t_mono_s is None else t_mono_s
     return Shot(t_mono_s=t_mono_s, look=picture, pixels=lambda: picture)
 
 
-def condition_after(given, step_s=0.1):
-    """The source after it was given these, one every `step_s`, and was lost; what is read of it, and its condition."""
-    clock = FakeClock()
-    capture = ScriptedCapture(given, clock, step_s)
-    source = LiveSource(lambda: capture, clock)
-    assert capture.is_done.wait(PATIENCE_S)
-    condition, state, frame = source.condition, source.state, source.read(0)
-    capture.may_end.set()
-    source.close()
-    return source, condition, state, frame
+class Camera:
+    """A `Capture` that gives what `shots` yields, and then nothing. It hangs in the step `hangs` (pixels: for each
+    picture), until `go` is set."""
+
+    def __init__(self, shots=(), hangs=None):
+        self._shots, self._hangs, self.go = iter(shots), hangs, threading.Event()
+        self.is_cancelled, self.is_released = threading.Event(), threading.Event()
+
+    def step(self, name):
+        if name == self._hangs:
+            self.go.wait(PATIENCE_S)
+
+    def read(self):
+        self.step("read")
+        given = next(self._shots, None)
+        if isinstance(given, Shot):
+            return replace(given, pixels=lambda: self.step("pixels") or given.pixels())
+        if given is None:
+            self.is_cancelled.wait(PATIENCE_S)
+        return given
+
+    def cancel(self):
+        self.is_cancelled.set()
+
+    def release(self):
+        self.step("release")
+        self.is_released.set()
 
 
+def paced(given, rate_hz=50):
+    for each in given:
+        time.sleep(1 / rate_hz)
+        yield each
+
+
+def live(*cameras):
+    """A source that opens these one after the other, and then finds none."""
+    waiting = iter(cameras)
+
+    def opened():
+        if camera := next(waiting, None):
+            camera.step("open")
+        return camera
+
+    return LiveSource(opened, time.monotonic)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("repeats", "step_s", "condition"),
+    ("given", "condition", "text"),
     [
-        (5, 0.1, Condition.RUNNING),
-        (11, 0.1, Condition.FROZEN),
-        (2, 0.9, Condition.RUNNING),
-        (3, 0.9, Condition.FROZEN),
-        (3, 0.2, Condition.RUNNING),
+        ([], Condition.LOST, "lost: no new picture"),
+        (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is whole"),
+        ((shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture over and over"),
     ],
 )
-def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, condition):
-    source, found, state, frame = condition_after([shot(1), shot(2), *[shot(2)] * repeats], step_s)
-    assert found is condition
-    assert (
-        state == {Condition.RUNNING: "streaming", Condition.FROZEN: "frozen: the same picture over and over"}[condition]
-    )
-    assert frame.name.startswith("frame 000001 "), "only the first of them is a frame"
-    assert source.refused == {"damaged": 0, "patched": 0, "frozen": repeats, "late": 0}
+def test_a_source_without_a_new_picture_is_said_to_be_so_and_opened_anew(given, condition, text):
+    first = Camera(paced(itertools.chain(map(shot, range(5)), given)))
+    second = Camera(paced(map(shot, itertools.count(100))))
+    source = live(first, second)
+    wait_for(lambda: source.read(0.1) is None and source.condition is condition)
+    assert source.state.startswith(text)
+    assert not first.is_released.is_set() or condition is Condition.LOST
+    wait_for(lambda: first.is_released.is_set() and source.condition is Condition.RUNNING)
+    assert next_frame(source)
+    assert source.state == "streaming"
+    source.close()
 
 
-def test_a_frozen_source_is_back_with_its_next_new_picture():
-    _, condition, state, frame = condition_after([*[shot(1)] * 30, shot(2)])
-    assert (condition, state) == (Condition.RUNNING, "streaming")
-    assert frame.name.startswith("frame 000001 ")
-
-
-def test_a_stream_of_which_nothing_is_whole_is_damaged_after_five_seconds():
-    refusals = [Refusal.DAMAGED] * 51
-    assert condition_after([shot(1), *refusals[:-2]])[1] is Condition.RUNNING
-    source, condition, state, frame = condition_after(refusals)
-    assert (condition, state, frame) == (Condition.DAMAGED, "damaged: no picture is whole", None)
-    assert source.refused["damaged"] == 51
+@pytest.mark.slow
+def test_a_picture_that_a_server_has_kept_is_not_new_after_a_loss():
+    kept = [shot(1), shot(2), shot(3)]
+    source = live(Camera(kept), Camera(itertools.chain(paced([kept[-1]] * 30), map(shot, range(50, 52)))))
+    wait_for(lambda: source.refused["frozen"] >= 30)
+    assert source.read(0.0) is None or source.refused["frozen"] == 30
+    wait_for(lambda: source.read(0.1))
+    source.close()
 
 
 def test_a_picture_that_is_older_than_the_one_before_is_refused_and_the_age_of_the_newest_is_known():
-    source, _, _, frame = condition_after([shot(1, 998.1), shot(2, 998.0)])
-    assert frame.t_mono_s == 998.1
-    assert source.refused["late"] == 1
-    assert source.latency_s == pytest.approx(2.0)
+    clock = FakeClock()
+    camera = Camera([shot(1, 998.1), shot(2, 998.0)])
+    source = LiveSource(lambda: camera, clock)
+    assert next_frame(source).t_mono_s == 998.1
+    wait_for(lambda: source.refused["late"] == 1)
+    assert source.latency_s == pytest.approx(1.9)
+    source.close()
 
 
-def test_a_source_of_unknown_age_is_late_after_five_seconds_and_says_why():
-    _, condition, state, frame = condition_after([shot(1), *[Refusal.LATE] * 51])
-    assert condition is Condition.LATE
-    assert state.startswith("late: the age of its pictures is unknown")
-    assert frame.name.startswith("frame 000000 ")
+@pytest.mark.slow
+@pytest.mark.parametrize("step", ["open", "read", "pixels", "release"])
+def test_a_call_that_hangs_is_given_up_and_holds_nobody(step, monkeypatch):
+    monkeypatch.setattr(live_module, "_OPENING_S", 1.0)
+    monkeypatch.setattr(liveness, "_UNKNOWN_RATE_S", 1.0)
+    shots = map(shot, range(3)) if step == "release" else map(shot, itertools.count())
+    hanging = Camera(itertools.chain(paced(shots), [None]), step)
+    hanging.is_cancelled.set()  # it is lost, rather than silent
+    source = live(hanging, Camera(paced(map(shot, itertools.count(1000)))))
+    wait_for(lambda: source.read(0.1) is None and source.condition is Condition.LOST)
+    wait_for(lambda: source.read(0.1))
+    assert source.condition is Condition.RUNNING
+    source.close()
+    assert source.ended
+    hanging.go.set()
+    assert hanging.is_released.wait(PATIENCE_S)
+
+
+def test_a_source_that_hangs_each_time_takes_no_more_than_three_threads(monkeypatch):
+    monkeypatch.setattr(live_module, "_OPENING_S", 0.2)
+    monkeypatch.setattr(live_module, "_FIRST_WAIT_S", 0.01)
+    opened, go = [], threading.Event()
+    source = LiveSource(lambda: opened.append(1) or (go.wait(PATIENCE_S) and None), time.monotonic)
+    wait_for(lambda: source.state == "lost: the opening hangs; 3 calls into it hang")
+    assert len(opened) == 3
+    go.set()
+    wait_for(lambda: len(opened) > 3)
+    source.close()
+
+
+def test_an_error_of_a_driver_is_a_loss_with_its_words():
+    def broken():
+        raise ValueError("no such codec")
+
+    source = LiveSource(broken, time.monotonic)
+    wait_for(lambda: source.state == "ValueError: no such codec, reopening in 0.5 s")
+    source.close()
+
+
+def test_a_picture_that_cannot_be_converted_is_left_out():
+    broken = replace(shot(1), pixels=lambda: 1 / 0)
+    camera = Camera(paced([broken, *map(shot, range(2, 20))], 20))
+    source = live(camera)
+    assert next_frame(source)
+    source.close()
 
 
 def test_a_picture_of_a_device_that_may_have_waited_is_known_less_well_in_time():
@@ -280,18 +347,37 @@ def test_a_picture_of_a_device_that_may_have_waited_is_known_less_well_in_time()
 
 def test_the_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch):
     waits_s = []
-    source = LiveSource(lambda: None, time.monotonic)
+
+    class Closing(threading.Event):
+        def wait(self, timeout_s):
+            waits_s.append(timeout_s)
+            return super().is_set()
+
+        def is_set(self):
+            return len(waits_s) >= 7
+
+    source = live()
     source.close()
-    monkeypatch.setattr(source._closing, "is_set", lambda: len(waits_s) == 7)
-    monkeypatch.setattr(source._closing, "wait", waits_s.append)
-    source._capture()
+    monkeypatch.setattr(source, "_closing", Closing())
+    source._keep_open()
     assert waits_s == [0.5, 1, 2, 4, 8, 10, 10]
+
+
+@pytest.mark.parametrize("name", ["video97", "camera.sdp"])
+def test_a_device_that_comes_late_is_waited_for(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(source_module, "is_live", lambda uri: True)
+    path = tmp_path / name
+    source = open_source(str(path), live=True)
+    wait_for(lambda: source.state.startswith(f"there is nothing at {path}, reopening in "))
+    assert source.condition is Condition.LOST
+    path.write_text("v=0")
+    wait_for(lambda: not source.state.startswith(f"there is nothing at {path}"))
+    source.close()
 
 
 @pytest.mark.parametrize(
     ("uri", "complaint"),
     [
-        ("/dev/video97", "There is nothing at `/dev/video97`: connect the camera"),
         ("missing.mp4", "There is nothing at `missing.mp4`: give a folder of images, a video file, a camera"),
         *(
             (uri, f"{uri} is no address of a stream")

@@ -22,17 +22,23 @@ from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _HEALTH_S, _MINUTE_S = 1.0, 60.0
+_START_S = 10.0  # from the start to a camera's first picture, if nothing is to be said of it
+# Without a query, while pictures come and none is paused: more than a query takes on the slowest board, and rarer ones
+# than asked for are due to something that hangs.
+_UNEXPLAINED_S = 30.0
+_UNEXPLAINED_QUERIES = 3
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
 
 _log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Pings the watchdog of systemd, and reports once a second how the flight goes to systemd and to the status file,
-    and the state of this computer to the autopilot; once a minute also to the terminal, if it was started on one. It
-    reports once, through the herald, when the camera is lost, frozen, damaged or shows nothing, when nothing can be
-    recognised any more, when this computer is hot, throttled or short of voltage, and when each of these is over.
-    `remarks` returns sentences for the status; those that are None are left out."""
+    """Pings the watchdog of systemd while queries come, or what keeps them off is reported. Reports once a second how
+    the flight goes to systemd and to the status file, and the state of this computer to the autopilot; once a minute
+    also to the terminal, if it was started on one. It reports once, through the herald, when the camera is lost,
+    frozen, damaged or shows nothing, when nothing can be recognised any more, when this computer is hot, throttled or
+    short of voltage, and when each of these is over. `remarks` returns sentences for the status; those that are None
+    are left out."""
 
     def __init__(
         self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Callable[[], Sequence[str | None]]
@@ -42,16 +48,19 @@ class Vitals:
         self._watchdog_due_s = self._health_due_s = crew.clock.mono_s()
         self._minute_due_s = self._health_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
         self._source_trouble: str | None = None
+        self._start_s = self._explained_s = self._health_due_s
         self._has_log = True
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
         self._failing = Trouble(crew.herald, "failing", failing, "frames are recognised again")
         self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
         self._companion = CompanionWatch(crew.herald)
+        self._has_event = False
         self._newest: dict[str, Any] | None = None
         self._match: dict[str, Any] | None = None
 
     def tell(self, event: Recognition) -> None:
         """Keep an event for the status, if it is a query."""
+        self._has_event = True
         if event.frame and event.is_query:
             self._newest = {"t_frame_s": event.frame.t_mono_s, **_seen(event)}
             self._match = self._newest if event.accepted else self._match
@@ -59,7 +68,7 @@ class Vitals:
     def beat(self) -> None:
         """Ping the watchdog and report, if due, and log the answers to fixes. Call it in every pass of the loop."""
         now_s = self._crew.clock.mono_s()
-        if self._watchdog_s and now_s >= self._watchdog_due_s:
+        if self._watchdog_s and now_s >= self._watchdog_due_s and self._is_explained(now_s):
             systemd.notify(WATCHDOG=1)
             self._watchdog_due_s = now_s + self._watchdog_s
         if self._crew.autopilot:
@@ -68,6 +77,13 @@ class Vitals:
             self._health_due_s = now_s + _HEALTH_S
             self._crew.flight_log.sync_due(now_s)
             self._report()
+
+    def _is_explained(self, now_s: float) -> bool:
+        """Tell whether queries come, or something that is reported explains that none does."""
+        is_awaited = self._crew.source.is_live and not (self._source_trouble or self._commands.is_paused)
+        if self._has_event or not is_awaited:
+            self._explained_s, self._has_event = now_s, False
+        return now_s - self._explained_s < max(_UNEXPLAINED_S, _UNEXPLAINED_QUERIES / self._pace.rate_hz)
 
     def _report(self) -> None:
         crew = self._crew
@@ -90,7 +106,10 @@ class Vitals:
 
     def _look_at_source(self) -> None:
         source = self._crew.source
-        trouble = _TROUBLES.get(source.condition)
+        condition = source.condition
+        trouble = _TROUBLES.get(condition)
+        if condition is Condition.OPENING and self._health_due_s - self._start_s > _START_S:
+            trouble = "gives no picture yet"
         if trouble == self._source_trouble:
             return
         self._source_trouble = trouble
@@ -123,7 +142,7 @@ class Vitals:
     def _status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
         """Return the status of the flight. Its keys that need a word (null: unknown):
         - `t_mono_s`: the `time` on the clock of the frames; `health`: the state that heartbeats tell
-        - `latency_s`: age of the newest picture when it could be read
+        - `latency_s`: age of the newest picture when it could be read, and while no newer one comes, now
         - `asked_rate_hz`: queries per second that the flight tries to keep
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
         - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)

@@ -4,7 +4,9 @@ recording's tape. The code of the flight is the same."""
 
 import ctypes
 import logging
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -45,6 +47,10 @@ _log = logging.getLogger(__name__)
 # size on a part of memory is given back to the system as soon as it is freed. Left alone, glibc raises both as larger
 # parts are freed: a flight over many places then holds more than it uses. At half of these it is slower.
 _MALLOC = {-1: 8_000_000, -3: 4_000_000}
+
+
+_TELL_S = 0.3
+_END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
 
 
 class StopNow(BaseException):
@@ -220,13 +226,40 @@ def _or_without(opened: Callable[[], T]) -> T | None:
 
 @contextmanager
 def _signals(stop: Stop) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT call `stop` inside it. SIGHUP is ignored: a closed terminal ends no
-    flight."""
+    """Context manager: SIGTERM and SIGINT call `stop` inside it, and end the process if that has not left it after four
+    seconds. SIGHUP is ignored: a closed terminal ends no flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
     handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    # Python calls `stop` in the main thread only, once that has returned from where it is, which may be a call that
+    # hangs. The number of the signal is written here at once.
+    before_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    has_ended = threading.Event()
+    watch = threading.Thread(target=_end_in_time, args=(reader, has_ended), name="end", daemon=True)
+    watch.start()
     try:
         yield
     finally:
+        signal.set_wakeup_fd(before_writer)
         for number, handler in before.items():
             signal.signal(number, handler)
+        has_ended.set()
+        os.close(writer)
+        watch.join()
+        os.close(reader)
+
+
+def _end_in_time(reader: int, has_ended: threading.Event) -> None:
+    """Wait for a signal from the pipe `reader` that ends the flight, then for `has_ended`. End the process if that does
+    not come in time. The lines of the flight log are in its file by then; memory and locks of a thread that hangs are
+    given back by the kernel alone."""
+    while number := os.read(reader, 1):
+        if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_END_S):
+            text = "the flight does not end by itself: its process is ended"
+            # In a thread, as the one that hangs may be within a message.
+            telling = threading.Thread(target=_log.warning, args=(text,), daemon=True)
+            telling.start()
+            telling.join(_TELL_S)
+            os._exit(1)

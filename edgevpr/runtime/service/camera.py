@@ -19,7 +19,7 @@ from edgevpr.power import machine
 from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.service.finding import Finding, device, fine, looked_at, wrong
 
-FRAME_WAIT_S = 15.0  # longer than any source takes to say that it is lost
+FRAME_WAIT_S = 65.0  # longer than any source takes to say that it is lost; a pipeline that starts slowly takes most
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
 _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
@@ -78,7 +78,7 @@ def _ribbon(uri: str, program: str, root: Path) -> Finding:
 
 
 def frame_seen(config: SourceConfig) -> str:
-    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 15 s, or
+    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 65 s, or
     if it is too old for a flight, ImageError if it does not fit the lens, and ConfigError for a calibration that cannot
     be used."""
     assert config.uri is not None
@@ -100,7 +100,7 @@ def frame_seen(config: SourceConfig) -> str:
 
 
 def _frame_size(source: Source, uri: str) -> tuple[int, int]:
-    """Wait for a frame, 15 s at most; return its width and height in pixels."""
+    """Wait for a frame, 65 s at most; return its width and height in pixels."""
     begin_s = time.monotonic()
     is_hopeless = False
     while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:

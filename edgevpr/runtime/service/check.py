@@ -8,10 +8,10 @@ from contextlib import closing
 from pathlib import Path
 
 from edgevpr.core.config import Config, load_config
-from edgevpr.core.errors import EdgevprError, LinkError, MapError, UsageError
+from edgevpr.core.errors import EdgevprError, LinkError, MapError, SourceError, UsageError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import open_source, recorded_steps
+from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_steps
 from edgevpr.mavlink.address import LinkAddress, parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
@@ -105,6 +105,8 @@ def _source(config: Config, offline: bool) -> str:
     if not offline:
         return frame_seen(config.source)
     calibrated_lens(config.source)
+    if is_live(uri) and (cause := missing_cause(uri)):
+        raise SourceError(f"The camera is not there ({cause}): connect it, or correct `source: {{uri: ...}}`.")
     with closing(open_source(uri, live=True)) as source:
         # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.
         while source.condition is Condition.OPENING:

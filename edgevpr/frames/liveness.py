@@ -1,0 +1,95 @@
+"""When a live source counts as lost, frozen or damaged, and when it is to be opened anew: by the time since its last
+new picture, whatever else arrives (sound, damaged pictures, repeats)."""
+
+from collections import deque
+from dataclasses import dataclass
+from statistics import median_low
+
+from edgevpr.frames.shot import Condition, Refusal
+
+LOST_S = 3.0  # without a new picture, for a source that has given more than one in this time
+# A source of which no rate is known yet: a key frame comes every ten seconds at most, a still picture of a slow camera
+# as well.
+_UNKNOWN_RATE_S = 12.0
+_INTERVALS = 5  # pictures by which the rate of a source is known
+_MISSED_INTERVALS = 2.5  # a slow source is lost if it leaves out two pictures,
+_LONGEST_S = 30.0  # or gives none for so long
+_FROZEN_S = 1.0
+_FROZEN_PICTURES = 3  # repeats, beside the time: a slow camera may take less than three pictures a second
+_DAMAGED_REOPEN_S = 5.0  # longer than streams need to recover from a lost packet
+_FROZEN_REOPEN_S = 5.0  # and twice as long each time that it has not helped, up to:
+_LONGEST_FROZEN_S = 30.0
+_LATE = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
+_LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong with a source, in words for people; `must_reopen`: it has lasted so long that only opening the
+    source anew may help."""
+
+    condition: Condition
+    text: str
+    must_reopen: bool
+
+
+class Liveness:
+    """Judges a source by what it gives. Times are in seconds of the monotonic clock."""
+
+    def __init__(self) -> None:
+        self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)
+        self._last_new_s: float | None = None
+        self._since_s = 0.0
+        self._is_rate_known = False
+        self._refusal: Refusal | None = None
+        self._repeats = 0
+        self._frozen_reopen_s = _FROZEN_REOPEN_S
+        self._is_doubtful = False
+
+    def open(self, now_s: float) -> None:
+        """Note that the source is open (again)."""
+        self._since_s, self._is_rate_known = now_s, False
+        self._refusal, self._repeats = None, 0
+
+    def take(self, now_s: float) -> Refusal | None:
+        """Note a picture that differs from those before it. Returns why it is no new one: the first after a source was
+        opened anew because it was frozen may be the frozen picture in another coding. Only the next one tells."""
+        if self._is_doubtful:
+            self._is_doubtful = False
+            return Refusal.FROZEN
+        if self._last_new_s is not None:
+            self._intervals_s.append(now_s - self._last_new_s)
+        self._since_s = self._last_new_s = now_s
+        self._is_rate_known = bool(self._intervals_s)
+        self._refusal, self._repeats = None, 0
+        self._frozen_reopen_s = _FROZEN_REOPEN_S
+        return None
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Note a picture that was rejected."""
+        self._refusal = refusal
+        self._repeats = self._repeats + 1 if refusal is Refusal.FROZEN else 0
+
+    def fault(self, now_s: float) -> Fault | None:
+        """Return what is wrong with the source at this time (None: nothing)."""
+        silent_s, usual_s = now_s - self._since_s, LOST_S
+        if self._is_rate_known:
+            usual_s = min(max(LOST_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _LONGEST_S)
+        limit_s = usual_s if self._is_rate_known else _UNKNOWN_RATE_S
+        if self._repeats >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
+            must_reopen = silent_s > max(self._frozen_reopen_s, usual_s)
+            return Fault(Condition.FROZEN, "frozen: the same picture over and over", must_reopen)
+        if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
+            must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
+            return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
+        if self._refusal is Refusal.LATE and silent_s > usual_s:
+            return Fault(Condition.LATE, _LATE, silent_s > _LATE_REOPEN_S)
+        if silent_s > limit_s:
+            return Fault(Condition.LOST, "lost: no new picture", True)
+        return None
+
+    def reopen(self, fault: Fault) -> None:
+        """Note that the source is opened anew because of this fault."""
+        if fault.condition is Condition.FROZEN:
+            self._is_doubtful = True
+            self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _LONGEST_FROZEN_S)

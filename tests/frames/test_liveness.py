@@ -1,0 +1,110 @@
+"""When a source counts as lost, damaged or frozen, and is opened anew."""
+
+import pytest
+
+from edgevpr.frames.liveness import Liveness
+from edgevpr.frames.shot import Condition, Refusal
+
+
+def liveness(*new_s, opened_s=0.0):
+    """That of a source opened at `opened_s`, with new pictures at these times."""
+    found = Liveness()
+    found.open(opened_s)
+    for t_s in new_s:
+        assert found.take(t_s) is None
+    return found
+
+
+def begins_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
+    """Seconds from `start_s` until a fault is `wanted`, of a source of which every picture is refused so."""
+    for step in range(1, 1000):
+        if refusal:
+            watched.refuse(refusal)
+        if (fault := watched.fault(start_s + step * every_s)) and wanted(fault):
+            return pytest.approx(step * every_s, abs=1.5 * every_s)
+    return None
+
+
+def is_(condition):
+    return lambda fault: fault.condition is condition
+
+
+def must_reopen(fault):
+    return fault.must_reopen
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "lost_s"), [(0.04, 3.0), (1.0, 3.0), (2.0, 5.0), (5.0, 12.5), (10.0, 25.0), (20.0, 30.0)]
+)
+def test_a_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, lost_s):
+    watched = liveness(*(number * interval_s for number in range(8)))
+    assert begins_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
+    assert begins_s(watched, must_reopen, 7 * interval_s) == lost_s
+
+
+def test_the_first_picture_and_the_second_of_a_slow_camera_are_waited_for():
+    assert begins_s(liveness(), is_(Condition.LOST)) == 12.0
+    assert begins_s(liveness(1.0), is_(Condition.LOST), 1.0) == 12.0
+    assert liveness(0.0, 5.0).fault(10.0) is None
+
+
+def test_a_source_opened_anew_is_given_time_for_a_key_frame_and_keeps_its_rate():
+    watched = liveness(0.0, 0.1, 0.2)
+    watched.open(20.0)
+    assert begins_s(watched, is_(Condition.LOST), 20.0) == 12.0
+    watched.take(25.0)
+    assert begins_s(watched, is_(Condition.LOST), 25.0) == 3.0
+
+
+def test_one_long_pause_does_not_make_a_source_slow():
+    watched = liveness(0.0, 0.1, 0.2, 60.0, 60.1)
+    assert begins_s(watched, is_(Condition.LOST), 60.1) == 3.0
+
+
+def test_a_source_of_which_no_picture_is_whole_is_damaged_and_opened_anew():
+    watched = liveness(0.0, 0.1)
+    assert begins_s(watched, is_(Condition.DAMAGED), 0.1, Refusal.DAMAGED) == 3.0
+    assert begins_s(watched, must_reopen, 0.1, Refusal.DAMAGED) == 5.0
+    assert begins_s(liveness(), must_reopen, 0.0, Refusal.DAMAGED) == 12.0, "a key frame may be ten seconds away"
+
+
+def test_a_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
+    watched = liveness(0.0, 0.1)
+    assert begins_s(watched, is_(Condition.LATE), 0.1, Refusal.LATE) == 3.0
+    assert "the age of its pictures is unknown" in watched.fault(4.0).text
+    assert begins_s(watched, must_reopen, 0.1, Refusal.LATE) == 30.0
+
+
+@pytest.mark.parametrize(
+    ("repeats", "step_s", "is_frozen"),
+    [(5, 0.1, False), (11, 0.1, True), (2, 0.9, False), (3, 0.9, True), (3, 0.2, False)],
+)
+def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
+    watched = liveness(0.0, 0.1)
+    for _ in range(repeats):
+        watched.refuse(Refusal.FROZEN)
+    fault = watched.fault(0.1 + repeats * step_s)
+    assert (fault is not None and fault.condition is Condition.FROZEN) == is_frozen
+
+
+def test_a_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
+    watched, waits_s = liveness(0.0, 0.1), []
+    for _ in range(5):
+        watched.open(0.0)
+        waits_s.append(begins_s(watched, must_reopen, 0.0, Refusal.FROZEN))
+        watched.reopen(watched.fault(100.0))
+    assert waits_s == [5.0, 10.0, 20.0, 30.0, 30.0]
+    watched.open(0.0)
+    assert watched.take(0.1) is Refusal.FROZEN, "it may be the frozen picture, coded in another way"
+    assert watched.take(0.2) is None
+    assert begins_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
+
+
+def test_a_new_picture_ends_every_fault():
+    for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
+        watched = liveness(0.0, 0.1)
+        for _ in range(20):
+            watched.refuse(refusal)
+        assert watched.fault(10.0)
+        watched.take(10.1)
+        assert watched.fault(10.2) is None
