@@ -84,7 +84,7 @@ class FakeSource:
         self.dropped = 0 if is_live else None
         self.refused = {"damaged": 0, "patched": 0, "frozen": 0, "late": 0} if is_live else {"damaged": 0}
         self.latency_s = 0.0 if is_live else None
-        self.is_lost = self.is_frozen = False
+        self.is_lost = self.is_frozen = self.is_opening = False
         self._read = 0
 
     @property
@@ -97,6 +97,8 @@ class FakeSource:
             return Condition.LOST
         if self.is_frozen:
             return Condition.FROZEN
+        if self.is_opening:
+            return Condition.OPENING
         return Condition.ENDED if self.ended else Condition.RUNNING
 
     @property
@@ -104,6 +106,7 @@ class FakeSource:
         words = {
             Condition.LOST: "lost, reopening in 0.5 s",
             Condition.FROZEN: "frozen: the same picture over and over",
+            Condition.OPENING: "opening, no picture yet",
             Condition.ENDED: "ended",
             Condition.RUNNING: "streaming" if self.is_live else "reading",
         }

@@ -82,7 +82,8 @@ class Liveness:
         if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
             must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
             return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
-        if self._refusal is Refusal.LATE and silent_s > usual_s:
+        if silent_s > limit_s and self._refusal is Refusal.LATE:
+            # Before the first picture they may only wait for a key frame, or be too few to know their age by.
             return Fault(Condition.LATE, _LATE, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:
             return Fault(Condition.LOST, "lost: no new picture", True)

@@ -76,7 +76,10 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     end_s = time.monotonic() + _FIRST_PICTURE_S
     while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
-            return ProgramCapture(open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s), process)
+            stream = open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s)
+            if time.monotonic() < end_s:
+                return ProgramCapture(stream, process)
+            stream.release()  # FFmpeg calls a stream open when its time is over, without a picture too
         time.sleep(_LOOK_S)
     exit_code = process.poll()
     why = (

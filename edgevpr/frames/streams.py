@@ -23,11 +23,12 @@ OPEN_TIMEOUT_S = 5.0
 READ_TIMEOUT_S = 15.0
 UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
-# packets back to wait for the missing one: at least two. It opens the addresses in an .sdp file only if these protocols
+# packets back to wait for the missing one: at least two. Its search for the rate, which nobody needs here, takes longer
+# than the opening may where a picture comes each second. It opens the addresses in an .sdp file only if these protocols
 # are allowed.
-_OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2"}
+_OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": "0"}
 # Some cameras send RTSP by UDP only. FFmpeg then waits 0.1 s for a packet that is missing, and reports it.
-_UDP_OPTIONS = {"rtsp_transport": "udp"}
+_UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
 _BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived

@@ -2,7 +2,7 @@
 of --output, and sends it MJPEG until the reader goes or it is told to end.
 
 With --list-cameras it lists one. FAKE_RPICAM in the environment: `absent` ends at once as without a camera, or lists
-none; `hangs` sends a few pictures and then none.
+none; `hangs` sends a few pictures and then none; `slow` takes seconds to the first.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import numpy as np
 
 FLAGS = ("camera", "timeout", "codec", "quality", "framerate", "width", "height", "output", "verbose")
 HANGS_AFTER = 8
+SLOW_S = 6.5  # longer than streams may take to open
 
 
 LISTED = (
@@ -40,6 +41,8 @@ def main() -> None:
     host, _, port = given.output.removeprefix("tcp://").rpartition(":")
     with socket.create_server((host, int(port))) as listener:
         reader, _ = listener.accept()
+    if how == "slow":
+        time.sleep(SLOW_S)
     rng = np.random.default_rng(0)
     for number in range(10**9):
         if how == "hangs" and number == HANGS_AFTER:

@@ -13,6 +13,7 @@ import pytest
 from live_sources import wait_for
 
 from edgevpr.core.errors import SourceError
+from edgevpr.frames import programs
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import is_live, open_source
 
@@ -67,10 +68,49 @@ def test_a_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
     wait_for(lambda: source.read(1.0))
 
 
+def test_a_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
+    monkeypatch.setenv("FAKE_RPICAM", "slow")
+    before = running()
+    source = rpicam()
+    (process,) = wait_for(lambda: running() - before)
+    assert wait_for(lambda: source.read(1.0))
+    assert running() - before == {process}, "it was not started anew"
+
+
+def test_a_program_that_gives_no_picture_for_long_is_started_anew(rpicam, monkeypatch):
+    monkeypatch.setattr(programs, "_FIRST_PICTURE_S", 1.0)
+    monkeypatch.setenv("FAKE_RPICAM", "slow")
+    source = rpicam()
+    wait_for(lambda: source.state.startswith("no picture from rpicam-vid in 1 s, reopening in "))
+    monkeypatch.delenv("FAKE_RPICAM")
+    monkeypatch.setattr(programs, "_FIRST_PICTURE_S", 60.0)
+    wait_for(lambda: source.read(1.0))
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("", ""),
+        ("ERROR: no such device\nAdditional debug info:\nv4l2.c(616)", ": ERROR: no such device"),
+        ("x" * 5000 + "\nSegmentation fault", ": Segmentation fault"),
+        ("\n" * 30000 + "no\x1b[31m", ": no\\x1b[31m"),
+    ],
+)
+def test_the_last_words_of_a_program_are_its_error_if_it_is_short(said, words):
+    program = subprocess.Popen(["printf", "%b", said], stdout=subprocess.PIPE)
+    found = programs._LastWords(program.stdout)
+    program.wait()
+    assert wait_for(lambda: not found._thread.is_alive())
+    assert found.after_end() == words
+
+
 def test_a_camera_that_is_not_there_is_said_and_looked_for_again(rpicam, monkeypatch, caplog):
     monkeypatch.setenv("FAKE_RPICAM", "absent")
     source = rpicam()
     wait_for(lambda: source.condition is Condition.LOST)
+    assert source.state.startswith(
+        "rpicam-vid has ended with code 1: ERROR: *** no cameras available ***, reopening in"
+    )
     assert "--list-cameras" in caplog.text
     monkeypatch.delenv("FAKE_RPICAM")
     wait_for(lambda: source.read(1.0))

@@ -73,6 +73,8 @@ def test_a_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
     assert begins_s(watched, is_(Condition.LATE), 0.1, Refusal.LATE) == 3.0
     assert "the age of its pictures is unknown" in watched.fault(4.0).text
     assert begins_s(watched, must_reopen, 0.1, Refusal.LATE) == 30.0
+    first = liveness()
+    assert begins_s(first, is_(Condition.LATE), 0.0, Refusal.LATE) == 12.0, "it may wait for a key frame"
 
 
 @pytest.mark.parametrize(

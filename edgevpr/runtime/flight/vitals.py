@@ -25,7 +25,7 @@ _HEALTH_S, _MINUTE_S = 1.0, 60.0
 _START_S = 10.0  # from the start to a camera's first picture, if nothing is to be said of it
 # Without a query, while pictures come and none is paused: more than a query takes on the slowest board, and rarer ones
 # than asked for are due to something that hangs.
-_UNEXPLAINED_S = 30.0
+_UNEXPLAINED_S = 45.0
 _UNEXPLAINED_QUERIES = 3
 _TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
 

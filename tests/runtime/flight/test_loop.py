@@ -7,6 +7,7 @@ from pictures import textured
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
+from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.world import Stop, StopNow
@@ -172,3 +173,27 @@ def test_a_source_without_a_frame_leaves_the_loop_turning(recording, tmp_path, c
     assert source.turns == 20
     beats = [each for each in flown.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     assert len(beats) == pytest.approx(4, abs=1), "once a second of the four"
+
+
+@pytest.mark.parametrize(
+    ("trouble", "fed_s"), [(None, 45), ("is_lost", 100), ("is_frozen", 100), ("is_opening", 100), ("recording", 100)]
+)
+def test_the_watchdog_is_fed_while_it_is_known_why_no_query_comes(
+    recording, tmp_path, clock, monkeypatch, trouble, fed_s
+):
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    fed = []
+    monkeypatch.setattr(systemd, "notify", lambda **said: "WATCHDOG" in said and fed.append(clock.now_s))
+    flown = flight(recording, tmp_path, clock, **{"source.rate_hz": 2.0})
+
+    class Silent(FakeSource):
+        def read(self, timeout_s):
+            clock.now_s += timeout_s
+            return None if clock.now_s < start_s + 100 else super().read(timeout_s)
+
+    start_s, source = clock.now_s, Silent([PICTURE], clock, is_live=trouble != "recording")
+    if trouble:
+        setattr(source, trouble, True)
+    flown.fly(source)
+    assert max(fed) - start_s == pytest.approx(fed_s, abs=2)

@@ -1,0 +1,117 @@
+"""Flights that are processes of their own, of which a call into the camera, or the main thread, never returns: what is
+said of it, that SIGTERM ends them, and what systemd's watchdog hears."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+from flight_process import start
+from flights import of_kind
+
+from edgevpr.runtime.flight.flightlog import read_log
+from edgevpr.runtime.flight.status import read_status
+
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+
+HANGING = Path(__file__).parents[2] / "hanging_camera.py"
+PATIENCE_S = 60.0
+END_S = 30.0  # it takes five; by far less than for ever, on a busy machine too
+
+
+def wait_for(condition):
+    give_up_s = time.monotonic() + PATIENCE_S
+    while not (result := condition()):
+        assert time.monotonic() < give_up_s, "nothing happened"
+        time.sleep(0.05)
+    return result
+
+
+@pytest.fixture
+def hanging(recording, tmp_path):
+    """Start a flight whose camera hangs in a step; returns it once it hangs."""
+    flights = []
+
+    def started(step, **environment):
+        (tmp_path / "c.yaml").write_text(f"status: {{file: {tmp_path / 'status.json'}}}\n")
+        run = ["run", "--map", recording / "cohog.gpkg", "--source", "/dev/video0", "--log", tmp_path / "f.jsonl"]
+        flags = ["--rate-hz", "5", "--config", tmp_path / "c.yaml"]
+        command = [sys.executable, HANGING, step, tmp_path / "mark", *run, *flags]
+        flight = subprocess.Popen(
+            list(map(str, command)), stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}
+        )
+        flights.append(flight)
+        wait_for((tmp_path / "mark").exists)
+        return flight
+
+    yield started
+    for each in flights:
+        each.kill()
+        each.wait()
+        each.stderr.close()
+
+
+@pytest.mark.parametrize("step", ["read", "pixels", "release"])
+def test_a_camera_that_hangs_is_reported_as_lost_and_the_flight_ends_when_asked(hanging, step, tmp_path):
+    flight = hanging(step)
+    status = wait_for(
+        lambda: (found := read_status(tmp_path / "status.json")) and "lost" in found[0]["source"] and found
+    )
+    assert status[0]["health"] == "CRITICAL"
+    flight.terminate()
+    assert flight.wait(END_S) == 0
+    lines = list(read_log(tmp_path / "f.jsonl"))
+    assert lines[-1]["kind"] == "end"
+    assert "lost" in of_kind(lines, "source")[0]["state"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_camera_whose_opening_hangs_holds_no_flight(hanging, number, tmp_path):
+    flight = hanging("open")
+    wait_for(lambda: read_status(tmp_path / "status.json"))
+    flight.send_signal(number)
+    assert flight.wait(END_S) == 0
+    assert list(read_log(tmp_path / "f.jsonl"))[-1]["kind"] == "end"
+
+
+def test_a_main_thread_that_hangs_feeds_no_watchdog_and_is_ended_all_the_same(hanging, tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        flight = hanging("main", NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000")
+        manager.settimeout(2.0)
+        give_up_s = time.monotonic() + PATIENCE_S
+        with suppress(TimeoutError):
+            while manager.recv(4096):
+                assert time.monotonic() < give_up_s, "it is still fed"
+    flight.terminate()
+    assert flight.wait(END_S) == 1
+    assert "its process is ended" in flight.stderr.read()
+    assert of_kind(read_log(tmp_path / "f.jsonl"), "start")
+
+
+@pytest.mark.network
+def test_a_program_that_gives_no_picture_is_ended_with_the_flight(recording, tmp_path):
+    """As a pipeline whose sensor hangs: the thread that waits for it is left, and it would keep the camera."""
+    program = tmp_path / "gst-launch-1.0"
+    program.write_text("#!/bin/sh\nexec sleep 600.25\n")
+    program.chmod(0o755)
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    flight = start(recording / "cohog.gpkg", "gst: v4l2src", tmp_path / "f.jsonl", PATH=path)
+    try:
+        (child,) = wait_for(
+            lambda: [each for each in psutil.Process(flight.pid).children() if "600.25" in each.cmdline()]
+        )
+        flight.terminate()
+        assert flight.wait(END_S) == 0
+        wait_for(lambda: not child.is_running())
+        assert list(read_log(tmp_path / "f.jsonl"))[-1]["kind"] == "end"
+    finally:
+        flight.kill()
+        flight.wait()
+        flight.stderr.close()
