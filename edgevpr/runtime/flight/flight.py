@@ -27,6 +27,7 @@ from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
 from edgevpr.runtime.flight.camerawatch import MirrorWatch, ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.frozenwatch import FrozenWatch, read_optics
 from edgevpr.runtime.flight.governor import Governing
 from edgevpr.runtime.flight.heightwatch import HeightWatch
 from edgevpr.runtime.flight.herald import Commands, Herald
@@ -68,7 +69,10 @@ class Flight:
         self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
         self._governing = Governing(crew, self._pace)
         self._commands = Commands(crew.link, herald, crew.learner)
-        self._vitals = Vitals(crew, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks)
+        self._frozen = FrozenWatch(herald, read_optics(config.source, crew.recogniser), crew.autopilot)
+        self._vitals = Vitals(
+            crew, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
+        )
         gps = GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot)
         self._surveyor = Surveyor(herald, gps, config.source, self._look)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
@@ -196,14 +200,9 @@ class Flight:
             pace.taken(source.step_s)
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
-        recogniser, link = self._crew.recogniser, self._crew.link
         with meter.timed(thread_only=True) as work:
             with self._crew.stop.breaks_off():
-                if isinstance(frame, ImageError):
-                    event = recogniser.unread(frame)
-                else:
-                    take = recogniser.step if is_query else recogniser.stride
-                    event = take(frame, link.vehicle_at(frame.t_mono_s) if link else None)
+                event = self._recognise(frame, is_query)
             event = replace(event, steps=replace(event.steps, read=reading.cost))
             if is_query:
                 self._tell(event)
@@ -213,14 +212,22 @@ class Flight:
         meter.load.busy(work.cost)
         self._governing.look()  # here, so that each reading covers a whole number of queries
 
+    def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
+        """Recognise a frame or, unless it `is_query`, measure its stride; refuse one of pictures that are frozen."""
+        if isinstance(frame, ImageError):
+            return self._crew.recogniser.unread(frame)
+        vehicle = self._crew.link.vehicle_at(frame.t_mono_s) if self._crew.link else None
+        if self._crew.source.is_live and (reason := self._frozen.judge(frame, vehicle)):
+            return Recognition(frame=frame, vehicle=vehicle, reason=reason)
+        return (self._crew.recogniser.step if is_query else self._crew.recogniser.stride)(frame, vehicle)
+
     def _is_time_for_stride(self) -> bool:
         """Tell whether to take a picture that is no query, for the motion that it shows: between rare queries, while
         the autopilot has no GPS. The pictures of a recording are all queries."""
         crew = self._crew
         if crew.autopilot is None or not crew.source.is_live or not crew.recogniser.measures_strides:
             return False
-        is_due = not self._commands.is_paused and self._pace.is_time_for_stride()
-        return is_due and crew.autopilot.wants_strides()
+        return not self._commands.is_paused and self._pace.is_time_for_stride() and crew.autopilot.wants_strides()
 
     def _tell(self, event: Recognition) -> None:
         """Report an event to the autopilot, then to all observers, which also get the report of its fix. An exception

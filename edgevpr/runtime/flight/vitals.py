@@ -16,6 +16,7 @@ from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import confidence_of
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
+from edgevpr.runtime.flight.frozenwatch import FrozenWatch
 from edgevpr.runtime.flight.herald import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
@@ -41,9 +42,17 @@ class Vitals:
     are left out."""
 
     def __init__(
-        self, crew: Crew, *, tally: Tally, pace: Pace, commands: Commands, remarks: Callable[[], Sequence[str | None]]
+        self,
+        crew: Crew,
+        frozen: FrozenWatch,
+        *,
+        tally: Tally,
+        pace: Pace,
+        commands: Commands,
+        remarks: Callable[[], Sequence[str | None]],
     ) -> None:
-        self._crew, self._tally, self._pace, self._commands, self._remarks = crew, tally, pace, commands, remarks
+        self._crew, self._frozen, self._tally, self._pace = crew, frozen, tally, pace
+        self._commands, self._remarks = commands, remarks
         self._watchdog_s = systemd.watchdog_interval_s()
         self._watchdog_due_s = self._health_due_s = crew.clock.mono_s()
         self._minute_due_s = self._health_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
@@ -133,7 +142,7 @@ class Vitals:
                 self._crew.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
     def _health(self) -> Health:
-        if self._source_trouble:
+        if self._source_trouble or self._frozen.is_frozen:
             return Health.CRITICAL
         if self._commands.is_paused:
             return Health.STANDBY
@@ -158,7 +167,7 @@ class Vitals:
             "elapsed_s": totals["elapsed_s"],
             "health": health.name,
             "paused": self._commands.is_paused,
-            "source": crew.source.state,
+            "source": self._frozen.state or crew.source.state,
             "latency_s": crew.source.latency_s,
             "queries": tally.queries,
             "accepted": tally.accepted,

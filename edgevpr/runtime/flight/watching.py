@@ -55,8 +55,8 @@ _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts the events of a flight: `queries`, of them `accepted` and `failed` ones; `unusable` frames, which are no
-    queries; events that failed in a row, and pictures in a row that hold too little to be recognised."""
+    """Counts the events of a flight: `queries`, of them `accepted` and `failed` ones; `unusable` frames, which failed
+    before they became queries; events that failed in a row; and pictures in a row that hold too little."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
@@ -71,7 +71,7 @@ class Tally:
         self._trouble = trouble
         self.queries += event.is_query
         self.accepted += event.accepted
-        self.unusable += not event.is_query
+        self.unusable += event.failed and not event.is_query
         self.failed += event.is_query and event.failed
         self.failed_in_a_row = self.failed_in_a_row + 1 if event.failed else 0
         self.nothing_in_a_row = self.nothing_in_a_row + 1 if event.says_nothing else 0

@@ -1,0 +1,265 @@
+"""Watch over the camera's pictures: while the aircraft moves, pictures that stay the same are frozen, whatever noise,
+clock or display they carry, and so are those that repeat earlier ones of this flight, as a clip that is played again.
+
+The measure of both is the same: a picture that equals an earlier one, although the aircraft has turned or flown on so
+far that it cannot. Rotation is the soundest witness, since gyroscopes measure it for every camera: about the optical
+axis it turns a picture, about another one it shifts it. Velocity times time over height is the second, for a camera
+that looks down, as far as an autopilot that is led by our own positions can be trusted. Nothing is said of a picture
+whose texture cannot show a motion, as over water, in fog or in the dark.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.core.config import SourceConfig
+from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.types import Frame, Vehicle
+from edgevpr.frames.sameness import BLOCKS, CoarsePicture, make_coarse
+from edgevpr.mavlink.messages import Severity
+from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.recognise.levelling import lens_of
+from edgevpr.runtime.recognise.recogniser import Recogniser
+
+# Motions are shares of the picture's longest side. A picture that has moved by 0.012 is not taken for unmoved.
+WITNESS_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
+PROOF_SHARE = 0.09  # sum of such motions by which pictures are frozen: one reset of an autopilot's heading is no proof
+_MOST_OF_ONE = 0.04  # that one rotation, or one repeated picture, counts for
+_PROOF_WITHIN_S = 20.0
+_LEAST_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition
+# Repeated pictures in a row, in flight, that are a proof by themselves: a route that is flown again, 500 m high with a
+# gimbal, shows one picture in five as before to within the resolution.
+_REPEATS_IN_A_ROW = 8
+_ROTATION_DOUBT_DEG = 2.0  # attitude, and time of the frame
+_SPEED_DOUBT_M_S = 2.0  # less counts as hovering
+_DRIFT_M_S = 6.0  # by which a way of a minute may be wrong, as the wind changes
+_FLIES_ON_M_S = 3.0
+_HEIGHT_DOUBT = 1.5  # the ground may be lower than the height says
+_FASTEST_M_S, _HIGHEST_M = 100.0, 10_000.0  # what is reported beyond is wrong
+_LOWEST_M = 5.0  # below, a height over ground is too uncertain as a measure
+_LONGEST_STEP_S = 5.0  # from picture to picture, for which a velocity is taken
+_HEADING_JUMP_DEG, _HEADING_JUMP_DEG_S = 30.0, 60.0  # faster, an autopilot has corrected its heading
+_AXIS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
+_WIDEST_FOV_DEG = 120.0  # of a lens that is unknown
+_SAME_BLOCKS, _FEWEST_BLOCKS = 0.75, BLOCKS // 3  # share of the blocks that must be unmoved, of so many at least
+_BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
+_MOST_STAY = 0.5  # of the blocks, in a picture that says which ones always stay
+_REMEMBERED, _REMEMBER_EVERY_S = 300, 0.5  # pictures; 4 MB
+_THUMB_ALIKE, _CANDIDATES = 0.97, 3
+_NEW_IN_A_ROW, _NEW_AFTER_REPEATS = 3, 10  # pictures after which the camera is taken as back
+
+FROZEN_TEXT = "camera frozen: pictures stay the same"
+REPEATING_TEXT = "camera frozen: pictures repeat"
+BACK_TEXT = "camera is back: pictures move again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Optics:
+    """What an aircraft's motion does to the pictures of its camera. `focal_share`: focal length in shares of the
+    picture's longest side. `looks_down`: else ahead. `is_level`: it hangs in a gimbal that keeps roll and pitch out."""
+
+    focal_share: float
+    looks_down: bool
+    is_level: bool
+
+    def rotation_share(self, then: Vehicle | None, now: Vehicle | None) -> float:
+        """Return by how much a picture moves at least by the rotation of the aircraft between two reports; 0 where it
+        is unknown."""
+        if then is None or now is None:
+            return 0.0
+        names = "roll_deg", "pitch_deg", "heading_deg"
+        roll_deg, pitch_deg, yaw_deg = (_change_deg(then, now, name) for name in names)
+        if self.is_level:
+            roll_deg = pitch_deg = 0.0
+        across_deg, about_deg = (roll_deg, yaw_deg) if self.looks_down else (yaw_deg, roll_deg)
+        shift = self.focal_share * _beyond_doubt(math.hypot(across_deg, pitch_deg))
+        return math.hypot(min(1.0, shift), _AXIS_SHARE * _beyond_doubt(about_deg))
+
+    def travel_share(self, moved_m: float, height_m: float | None) -> float:
+        """Return by how much a picture moves at least if the aircraft has moved by `moved_m`; 0 if the camera does not
+        look down, or the height is unknown."""
+        if not self.looks_down or height_m is None or not _LOWEST_M <= height_m <= _HIGHEST_M:
+            return 0.0
+        return max(0.0, moved_m) * self.focal_share / (_HEIGHT_DOUBT * height_m)
+
+
+def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
+    """Return the optics of a configured camera; a lens that is unknown is taken as the widest usual one."""
+    lens = lens_of(source)
+    focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _WIDEST_FOV_DEG) / 2)
+    looks_down = recogniser.technique.spec.looks_down
+    return Optics(focal_share=focal_share, looks_down=looks_down, is_level=source.gimbal)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sighting:
+    """A picture, and what is known of the aircraft when it was taken (`vehicle` None: nothing). `path_m` (2,): way
+    flown since the start of the flight, by velocities, metres east and north."""
+
+    picture: CoarsePicture
+    t_s: float
+    vehicle: Vehicle | None
+    path_m: Doubles
+
+
+class FrozenWatch:
+    """Judges each picture of a live camera before it is recognised, and reports once when pictures are frozen, and once
+    when they move again. Some have been recognised before that is known: the `autopilot` (None: there is no link) then
+    navigates anew, so that nothing that is sent rests on them. `is_frozen`: pictures are frozen."""
+
+    def __init__(self, herald: Herald, optics: Optics, autopilot: ToAutopilot | None = None) -> None:
+        self.is_frozen = False
+        self._herald, self._optics, self._autopilot = herald, optics, autopilot
+        self._first: Sighting | None = None  # of the pictures in a row that are the same
+        self._newest: Sighting | None = None
+        self._turned_from: Vehicle | None = None
+        self._flown_share = 0.0
+        self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
+        self._repeats: deque[tuple[float, float]] = deque()
+        self._stays = np.zeros(BLOCKS)  # share of the latest pictures in which a block stayed while others moved
+        self._remembered: deque[Sighting] = deque(maxlen=_REMEMBERED)
+        self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
+
+    @property
+    def state(self) -> str | None:
+        """What is reported of the pictures while they are frozen, else None."""
+        return (REPEATING_TEXT if self._new_needed == _NEW_AFTER_REPEATS else FROZEN_TEXT) if self.is_frozen else None
+
+    def judge(self, frame: Frame, vehicle: Vehicle | None) -> str | None:
+        """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
+        if vehicle and not vehicle.is_fresh_at(frame.t_mono_s):
+            vehicle = None
+        now = self._sighting(make_coarse(frame.image), frame.t_mono_s, vehicle)
+        is_same = None if self._first is None else self._is_same(self._first.picture, now.picture, learns=True)
+        if self._first and is_same:
+            self._stay(self._first, now)
+        else:
+            is_repeat = self._look_back(now)
+            if is_same is False and not is_repeat:
+                self._new_in_a_row += 1
+                self._repeats_in_a_row = 0
+            self._begin_row(now)
+        self._newest = now
+        self._decide(now.t_s)
+        return None if self.state is None else f"not used: {self.state}"
+
+    def _sighting(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> Sighting:
+        before, path_m = self._newest, np.zeros(2)
+        if before:
+            path_m = before.path_m
+            was_m_s, is_m_s = _velocity(before.vehicle), _velocity(vehicle)
+            if was_m_s and is_m_s and 0 < t_s - before.t_s <= _LONGEST_STEP_S:
+                path_m = path_m + (t_s - before.t_s) * np.mean([was_m_s, is_m_s], axis=0)
+            if _has_jumped(before, vehicle, t_s):
+                self._remembered.clear()
+        return Sighting(picture=picture, t_s=t_s, vehicle=vehicle, path_m=path_m)
+
+    def _begin_row(self, now: Sighting) -> None:
+        self._first, self._turned_from, self._flown_share = now, now.vehicle, 0.0
+        self._rotations.clear()
+        last = self._remembered[-1] if self._remembered else None
+        if last is None or now.t_s - last.t_s >= _REMEMBER_EVERY_S:
+            self._remembered.append(replace(now, picture=CoarsePicture(now.picture.grey)))
+
+    def _stay(self, first: Sighting, now: Sighting) -> None:
+        """Process a picture that equals the first one of its row."""
+        self._new_in_a_row = 0
+        self._flown_share = max(self._flown_share, self._flown_by(first, now, _SPEED_DOUBT_M_S))
+        turned_share = self._optics.rotation_share(self._turned_from, now.vehicle)
+        if turned_share >= WITNESS_SHARE:
+            self._rotations.append((now.t_s, min(turned_share, _MOST_OF_ONE)))
+        if turned_share >= WITNESS_SHARE or self._turned_from is None:
+            self._turned_from = now.vehicle
+
+    def _look_back(self, now: Sighting) -> bool:
+        """Return whether a picture equals an earlier one of the flight, and count what contradicts that."""
+        if not self._remembered:
+            return False
+        alike = np.array([each.picture.thumb for each in self._remembered]) @ now.picture.thumb
+        for number in np.argsort(alike)[: -_CANDIDATES - 1 : -1].tolist():
+            then = self._remembered[number]
+            # A copy, here and where it is kept, since the blocks of all that is remembered would take 20 MB.
+            if alike[number] >= _THUMB_ALIKE and self._is_same(CoarsePicture(then.picture.grey), now.picture):
+                self._repeat(then, now)
+                return True
+        return False
+
+    def _repeat(self, then: Sighting, now: Sighting) -> None:
+        self._new_in_a_row = 0
+        if now.t_s - then.t_s < _LEAST_S:
+            return
+        velocity_m_s = _velocity(now.vehicle)
+        flies_on = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _FLIES_ON_M_S
+        if flies_on and self._optics.looks_down:  # the horizon ahead stays for long
+            self._repeats_in_a_row += 1
+        turned_share = self._optics.rotation_share(then.vehicle, now.vehicle)
+        share = max(turned_share, self._flown_by(then, now, _DRIFT_M_S))
+        if share >= WITNESS_SHARE:
+            self._repeats.append((now.t_s, min(share, _MOST_OF_ONE)))
+
+    def _flown_by(self, then: Sighting, now: Sighting, doubt_m_s: float) -> float:
+        moved_m = float(np.hypot(*(now.path_m - then.path_m))) - doubt_m_s * (now.t_s - then.t_s)
+        return self._optics.travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
+
+    def _is_same(self, then: CoarsePicture, now: CoarsePicture, learns: bool = False) -> bool | None:
+        """Tell whether two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
+        always stay, as those of a display or of the airframe, are not used; with `learns`, they are learnt."""
+        textured, unmoved = then.is_textured, then.is_unmoved(now)
+        judged = textured & (self._stays < _MOST_STAY)
+        if learns and unmoved.sum() <= _MOST_STAY * textured.sum():
+            self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY
+        return None if judged.sum() < _FEWEST_BLOCKS else bool(unmoved[judged].mean() >= _SAME_BLOCKS)
+
+    def _decide(self, now_s: float) -> None:
+        for witnesses in (self._rotations, self._repeats):
+            while witnesses and now_s - witnesses[0][0] > _PROOF_WITHIN_S:
+                witnesses.popleft()
+        stays_s = now_s - self._first.t_s if self._first else 0.0
+        stays_share = self._flown_share + sum(share for _, share in self._rotations)
+        is_repeating = sum(share for _, share in self._repeats) >= PROOF_SHARE
+        if stays_share >= PROOF_SHARE and stays_s >= _LEAST_S:
+            self._report(_NEW_IN_A_ROW)
+        elif is_repeating or self._repeats_in_a_row >= _REPEATS_IN_A_ROW:
+            self._report(_NEW_AFTER_REPEATS)
+        elif self.is_frozen and self._new_in_a_row >= self._new_needed:
+            self.is_frozen = False
+            self._herald.tell("source", Severity.INFO, BACK_TEXT, topic="frozen", state=BACK_TEXT)
+
+    def _report(self, new_needed: int) -> None:
+        was_frozen, self.is_frozen = self.is_frozen, True
+        self._new_needed = max(new_needed, self._new_needed if was_frozen else 0)
+        if was_frozen or self.state is None:
+            return
+        if self._autopilot:
+            self._autopilot.begin_anew()
+        self._herald.tell("source", Severity.WARNING, self.state, topic="frozen", state=self.state)
+
+
+def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
+    """Return a reported velocity; None if it is unknown or impossible."""
+    velocity_m_s = vehicle.velocity_m_s if vehicle else None
+    return velocity_m_s if velocity_m_s and math.hypot(*velocity_m_s) <= _FASTEST_M_S else None
+
+
+def _change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
+    """Return by how much an angle has changed; 0 if it is unknown."""
+    before, after = getattr(then, name), getattr(now, name)
+    if before is None or after is None or not math.isfinite(before + after):
+        return 0.0
+    return float(shorter_deg(after - before))
+
+
+def _beyond_doubt(angle_deg: float) -> float:
+    return math.radians(max(0.0, abs(angle_deg) - _ROTATION_DOUBT_DEG))
+
+
+def _has_jumped(before: Sighting, vehicle: Vehicle | None, t_s: float) -> bool:
+    """Tell whether the heading has changed faster than an aircraft turns."""
+    if before.vehicle is None or vehicle is None:
+        return False
+    turned_deg = abs(_change_deg(before.vehicle, vehicle, "heading_deg"))
+    return turned_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - before.t_s)

@@ -1,0 +1,212 @@
+"""Pictures that stay the same, or repeat, while the aircraft moves are refused; those that may stay are not."""
+
+import cv2
+import numpy as np
+import pytest
+from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from flights import Flight, of_kind
+from frozen_cameras import DOWN, Flown, at_constant_bitrate, compressed, make_ground, with_clock
+from pictures import textured
+
+from edgevpr.mavlink.messages import Health
+from edgevpr.runtime.flight.frozenwatch import BACK_TEXT, FROZEN_TEXT, REPEATING_TEXT, Optics
+
+pytestmark = pytest.mark.slow
+
+AHEAD = Optics(focal_share=0.77, looks_down=False, is_level=False)
+GIMBAL = Optics(focal_share=0.77, looks_down=True, is_level=True)
+
+
+@pytest.fixture(scope="module")
+def ground():
+    return make_ground()
+
+
+def by_encoder(picture, rng, count):
+    return at_constant_bitrate(picture, 10 * count)[::10]
+
+
+def by_jpeg(picture, rng, count):
+    return [compressed(picture, rng) for _ in range(count)]
+
+
+def under_clock(picture, rng, count):
+    return [compressed(with_clock(picture, number), rng) for number in range(count)]
+
+
+@pytest.mark.parametrize("harm", [by_encoder, by_jpeg, under_clock])
+@pytest.mark.parametrize(("speed_m_s", "within_s"), [(10.0, 3), (5.0, 5)])
+def test_pictures_that_stay_while_the_aircraft_flies_on_are_refused_until_they_move(ground, harm, speed_m_s, within_s):
+    flown = Flown(ground)
+    last = flown.fly_on(6, speed_m_s)[-1]
+    for picture in harm(last, flown.rng, 16):
+        flown.see(picture, velocity_m_s=(speed_m_s, 0.0))
+    assert flown.refused == [None] * (5 + within_s) + [f"not used: {FROZEN_TEXT}"] * (17 - within_s)
+    assert flown.autopilot.begun_anew == 1
+    flown.fly_on(6, speed_m_s, start_m=180.0)
+    assert flown.refused[-4:] == [None] * 4
+    assert flown.notes.texts == [FROZEN_TEXT, BACK_TEXT]
+
+
+@pytest.mark.parametrize(
+    ("optics", "turn"),
+    [
+        (DOWN, lambda number: {"heading_deg": 12.0 * number}),
+        (DOWN, lambda number: {"roll_deg": 5.0 * (-1) ** number}),
+        (AHEAD, lambda number: {"heading_deg": 4.0 * (number % 4)}),
+        (AHEAD, lambda number: {"pitch_deg": 8.0 * (number % 2)}),
+        (GIMBAL, lambda number: {"heading_deg": 12.0 * number}),
+    ],
+)
+def test_pictures_that_stay_while_the_aircraft_turns_are_refused(ground, optics, turn):
+    flown = Flown(ground, optics)
+    flown.fly_on(3, 10.0)
+    still = flown.photograph()
+    for number in range(16):
+        flown.see(compressed(still, flown.rng), **turn(number))
+    assert flown.refused[:5] == [None] * 5
+    assert all(flown.refused[11:])
+    assert flown.notes.texts == [FROZEN_TEXT]
+
+
+@pytest.mark.parametrize("is_in_order", [True, False])
+def test_a_clip_that_is_played_again_in_flight_is_refused(ground, is_in_order):
+    flown = Flown(ground)
+    clip = flown.fly_on(20, 5.0)
+    for number in range(40):
+        shown = clip[number % 20 if is_in_order else flown.rng.integers(20)]
+        flown.see(compressed(shown, flown.rng), velocity_m_s=(5.0, 0.0))
+    assert flown.refused[:20] == [None] * 20
+    assert all(flown.refused[30:])
+    assert flown.notes.texts == [REPEATING_TEXT]
+
+
+def test_a_clip_whose_turns_the_aircraft_does_not_fly_is_refused(ground):
+    flown = Flown(ground)
+    turns = [30.0 * number for number in range(12)]
+    clip = [flown.photograph(heading_deg=heading_deg) for heading_deg in turns]
+    for picture, heading_deg in zip(clip, turns, strict=True):
+        flown.see(picture, heading_deg=heading_deg)
+    for picture in clip:
+        flown.see(compressed(picture, flown.rng), heading_deg=330.0)
+    assert flown.refused[:12] == [None] * 12
+    assert all(flown.refused[-6:])
+
+
+@pytest.mark.parametrize(("drift_m", "tilt_deg", "every_s"), [(1.0, 1.0, 1.0), (0.1, 0.2, 1.0), (1.0, 2.5, 0.5)])
+def test_a_hover_in_gusts_is_not_frozen(ground, drift_m, tilt_deg, every_s):
+    flown, at_m = Flown(ground, every_s=every_s), np.zeros(2)
+    for _ in range(60):
+        at_m = 0.9 * at_m + flown.rng.normal(0, 0.44 * drift_m, 2)
+        roll_deg, pitch_deg, turn_deg = flown.rng.normal(0, tilt_deg, 3)
+        attitude = {"heading_deg": 90.0 + turn_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+        picture = flown.photograph(200.0 + at_m[0], 120.0 + at_m[1], **attitude)
+        flown.see(picture, velocity_m_s=flown.rng.normal(0, 0.7, 2), **attitude)
+    assert flown.refused == [None] * 60
+
+
+def test_a_camera_on_the_ground_is_not_frozen_when_the_autopilot_finds_its_heading(ground):
+    flown = Flown(ground)
+    still = flown.photograph()
+    for number in range(60):
+        heading_deg = 0.0 if number < 20 else 137.0
+        flown.see(compressed(still, flown.rng), heading_deg=heading_deg, height_m=0.2, velocity_m_s=(1.5, 0.0))
+    assert flown.refused == [None] * 60
+
+
+def test_a_slow_drift_is_not_frozen(ground):
+    flown = Flown(ground)
+    for number in range(60):
+        picture = flown.photograph(east_m=180.0 + 0.3 * number)
+        flown.see(picture, velocity_m_s=(0.3, 0.0))
+    assert flown.refused == [None] * 60
+
+
+def test_the_horizon_ahead_is_not_frozen_in_straight_flight(ground):
+    flown = Flown(ground, AHEAD)
+    far = flown.photograph()
+    far[:200] = 200
+    for _ in range(60):
+        roll_deg, pitch_deg, turn_deg = flown.rng.normal(0, 1.0, 3)
+        shift = np.array([[1, 0, -8.6 * turn_deg], [0, 1, 8.6 * pitch_deg]])
+        picture = cv2.warpAffine(far, shift, (640, 480), borderMode=cv2.BORDER_REFLECT)
+        attitude = {"heading_deg": 90.0 + turn_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+        flown.see(compressed(picture, flown.rng), velocity_m_s=(20.0, 0.0), **attitude)
+    assert flown.refused == [None] * 60
+
+
+@pytest.mark.parametrize("level", [90, 6])
+def test_water_fog_and_dark_under_a_display_are_not_frozen(ground, level):
+    flown = Flown(ground)
+    for number in range(40):
+        shown = np.clip(flown.rng.normal(level, 4, (480, 640, 1)), 0, 255).astype(np.uint8).repeat(3, axis=2)
+        picture = compressed(with_clock(shown, number), flown.rng)
+        flown.see(picture, velocity_m_s=(20.0, 0.0), heading_deg=20.0 * number)
+    assert flown.refused == [None] * 40
+
+
+def test_furrows_that_are_flown_along_are_not_frozen(ground):
+    """Nothing in the picture moves but the noise."""
+    flown = Flown(ground)
+    right, down = np.meshgrid(np.arange(640), np.arange(480))
+    along = 0.92 * right + 0.39 * down
+    for _ in range(40):
+        furrows = 110 + 40 * np.sin(along / 6) + 20 * np.sin(along / 17) + flown.rng.normal(0, 4, (480, 640))
+        picture = np.clip(furrows, 0, 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+        flown.see(compressed(picture, flown.rng), velocity_m_s=(15.0, 0.0))
+    assert flown.refused == [None] * 40
+
+
+def test_a_route_that_is_flown_again_is_not_repeated(ground):
+    flown = Flown(ground)
+    for _ in range(3):
+        start_m, north_m = 60.0 + flown.rng.uniform(0, 10), 120.0 + flown.rng.normal(0, 1.0)
+        for number in range(24):
+            roll_deg, pitch_deg, turn_deg = flown.rng.normal(0, 1.5, 3)
+            attitude = {"heading_deg": 90.0 + turn_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+            picture = flown.photograph(start_m + 10.0 * number, north_m, **attitude)
+            flown.see(picture, velocity_m_s=(10.0, 0.0), **attitude)
+    assert flown.refused == [None] * 72
+
+
+@pytest.mark.parametrize("harm", [np.nan, np.inf, 1e300])
+def test_impossible_reports_end_nothing(ground, harm):
+    flown = Flown(ground)
+    for _ in range(5):
+        reported = {"heading_deg": harm, "roll_deg": harm, "velocity_m_s": (harm, harm), "height_m": harm}
+        assert flown.see(flown.photograph(), **reported) is None
+    assert flown.see(np.zeros((3, 4), np.uint8)) is None
+
+
+def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
+    clock, health, seen = FakeClock(), [], []
+
+    def vehicle():
+        heading_deg = 10.0 * (clock.now_s - 1000.0) % 360
+        return vehicle_at(50.0, 8.0, clock.now_s, heading_deg=heading_deg, roll_deg=0.0, pitch_deg=0.0)
+
+    def read():
+        health.append(link.health)
+        clock.sleep(1.0)
+
+    class Status:
+        def tell(self, status) -> None:
+            seen.append(status["source"])
+
+    link = FakeLink(clock, vehicle=vehicle)
+    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    noise = np.random.default_rng(2)
+    shown = [0, 1, *[2] * 12, 3, 4, 5, 6]
+    pictures = [textured(number, 240, 320) + noise.integers(0, 4, (240, 320), np.uint8) for number in shown]
+    lines = flight.fly(FakeSource(pictures, clock, work=read), status=Status())
+    accepted = [line["accepted"] for line in of_kind(lines, "query")]
+    refused = of_kind(lines, "unusable")
+    assert 7 <= len(refused) <= 11
+    assert {line["problem"] for line in refused} == {f"not used: {FROZEN_TEXT}"}
+    assert accepted == [True] * (len(shown) - len(refused))
+    assert flight.end["unusable"] == 0, "the camera has failed, and no picture"
+    assert [line["state"] for line in of_kind(lines, "source")] == [FROZEN_TEXT, BACK_TEXT]
+    assert link.texts() == [(4, f"edgevpr: {FROZEN_TEXT}"), (6, f"edgevpr: {BACK_TEXT}")]
+    assert FROZEN_TEXT in seen
+    assert Health.CRITICAL in health
+    assert health[-1] is Health.ACTIVE
