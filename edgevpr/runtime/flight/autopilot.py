@@ -156,12 +156,14 @@ class ToAutopilot:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
-    def compare_gps(self, off_m: float, is_wrong: bool) -> None:
+    def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
         """Send the distance `off_m` (metres) from the GPS position to a match. `is_wrong` is the judgement that GPS
-        contradicts the map: while it is True, the navigator does not use GPS."""
+        contradicts the map: while it is True, the navigator does not use GPS. Where they never `have_agreed`, the map
+        is as likely to be wrong: then GPS is used, and no position is sent."""
         with self._link.turn("gps"):
             self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
-            self._navigator.believe_gps(not is_wrong)
+            self._navigator.believe_gps(not is_wrong or not have_agreed)
+            self._navigator.doubt_map(is_wrong and not have_agreed)
 
     def correct_height(self, ratio: float) -> None:
         """Set the height above ground by the pictures over that by the autopilot (1.0: they agree)."""

@@ -54,6 +54,7 @@ _ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other 
 _UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
 _CONTINUOUS = "taken into the continuous position"
 # With GPS, ArduPilot refuses a fix, and PX4 takes it with a gain that makes its velocity jump.
+_DOUBTED = "not sent: the map has contradicted GPS from the first match on"
 _HAS_GPS = "not needed: the autopilot has GPS"
 _HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
 
@@ -83,7 +84,7 @@ class Navigator(Listener):
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
         self._appeared_s = self._lean_s = -math.inf
-        self._channel, self._believes_gps = Channel.COMMAND, True
+        self._channel, self._believes_gps, self._doubts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._given_s = OutputWatch(), -math.inf
         self._height_ratio = 1.0
@@ -97,6 +98,12 @@ class Navigator(Listener):
     def believe_gps(self, believes: bool) -> None:
         """Set whether GPS is used for navigation."""
         self._believes_gps = believes
+
+    def doubt_map(self, doubts: bool) -> None:
+        """Set whether the map has contradicted GPS from the first match on. One of them is wrong, and nothing shows
+        which: no position is sent, also after GPS is lost."""
+        with self._lock:
+            self._doubts_map = doubts
 
     def believes_gps(self) -> bool:
         return self._believes_gps
@@ -245,7 +252,7 @@ class Navigator(Listener):
             return Output.GPS_IN_USE
         if estimate is None:
             return Output.STARTING if self.output is Output.STARTING else Output.UNKNOWN
-        if self._navigation.is_in_doubt:
+        if self._navigation.is_in_doubt or self._doubts_map:
             return Output.CONTRADICTS_GPS
         if self._watch.withdrawn:
             return self._watch.withdrawn
@@ -324,6 +331,8 @@ class Navigator(Listener):
             return Advice(None, _CONTINUOUS)
         if reckons_by_gps(vehicle):
             return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
+        if self._doubts_map:
+            return Advice(None, _DOUBTED)
         estimate = self._navigation.at(now_s)
         if estimate is None:
             return Advice(None, _UNHEARD)

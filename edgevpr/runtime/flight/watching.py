@@ -175,6 +175,7 @@ class GpsWatch:
         self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
         self._reported_m = 0.0  # the distance that was last reported
+        self._have_agreed = False  # GPS and map, in this flight
         self.is_wrong = False
 
     def begin_anew(self) -> None:
@@ -200,7 +201,7 @@ class GpsWatch:
         self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
-            self._autopilot.compare_gps(away_m, self.is_wrong)
+            self._autopilot.compare_gps(away_m, self.is_wrong, self._have_agreed)
         has_grown = self.is_wrong and away_m > _REPORTED_AGAIN * self._reported_m
         if self.is_wrong != was_wrong or has_grown:
             self._reported_m = away_m
@@ -223,7 +224,7 @@ class GpsWatch:
             self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_of
             self._agreed = set(seen.places)
             if self._agreeing >= _GPS_IN_A_ROW and len(self._doubts) < _GPS_IN_TURN:
-                self.is_wrong = False
+                self.is_wrong, self._have_agreed = False, True
             return
         places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
 

@@ -131,6 +131,20 @@ def test_gps_watch_allows_for_the_time_of_a_frame(watched, t_sd_s, is_wrong):
     assert air.fly(40).watch.is_wrong is is_wrong
 
 
+@pytest.mark.parametrize("agrees_s", [0, 30])
+def test_map_that_never_agreed_with_gps_moves_no_aircraft_after_its_loss(watched, agrees_s):
+    """A map whose places lie 300 m beside the true ones contradicts GPS from the first match on, a receiver that is led
+    away only later."""
+    air = watched().fly(agrees_s)
+    air.gps_off_m = np.array([300.0, 0.0])
+    air.fly(30)
+    assert air.watch.is_wrong
+    assert air.navigator.believes_gps() is (agrees_s == 0)
+    air.lose_gps()
+    sent = [fix for fix in air.fly(20).reports[-20:] if fix.sent]
+    assert bool(sent) is (agrees_s > 0)
+
+
 def test_gps_watch_reports_a_distance_again_when_it_has_doubled(watched):
     air = watched()
     air.fly(20)
