@@ -114,8 +114,10 @@ def faults(flown: Row, control: Row) -> list[str]:
 
 
 def is_refused(flown: Row) -> bool:
-    """Tell whether edgevpr sent nothing in the watched time, and warned of something else than a busy computer."""
-    return not flown.get("sent") and any(not text.startswith("held to ") for text in flown["warnings"])
+    """Tell whether edgevpr sent nothing in the watched time, or the aircraft stayed on the ground, and it has warned of
+    something else than a busy computer."""
+    is_harmless = not flown.get("sent") or bool(flown["cannot"])
+    return is_harmless and any(not text.startswith("held to ") for text in flown["warnings"])
 
 
 def judged(rows: Mapping[str, Row]) -> list[Row]:
@@ -152,7 +154,7 @@ as before until the estimate stays within {_ON_GPS_M:.0f} m. Positions sent; que
 
 Right: nothing is more than {WORSE_M:.0f} m worse than the control, GPS is used again {LATER_S:.0f} s later than by it
 at the latest, after a start of the autopilot positions come within {FIRST_WITHIN_S:.0f} s, and none while paused.
-Refused: edgevpr sends nothing, and has warned.
+Refused: edgevpr sends nothing, or the aircraft does not arm, and it has warned.
 
 {base.table(cells, _COLUMNS)}
 
