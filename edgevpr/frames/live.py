@@ -166,7 +166,7 @@ class LiveSource(Source):
                 self.facts = self.facts or opening.facts
             else:
                 self.refused[found.value] += 1
-                self._liveness.refuse(found)
+                self._liveness.refuse(found, now_s)
 
     def _put(self, shot: Shot, now_s: float) -> Refusal | None:
         """Keep a picture as the newest one, or return why it is none."""

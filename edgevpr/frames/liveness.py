@@ -39,7 +39,7 @@ class Liveness:
     def __init__(self) -> None:
         self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)
         self._last_new_s: float | None = None
-        self._since_s = 0.0
+        self._since_s = self._refused_s = 0.0
         self._is_rate_known = False
         self._refusal: Refusal | None = None
         self._repeats = 0
@@ -65,9 +65,9 @@ class Liveness:
         self._frozen_reopen_s = _FROZEN_REOPEN_S
         return None
 
-    def refuse(self, refusal: Refusal) -> None:
+    def refuse(self, refusal: Refusal, now_s: float) -> None:
         """Note a picture that was rejected."""
-        self._refusal = refusal
+        self._refusal, self._refused_s = refusal, now_s
         self._repeats = self._repeats + 1 if refusal is Refusal.FROZEN else 0
 
     def fault(self, now_s: float) -> Fault | None:
@@ -82,7 +82,8 @@ class Liveness:
         if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
             must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
             return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
-        if silent_s > limit_s and self._refusal is Refusal.LATE:
+        is_late = self._refusal is Refusal.LATE and now_s - self._refused_s <= LOST_S
+        if silent_s > limit_s and is_late:
             # Before the first picture they may only wait for a key frame, or be too few to know their age by.
             return Fault(Condition.LATE, _LATE, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:

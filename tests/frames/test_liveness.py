@@ -19,7 +19,7 @@ def begins_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
     """Seconds from `start_s` until a fault is `wanted`, of a source of which every picture is refused so."""
     for step in range(1, 1000):
         if refusal:
-            watched.refuse(refusal)
+            watched.refuse(refusal, start_s + step * every_s)
         if (fault := watched.fault(start_s + step * every_s)) and wanted(fault):
             return pytest.approx(step * every_s, abs=1.5 * every_s)
     return None
@@ -84,7 +84,7 @@ def test_a_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
 def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
     watched = liveness(0.0, 0.1)
     for _ in range(repeats):
-        watched.refuse(Refusal.FROZEN)
+        watched.refuse(Refusal.FROZEN, 0.1)
     fault = watched.fault(0.1 + repeats * step_s)
     assert (fault is not None and fault.condition is Condition.FROZEN) == is_frozen
 
@@ -106,7 +106,7 @@ def test_a_new_picture_ends_every_fault():
     for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
         watched = liveness(0.0, 0.1)
         for _ in range(20):
-            watched.refuse(refusal)
+            watched.refuse(refusal, 9.9)
         assert watched.fault(10.0)
         watched.take(10.1)
         assert watched.fault(10.2) is None

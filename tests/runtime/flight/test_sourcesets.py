@@ -55,12 +55,20 @@ def test_the_set_without_gps_is_asked_for_once_and_the_other_after_ten_seconds_o
 def test_a_receiver_that_is_wrong_counts_as_none():
     with Controlled("arduplane", source_sets=ALLOWED) as flown:
         in_air(flown)
-        flown.autopilot.compare_gps(100.0, is_wrong=True)
+        flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=True)
         flown.fly(3)
         assert asked(flown) == [2]
-        flown.autopilot.compare_gps(3.0, is_wrong=False)
+        flown.autopilot.compare_gps(3.0, is_wrong=False, have_agreed=True)
         flown.fly(15)
         assert asked(flown) == [2, 1]
+
+
+def test_a_receiver_that_never_agreed_with_the_map_stays_in_use():
+    with Controlled("arduplane", source_sets=ALLOWED) as flown:
+        in_air(flown)
+        flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
+        flown.fly(3)
+        assert asked(flown) == []
 
 
 @pytest.mark.parametrize(
