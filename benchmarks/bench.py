@@ -31,7 +31,10 @@ PLACES = 10_000
 REACH_M = 300.0
 FRAME = (640, 480)  # width and height
 FRAMES_A_SET = 2
-ENCODE_TURNS, MATCH_TURNS, QUERY_TURNS, REFERENCES = 10, 15, 9, 60
+ENCODE_TURNS = 10
+MATCH_TURNS = 15
+QUERY_TURNS = 9
+REFERENCES = 60
 COLUMNS = {
     "encode": {
         "encode `cohog`": "{entropy}",

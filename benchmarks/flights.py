@@ -276,7 +276,7 @@ def page(result: Row) -> str:
 
 Right, wrong, far off: fixes. Lost: share of the time over the map. Gap: the longest without a right fix over the map,
 median and worst of the flights. Errors: median / 95th percentile of right fixes. Within: shares of errors, axis by
-axis, within one and two standard deviations that the fix claims (asked: .68 and .95), of all fixes over the site's own
+axis, within one and two standard deviations that the fix claims (asked 0.68, 0.95), of all fixes over the site's own
 ground.
 
 {tables[0]}

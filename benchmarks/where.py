@@ -246,7 +246,7 @@ def page(found: Row) -> str:
 {base.told(__doc__, "Writes where.json")}
 
 Errors are median / 95th percentile of accepted matches: before refining, of the place's own position; after it, of the
-fix. Within: shares of errors, axis by axis, within one and two standard deviations of the fix (asked: .68 and .95);
+fix. Within: shares of errors, axis by axis, within one and two standard deviations of the fix (asked 0.68, 0.95);
 against GPS with the scatter of the tags, which refining has estimated, added.
 
 {base.table(rows, _COLUMNS)}

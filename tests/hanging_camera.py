@@ -13,7 +13,8 @@ from edgevpr.frames import source
 from edgevpr.frames.shot import Shot
 from edgevpr.runtime.flight.flight import Flight
 
-_STEP, _MARK = sys.argv[1], Path(sys.argv[2])
+_STEP = sys.argv[1]
+_MARK = Path(sys.argv[2])
 _PICTURES = 5
 
 

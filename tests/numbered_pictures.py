@@ -5,7 +5,8 @@ import zlib
 import cv2
 import numpy as np
 
-WIDTH, HEIGHT = 320, 240
+WIDTH = 320
+HEIGHT = 240
 _BAND_PX, _BAR_PX = 16, 16
 _NUMBER_BITS, _CHECK_BITS = 12, 8
 

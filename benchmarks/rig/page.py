@@ -106,7 +106,7 @@ after the loss. Worse: the second at which the estimate was worst in comparison 
 {_spread(found)}
 
 edgevpr's fixes against the true position of their own picture, by how far the aircraft banked, and the share of errors,
-axis by axis, within one and two sigma of the accuracy that was claimed (asked: .68 and .95). Query: from the picture to
+axis by axis, within one and two sigma of the accuracy that was claimed (asked 0.68, 0.95). Query: from the picture to
 the answer, median and 99 %.
 
 {base.table([each for each in _rows(found, "with") if "fixes" in each], _FIXES)}

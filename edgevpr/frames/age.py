@@ -151,13 +151,13 @@ class StampedTime:
         order_delay_s = came_s - self.rate * order_s
         is_new = came_s[-1] - self._begun_s < _START_S
         for span_s in _SPANS_S:
-            first = _first_of(came_s, span_s)
+            first = _find_span_start(came_s, span_s)
             if first is not None and (trend := envelope_growth(came_s[first:], order_delay_s[first:])):
                 self._follow_trend(window[first:], *trend, span_s, is_new)
                 return
         if came_s[-1] - self._doubted_s > _DOUBT_LASTS_S:
             self._max_known_age_s = math.inf
-        if (first := _first_of(came_s, _SPAN_AT_START_S)) is not None:
+        if (first := _find_span_start(came_s, _SPAN_AT_START_S)) is not None:
             above_s = order_delay_s[first:] - self._least_order_delay_s
             if above_s.min() > _MAX_DOUBTFUL_AGE_S and np.ptp(above_s) < _STEADY_S:
                 # All are late by the same: so the sender has paused, or the network holds all of them up.
@@ -203,7 +203,7 @@ class StampedTime:
             _log.warning("the stream's time stamps run at %.2f of the true rate: they are corrected", 1 / self.rate)
 
 
-def _first_of(came_s: Doubles, span_s: float) -> int | None:
+def _find_span_start(came_s: Doubles, span_s: float) -> int | None:
     """Return the first picture of the last `span_s` seconds; None if there are none from most of them, or too few."""
     first = min(int(np.searchsorted(came_s, came_s[-1] - span_s)), max(0, len(came_s) - _MIN_PICTURES))
     return first if came_s[-1] - came_s[first] > _COVERED_SHARE * span_s else None
@@ -233,7 +233,7 @@ def share_of_bytes(window: Doubles) -> tuple[float, float]:
         return -math.inf, math.inf
     # A link's capacity changes. So the steps are compared with those around them.
     pieces = np.array_split(steps, _PIECES)
-    late_s, by_bytes_s = np.concatenate([_beside_mean(*piece.T) for piece in pieces], axis=1)
+    late_s, by_bytes_s = np.concatenate([_subtract_expected(*piece.T) for piece in pieces], axis=1)
     share, sd = _regression(late_s, by_bytes_s)
     # A large picture that came just before or after a change must not outweigh all the others.
     is_usual = steps[:, 2] <= _LARGE * np.median(steps[:, 2])
@@ -253,7 +253,7 @@ def _regression(y: Doubles, x: Doubles) -> tuple[float, float]:
     return factor, math.sqrt(float(rest @ rest) / (len(x) - _PIECES - 1) / power)
 
 
-def _beside_mean(came_s: Doubles, order_s: Doubles, size: Doubles) -> Doubles:
+def _subtract_expected(came_s: Doubles, order_s: Doubles, size: Doubles) -> Doubles:
     """Return by how much each step is longer than it would be by the stamps, and by how much it should be by its bytes,
     (2, n) in seconds."""
     whole_s = came_s.sum()

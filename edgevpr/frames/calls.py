@@ -18,9 +18,8 @@ class Opening:
     """One opening of a camera or stream, by a thread of its own, which opens it, hands what it reads to `take` (with
     this object), and releases it once it is lost or `cancel` is called.
 
-    `opened_s`: when it was open, by `clock` (None: not yet). `facts`: what it states of its pictures (None: nothing).
-    `cause`: why it could not be opened or read on, in a few words (None: it is lost, or cancelled). `ended`: the thread
-    has released it."""
+    `opened_s`: when it was open, by `clock` (None: not yet). `cause`: why it could not be opened or read on, in a few
+    words (None: it is lost, or cancelled). `ended`: the thread has released it."""
 
     def __init__(
         self,
@@ -34,9 +33,13 @@ class Opening:
         self.is_cancelled = False
         self.ended = threading.Event()
         self._open_capture, self._take, self._clock = open_capture, take, clock
-        self.facts: StreamFacts | None = None
         self._capture: Capture | None = None
         threading.Thread(target=self._run, name="capture", daemon=True).start()
+
+    @property
+    def facts(self) -> StreamFacts | None:
+        """What the open stream states of its pictures; None if it states nothing."""
+        return getattr(self._capture, "facts", None)
 
     def cancel(self) -> None:
         """Let the thread end as soon as its present call returns."""
@@ -60,7 +63,6 @@ class Opening:
             self.cause = "nothing there"
             return
         self._capture, self.opened_s = capture, self._clock()
-        self.facts = getattr(capture, "facts", None)
         try:
             while not self.is_cancelled and (shot := capture.read()) is not None:
                 self._take(self, shot)
@@ -86,10 +88,9 @@ class Converter:
         self._thread = threading.Thread(target=self._run, name="convert", daemon=True)
         self._thread.start()
 
-    @property
-    def is_alive(self) -> bool:
-        """True until the thread has ended."""
-        return self._thread.is_alive()
+    def has_ended(self) -> bool:
+        """Tell whether the thread has ended."""
+        return not self._thread.is_alive()
 
     def ask(self, conversion: Conversion) -> None:
         """Have this done."""

@@ -131,7 +131,7 @@ class LiveSource(Source):
             self.latency_s = now_s - self._last_taken_s
         if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_S:
             self._converter.end()
-            self._hanging.append(lambda hung=self._converter: not hung.is_alive)  # type: ignore[misc]
+            self._hanging.append(self._converter.has_ended)
             self._converter, self._conversion = Converter(), None
             self._newest = None  # of the same decoder
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)

@@ -92,7 +92,7 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     name = _PIPELINE if is_pipeline else _RIBBON
     if exit_code is None:
         raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_S:g} s")
-    raise OpeningError(f"{name} has ended with code {exit_code}{words.after_end()}")
+    raise OpeningError(f"{name} has ended with code {exit_code}{words.explain_exit()}")
 
 
 class ProgramCapture:
@@ -116,7 +116,7 @@ class ProgramCapture:
 def _ribbon(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon camera to the first who connects to `port`."""
     return [
-        *_ended_with_us("KILL"),
+        *_die_with_parent("KILL"),
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -129,10 +129,10 @@ def _pipeline(uri: str, port: int) -> list[str]:
     they have gone."""
     sink = f"sync=false buffers-soft-max={_WAITING_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     sent = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    return [*_ended_with_us("TERM"), require_program(uri), "-q", *_words(uri), *sent.split()]
+    return [*_die_with_parent("TERM"), require_program(uri), "-q", *_words(uri), *sent.split()]
 
 
-def _ended_with_us(name: str) -> tuple[str, ...]:
+def _die_with_parent(name: str) -> tuple[str, ...]:
     """Return the words before a command that let the kernel send it the signal `name` when our thread ends. GStreamer
     closes its camera upon TERM; rpicam-vid has nothing to close."""
     return "setpriv", "--pdeathsig", name
@@ -161,7 +161,7 @@ class _LastWords:
         self._thread = threading.Thread(target=self._read, name="last words", daemon=True)
         self._thread.start()
 
-    def after_end(self) -> str:
+    def explain_exit(self) -> str:
         """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
         self._thread.join(_LOOK_S)
         lines = [line.decode(errors="replace").strip() for line in list(self._lines)]

@@ -262,13 +262,13 @@ def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callab
     elif uri.startswith("/dev/"):
         from edgevpr.frames.devices import open_device
 
-        return lambda: _if_there(uri, lambda: open_device(uri, clock))
+        return lambda: _open_if_present(uri, lambda: open_device(uri, clock))
     from edgevpr.frames.streams import open_address  # loads FFmpeg
 
-    return lambda: _if_there(uri, lambda: open_address(uri, clock, period_s))
+    return lambda: _open_if_present(uri, lambda: open_address(uri, clock, period_s))
 
 
-def _if_there(uri: str, open_capture: Callable[[], Capture | None]) -> Capture | None:
+def _open_if_present(uri: str, open_capture: Callable[[], Capture | None]) -> Capture | None:
     if cause := missing_cause(uri):
         raise OpeningError(cause)
     return open_capture()

@@ -10,7 +10,8 @@ import av
 import cv2
 import numpy as np
 
-WIDTH, HEIGHT = 320, 240
+WIDTH = 320
+HEIGHT = 240
 RATE_HZ = 10
 _NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 _SDP = (

@@ -101,7 +101,7 @@ def test_the_last_words_of_a_program_are_its_error_if_it_is_short(said, words):
     found = programs._LastWords(program.stdout)
     program.wait()
     assert wait_for(lambda: not found._thread.is_alive())
-    assert found.after_end() == words
+    assert found.explain_exit() == words
 
 
 def test_a_camera_that_is_not_there_is_said_and_looked_for_again(rpicam, monkeypatch, caplog):

@@ -14,7 +14,7 @@ GRAVITY_M_S2 = 9.80665
 _ATTITUDE_LASTS_S = 20.0
 # The error of the attitude wanders up to nine times as fast as that of good gyros, as in PX4's simulator: by 0.1 in
 # eight seconds after GPS was lost. Of the last twenty pictures: the mean square of the leans that they show, over their
-# variances, is .2 in flights of ArduPilot's simulator and 1.3 in those of PX4's.
+# variances, is 0.2 in flights of ArduPilot's simulator and 1.3 in those of PX4's.
 _ROUGHEST = 8.0
 _SHOWN_GAIN = 0.05
 _CALM, _ROUGH = 0.3, 0.8
@@ -46,9 +46,9 @@ class Drift:
     velocity_noise: float
     acceleration_noise: float
     is_of_attitude: bool  # the path rests on the attitude, so that an error of it is one of the path's acceleration
-    # The autopilot follows our positions closely, and takes their errors for motion: its attitude errs with them. So it
-    # is taken for poor when GPS is lost, until pictures have shown that it is good.
-    is_led: bool = False
+    # The autopilot follows our positions closely, and takes their errors for motion. So its attitude is taken for poor
+    # when GPS is lost, until pictures have shown that it is good.
+    attitude_follows_positions: bool = False
 
 
 # Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
@@ -62,7 +62,7 @@ INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
     is_of_attitude=True,
 )  # fmt: skip
-INERTIAL_LED = replace(INERTIAL, is_led=True)
+INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class DriftFilter:
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
         self._upset = 0.0  # 1 when GPS is lost, then less and less
         # Mean square of the leans of the last pictures, over their variances.
-        self._shown = _ROUGH if drift.is_led else 0.0
+        self._shown = _ROUGH if drift.attitude_follows_positions else 0.0
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
@@ -134,7 +134,7 @@ class DriftFilter:
         so does that of the attitude of an autopilot that reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._upset = 0.0 if self._drift.is_of_attitude else 1.0
-        if self._drift.is_led:
+        if self._drift.attitude_follows_positions:
             self._shown = max(self._shown, _ROUGH)
 
     def hear_gps(

@@ -50,7 +50,7 @@ class Whereabouts:
 
 class Navigation:
     """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
-    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`, `INERTIAL_LED`). `map_sd_m` is the
+    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
     standard deviation, of one axis, of the error that all fixes share.
 
     Beside accelerations, which go with positions that are sent all the time, the autopilot's estimate may be made of

@@ -16,7 +16,7 @@ from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import Consistency, HeardFrame, positioned, worst_sd
-from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, INERTIAL_LED, RECKONED, Drift
+from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, RECKONED, Drift
 from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
 from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import over_ground
@@ -119,7 +119,7 @@ class Navigator(Listener):
         positions, and we must not use it: the path is then summed up from accelerations."""
         with self._lock:
             before, self._channel = self._channel, channel
-            if _drift_of(channel) is not _drift_of(before):
+            if _choose_drift(channel) is not _choose_drift(before):
                 self._begin()
 
     def begin_anew(self) -> None:
@@ -267,7 +267,7 @@ class Navigator(Listener):
         return Output.RESERVE
 
     def _begin(self) -> None:
-        self._navigation, self._consistency = Navigation(_drift_of(self._channel), self._map_sd_m), Consistency()
+        self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
     def _unheard(self, fix: Fix, now_s: float) -> Advice:
@@ -292,7 +292,7 @@ class Navigator(Listener):
         is_apart = self._is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
         ratio, stride = self._height_ratio, None
         if event.stride and 1 / _MOST_CORRECTED < ratio < _MOST_CORRECTED:
-            stride = event.stride.enlarged(ratio)
+            stride = event.stride.scale(ratio)
         tilt_sd = _ATTITUDE_SD if has_attitude else _UNTOLD_ATTITUDE_SD
         return HeardFrame(
             t_s=event.frame.t_mono_s,
@@ -396,10 +396,10 @@ class Slew:
         return *self._at, (1 - part) * behind_m
 
 
-def _drift_of(channel: Channel) -> Drift:
+def _choose_drift(channel: Channel) -> Drift:
     """Return the errors of the path beside an autopilot that is told positions by a channel."""
     if channel in _PX4_CHANNELS:
-        return INERTIAL_LED
+        return INERTIAL_PX4
     return INERTIAL if channel.is_continuous else RECKONED
 
 

@@ -33,7 +33,7 @@ class Stride:
     inliers: int
     zoom: float = 0.0
 
-    def enlarged(self, factor: float) -> "Stride":
+    def scale(self, factor: float) -> "Stride":
         """Return the motion that the same pictures show from a height that is `factor` times as large."""
         east_m, north_m = self.moved_m
         return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m)

@@ -25,7 +25,8 @@ _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
 _BY_LIBCAMERA = ("media*", "video*", "dma_heap/*")  # devices below /dev that it opens
 _BOOT = "boot/firmware/config.txt"
-_ARGUS_SOURCE, _ARGUS_SOCKET = "nvarguscamerasrc", "tmp/argus_socket"
+_ARGUS_SOURCE = "nvarguscamerasrc"
+_ARGUS_SOCKET = "tmp/argus_socket"
 
 
 def camera_findings(uri: str, root: Path = Path("/")) -> Iterator[Finding]:

@@ -181,7 +181,8 @@ def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, acce
     assert judged((score, score - 0.1), proof=proof).accepted == accepted
 
 
-PLACES, LENGTH = 80, 6
+PLACES = 80
+LENGTH = 6
 RULE_OF_SEQUENCE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
 
 

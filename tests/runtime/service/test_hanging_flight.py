@@ -14,6 +14,7 @@ import psutil
 import pytest
 from flight_process import start
 from flights import of_kind
+from live_sources import PATIENCE_S, wait_for
 
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.status import read_status
@@ -21,16 +22,7 @@ from edgevpr.runtime.flight.status import read_status
 pytestmark = [pytest.mark.process, pytest.mark.slow]
 
 HANGING = Path(__file__).parents[2] / "hanging_camera.py"
-PATIENCE_S = 60.0
 END_S = 30.0  # it takes five; by far less than for ever, on a busy machine too
-
-
-def wait_for(condition):
-    give_up_s = time.monotonic() + PATIENCE_S
-    while not (result := condition()):
-        assert time.monotonic() < give_up_s, "nothing happened"
-        time.sleep(0.05)
-    return result
 
 
 @pytest.fixture
