@@ -22,6 +22,7 @@ _STAMP_OFF_S = 1.0
 # Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
 _BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS, _NEAR_WRAP_MS = 2**32, 60_000
+LATE_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
 # The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
 # `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
 _STAMPS = {
@@ -127,6 +128,14 @@ class AutopilotClock:
         if boot_s is not None and self._utc_ahead_s is not None:
             return boot_s + self._utc_ahead_s
         return None if self._utc_ahead_of_ours_s is None else t_mono_s + self._utc_ahead_of_ours_s
+
+    def delay_s(self, boot_ms: int, now_s: float) -> float:
+        """Return how long a report of the boot time `boot_ms` was on its way, seconds; 0.0 where the boot time is not
+        known. It is no less than half the last round trip: if not the report, then what we send comes late."""
+        reported_s = self.mono_s(boot_ms / 1e3)
+        if reported_s is None:
+            return 0.0
+        return max(math.remainder(now_s - reported_s, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
 
     @property
     def _offset_s(self) -> float | None:

@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock
+from edgevpr.mavlink.clock import LATE_S, SILENT_AFTER_S, AutopilotClock
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
@@ -24,6 +24,11 @@ FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a 
 _LEAST_HPA = 300.0  # of the air where anything flies
 _MOST_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
+
+# Reports of where the vehicle is, and how it moves; the first three carry the boot time.
+_TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
+_MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
+_LATE_FOR_S = 3.0  # after the last one that came too late
 
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
 
@@ -145,6 +150,8 @@ class Autopilot:
         self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
         self.receivers = Receivers()
+        self.delay_s = 0.0  # how late the newest report came
+        self._late_s = -math.inf  # when one last came too late
 
     @property
     def system_id(self) -> int | None:
@@ -166,6 +173,10 @@ class Autopilot:
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
         return now_s - self.heard_s <= SILENT_AFTER_S
+
+    def is_late(self, now_s: float) -> bool:
+        """Return True if its reports have come too late to be used in the last three seconds."""
+        return now_s - self._late_s <= _LATE_FOR_S
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, moved to `t_mono_s`: see `Conversation.vehicle_at`."""
@@ -215,7 +226,13 @@ class Autopilot:
         return beats
 
     def _hear_report(self, message: Message, now_s: float) -> None:
-        match message.get_type():
+        kind = message.get_type()
+        if kind in _TIMED_REPORTS:
+            self.delay_s = self.clock.delay_s(message.time_boot_ms, now_s)
+        if kind in _MOTION_REPORTS and self.delay_s > LATE_S:
+            self._late_s = now_s
+            return  # on a link that is full, or after we were stopped: what it says is past
+        match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
                 known = mavlink.enums["MAV_RESULT"].get(message.result)
                 self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)

@@ -196,3 +196,34 @@ def test_a_fix_that_waited_in_vain_for_the_time_says_so():
     autopilot.wait(1.1)
     autopilot.told()
     assert (sending.sent, sending.why) == (False, "the autopilot's clock was not known within 1 s")
+
+
+def report_late(autopilot, late_s):
+    """Let a second of reports come `late_s` seconds after they were sent. Returns the texts to the ground station."""
+    for _ in range(10):
+        autopilot.beat()
+        boot_ms = autopilot.boot_ms
+        autopilot.wait(late_s)
+        autopilot.say(mavlink.MAVLink_global_position_int_message(boot_ms, 500_000_000, 80_000_000, 0, 0, 0, 0, 0, 0))
+        autopilot.say(mavlink.MAVLink_attitude_message(boot_ms, 0.5, 0, 0, 0, 0, 0))
+        autopilot.wait(0.1)
+    return [message.text for message in autopilot.told() if message.get_type() == "STATUSTEXT"]
+
+
+@pytest.mark.parametrize("is_the_way_back", [True, False])
+def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
+    autopilot = Autopilot(booted_s=600.0)
+    texts = report_late(autopilot, 0.05)
+    before = autopilot.vehicle
+    assert before is not None
+    assert not texts
+    if not is_the_way_back:
+        autopilot.timesync_s = 1.5
+    texts = [text for _ in range(4) for text in report_late(autopilot, 1.2 if is_the_way_back else 0.0)]
+    assert autopilot.vehicle.t_heard_s - before.t_heard_s < 2.0, "the vehicle is where it was last heard in time"
+    assert autopilot.conversation.vehicle_at(autopilot.clock.now_s).roll_deg is None
+    assert any("link full: reports" in text for text in texts)
+    autopilot.timesync_s = 0.0
+    texts = [text for _ in range(8) for text in report_late(autopilot, 0.05)]
+    assert autopilot.clock.now_s - autopilot.vehicle.t_heard_s < 0.2
+    assert any("in time again" in text for text in texts)

@@ -163,10 +163,10 @@ def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
 
 def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
     autopilot, ear = interviewed()
-    autopilot.say(mavlink.MAVLink_scaled_imu_message(0, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
+    autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
     assert ear.forces == []
     autopilot.attitude(roll_deg=28.65)
-    autopilot.say(mavlink.MAVLink_scaled_imu_message(0, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
+    autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
     ((force, roll_deg),) = ear.forces
     assert force == pytest.approx((0.980665, 0.0, -9.80665))
     assert roll_deg == pytest.approx(28.65, abs=0.01)
