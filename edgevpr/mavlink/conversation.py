@@ -323,7 +323,7 @@ class Conversation:
         """Announce that the autopilot's reports have begun to come too late, or no longer do."""
         is_late = self.autopilot.is_late(now_s)
         if is_late and not self._was_late:
-            delay_s = self.autopilot.delay_s
+            delay_s = self.autopilot.late_by_s
             log.warning(
                 "the autopilot's reports come %.1f s late, and are not used: the link is full; raise its baud rate, or "
                 "let the other programs on it ask for fewer messages", delay_s,

@@ -28,7 +28,7 @@ _MILLI_G_M_S2 = 9.80665e-3
 # Reports of where the vehicle is, and how it moves; the first three carry the boot time.
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
-_LATE_FOR_S = 3.0  # after the last one that came too late
+_LATE_FOR_S = 10.0  # after the last one that came too late
 
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
 
@@ -150,8 +150,8 @@ class Autopilot:
         self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
         self.receivers = Receivers()
-        self.delay_s = 0.0  # how late the newest report came
-        self._late_s = -math.inf  # when one last came too late
+        self._delay_s = 0.0  # by how much the newest report came late
+        self.late_by_s, self._late_s = 0.0, -math.inf  # the newest that came too late, and when
 
     @property
     def system_id(self) -> int | None:
@@ -175,7 +175,7 @@ class Autopilot:
         return now_s - self.heard_s <= SILENT_AFTER_S
 
     def is_late(self, now_s: float) -> bool:
-        """Return True if its reports have come too late to be used in the last three seconds."""
+        """Return True if its reports have come too late to be used in the last ten seconds."""
         return now_s - self._late_s <= _LATE_FOR_S
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
@@ -228,9 +228,9 @@ class Autopilot:
     def _hear_report(self, message: Message, now_s: float) -> None:
         kind = message.get_type()
         if kind in _TIMED_REPORTS:
-            self.delay_s = self.clock.delay_s(message.time_boot_ms, now_s)
-        if kind in _MOTION_REPORTS and self.delay_s > LATE_S:
-            self._late_s = now_s
+            self._delay_s = self.clock.delay_s(message.time_boot_ms, now_s)
+        if kind in _MOTION_REPORTS and self._delay_s > LATE_S:
+            self.late_by_s, self._late_s = self._delay_s, now_s
             return  # on a link that is full, or after we were stopped: what it says is past
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:

@@ -224,6 +224,6 @@ def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
     assert autopilot.conversation.vehicle_at(autopilot.clock.now_s).roll_deg is None
     assert any("link full: reports" in text for text in texts)
     autopilot.timesync_s = 0.0
-    texts = [text for _ in range(8) for text in report_late(autopilot, 0.05)]
+    texts = [text for _ in range(12) for text in report_late(autopilot, 0.05)]
     assert autopilot.clock.now_s - autopilot.vehicle.t_heard_s < 0.2
     assert any("in time again" in text for text in texts)
