@@ -1,0 +1,39 @@
+"""The commands in README, tutorials and how-to pages: each can be typed, and those of README run."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from edgevpr.cli.main import command_line
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "deploy/README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"^```(?:sh|text|console)?\n(.*?)^```", re.M | re.S)
+
+
+def read_commands(page: Path) -> list[str]:
+    """Return the commands of edgevpr in the blocks of a page, without prompts, comments and continuations."""
+    commands = []
+    for block in BLOCK.findall(page.read_text("utf-8")):
+        lines = block.replace("\\\n", " ").splitlines()
+        is_session = any(line.startswith("$ ") for line in lines)
+        for line in lines:
+            if is_session and not line.startswith("$ "):
+                continue
+            for command in re.split(r"&&|;|\|", line.removeprefix("$ ").partition("  #")[0]):
+                words = command.strip()
+                if words.startswith("edgevpr ") and "..." not in words:
+                    commands.append(words)
+    return commands
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_of_a_page_can_be_typed(page, capsys):
+    parser = command_line()
+    for command in read_commands(page):
+        try:
+            parser.parse_args(shlex.split(command, comments=True)[1:])
+        except SystemExit as ended:
+            assert ended.code == 0, f"{command}: {capsys.readouterr().err}"
