@@ -1,4 +1,4 @@
-"""The commands in README, tutorials and how-to pages: each can be typed, and those of README run."""
+"""The commands in README, tutorials and how-to pages: each can be typed as it stands."""
 
 import re
 import shlex
@@ -29,11 +29,15 @@ def read_commands(page: Path) -> list[str]:
     return commands
 
 
+def is_valid(command: str) -> bool:
+    """Return whether the command line takes a command; a wrong one is explained on stderr."""
+    try:
+        command_line().parse_args(shlex.split(command, comments=True)[1:])
+    except SystemExit as ended:
+        return ended.code == 0
+    return True
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_of_a_page_can_be_typed(page, capsys):
-    parser = command_line()
-    for command in read_commands(page):
-        try:
-            parser.parse_args(shlex.split(command, comments=True)[1:])
-        except SystemExit as ended:
-            assert ended.code == 0, f"{command}: {capsys.readouterr().err}"
+def test_commands_of_a_page_can_be_typed(page):
+    assert [command for command in read_commands(page) if not is_valid(command)] == []
