@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from threading import Lock
 
-from edgevpr.core.geodesy import distance_m, moved, offset_m
+from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import FRAME_TIME_SD_S, Vehicle
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import BETWEEN_S
@@ -20,6 +20,7 @@ from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, R
 from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
 from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import over_ground
+from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviation that is added to that of a fix, beside that of the time of its frame: half a degree.
@@ -38,12 +39,10 @@ _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-_ALIKE, _PX4_ALIKE, _LEAN_GOOD_FOR_S = math.sqrt(50), 1.5, 5.0
+_ALIKE = math.sqrt(50)
+_PX4_ALIKE = 1.5
+_LEAN_GOOD_FOR_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
-_FASTEST_M_S = 2.0  # speed of a correction: ArduPilot did not follow a jump of 25 m for 8 s
-# A position that is farther behind jumps: a filter refuses it for seven to ten seconds, then begins there, which is
-# sooner than it is caught up with, and meanwhile nothing is sent that is far from what we know.
-_FARTHEST_BEHIND_M = 40.0
 _OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS may still be where that put it
 # A receiver that has been lost and is steady for so long is left to the autopilot; until the second time "no fix" is
 # sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
@@ -51,7 +50,8 @@ _BACK_S = 1.0
 _TAKEN_BACK_S = 3.0
 _MOST_CORRECTED = 2.0  # beyond this ratio of heights, motion between pictures is not used
 _ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
-_UNHEARD, _UNHEARD_S = "nothing is heard of the vehicle", 5.0
+_UNHEARD = "nothing is heard of the vehicle"
+_UNHEARD_S = 5.0
 _CONTINUOUS = "taken into the continuous position"
 # With GPS, ArduPilot refuses a fix, and PX4 takes it with a gain that makes its velocity jump.
 _DOUBTED = "not sent: the map has contradicted GPS from the first match on"
@@ -221,11 +221,11 @@ class Navigator(Listener):
             vehicle, estimate = self._vehicle, self._known(t_s)
             self.output = self._next_output(vehicle, estimate)
             if estimate is None or vehicle is None or not self.output.is_sent:
-                self._slew.forget()
+                self._slew.reset()
                 return None
             self._given_s = t_s
             self._watch.note_sent(t_s)
-            lat_deg, lon_deg, behind_m = self._slew.followed(estimate)
+            lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
             east, north = estimate.velocity_m_s
             attitude, alike = self._attitude, self._alike(t_s)
             is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
@@ -236,7 +236,7 @@ class Navigator(Listener):
                 # The autopilot's own altitude may come from us: beside a receiver it is the receiver's.
                 alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
                 velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-                accuracy_m=alike * math.hypot(self._claimed_m(estimate), behind_m),
+                accuracy_m=alike * math.hypot(self._claimed_m(estimate), lag_m),
                 alt_accuracy_m=_ALT_SD_M,
                 speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
                 attitude=None if attitude is None else _in_radians(attitude),
@@ -362,38 +362,6 @@ class Navigator(Listener):
     def _claimed_m(self, estimate: Whereabouts) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
         return max(self._shared_sd_m, estimate.accuracy_m)
-
-
-class Slew:
-    """A position that does not jump, since autopilots do not follow jumps: it moves with the velocity of the estimates,
-    and its error against them shrinks by 2 m/s at most. One that is more than 40 m behind begins anew."""
-
-    def __init__(self) -> None:
-        self._said: Whereabouts | None = None
-        self._at = 0.0, 0.0
-
-    def forget(self) -> None:
-        """Restart at the next estimate."""
-        self._said = None
-
-    def followed(self, estimate: Whereabouts) -> tuple[float, float, float]:
-        """Move towards an estimate that is later than the last one. Returns latitude and longitude in degrees, and the
-        remaining distance to the estimate in metres."""
-        here = estimate.position
-        if self._said is None:
-            self._said, self._at = estimate, (here.lat_deg, here.lon_deg)
-            return *self._at, 0.0
-        step_s = max(0.0, estimate.t_s - self._said.t_s)
-        east_m_s, north_m_s = estimate.velocity_m_s
-        carried = moved(*self._at, step_s * east_m_s, step_s * north_m_s)
-        east_m, north_m = offset_m(*carried, here.lat_deg, here.lon_deg)
-        behind_m = math.hypot(east_m, north_m)
-        if behind_m > _FARTHEST_BEHIND_M:
-            self.forget()
-            return self.followed(estimate)
-        part = min(1.0, _FASTEST_M_S * step_s / behind_m) if behind_m > 0 else 1.0
-        self._said, self._at = estimate, moved(*carried, part * float(east_m), part * float(north_m))
-        return *self._at, (1 - part) * behind_m
 
 
 def _choose_drift(channel: Channel) -> Drift:

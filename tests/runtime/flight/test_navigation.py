@@ -14,7 +14,7 @@ from edgevpr.runtime.flight import drift
 from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
 from edgevpr.runtime.flight.navigation import Navigation
-from edgevpr.runtime.flight.navigator import Slew
+from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.perspective import Lean
 from edgevpr.runtime.recognise.stride import Stride
 
@@ -244,14 +244,14 @@ def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
     flown = Flown(RECKONED)
     slew = Slew()
     flown.fly(10, has_gps=True)
-    behind_m = [slew.followed(flown.navigation.at(flown.t_s))[2] for _ in range(2)]
+    behind_m = [slew.follow(flown.navigation.at(flown.t_s))[2] for _ in range(2)]
     assert behind_m == [0.0, 0.0]
     flown.fix((30.0, 0.0), Weighed(is_against=True))
     last, steps_m, behind_m = None, [], []
     for _ in range(150):
         flown.fly(0.1, fixes=False)
         here = flown.navigation.at(flown.t_s)
-        lat_deg, lon_deg, behind = slew.followed(here)
+        lat_deg, lon_deg, behind = slew.follow(here)
         behind_m.append(behind)
         if last:
             steps_m.append(float(distance_m(*last, lat_deg, lon_deg)))
@@ -259,8 +259,8 @@ def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
     assert behind_m[0] > 20
     assert behind_m[-1] == pytest.approx(0.0, abs=0.2)
     assert max(steps_m) < 0.1 * (12 + 2 + 3), "its own speed, the catching up, and what the filter thinks of the speed"
-    slew.forget()
-    assert slew.followed(flown.navigation.at(flown.t_s))[2] == 0.0
+    slew.reset()
+    assert slew.follow(flown.navigation.at(flown.t_s))[2] == 0.0
 
 
 class Received:
