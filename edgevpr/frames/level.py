@@ -18,7 +18,10 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import shrunk
 from edgevpr.frames.lens import CalibratedLens, Remap, sight_of
 
-MOST_TILT_DEG = 45.0
+MAX_TILT_DEG = 60.0
+# Without a lens an image is not levelled, and beyond this tilt it looks otherwise than straight down. With one, the
+# ground under the aircraft lies at the edge of the image or outside, and the middle of the image takes its place.
+MAX_TILT_UNLEVELLED_DEG = 20.0
 _MOST_OFF_DOWN_DEG = 85.0  # between a corner's ray and straight down: beyond are the horizon and far too distant ground
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
@@ -146,6 +149,7 @@ def levelled(
         view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, focal=focal)
         return straightened(frame.image, overlay, view, lens.calibrated)
 
+    below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
     side = min(taking.longest_px, _LONGEST_PX)
     out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
     turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
@@ -216,7 +220,7 @@ def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN)
         return UNKNOWN_VIEW
     ahead, right, down = (_level_from_body(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
-    if tilt_deg > MOST_TILT_DEG:
+    if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
         return View(reason=f"it is tilted {tilt_deg:.0f} degrees")
     if heading_deg is None or height_m is None or not 0 <= height_m <= _HIGHEST_M:
         return UNKNOWN_VIEW
@@ -258,7 +262,7 @@ class _Taking:
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
         rays = self.straight @ self.lens_from_pixel @ self.corners
         lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
-        self.is_too_tilted = self.tilt_deg > MOST_TILT_DEG or lowest < math.cos(math.radians(_MOST_OFF_DOWN_DEG))
+        self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG or lowest < math.cos(math.radians(_MOST_OFF_DOWN_DEG))
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> "_Homography | Remap":

@@ -159,12 +159,12 @@ def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
 @pytest.mark.slow
 def test_a_tilt_that_a_picture_does_not_bear_is_said_once(walk, ground, caplog):
     asked = walk(scaling())
-    steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 50.0})
+    steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 65.0})
     with caplog.at_level(logging.WARNING):
         reasons = [asked.step(steep).view.reason for _ in range(3)]
-    assert reasons == ["it is tilted 50 degrees"] * 3
+    assert reasons == ["it is tilted 65 degrees"] * 3
     assert [record.message for record in caplog.records] == [
-        "1 is taken as it is, as others like it will be: it is tilted 50 degrees"
+        "1 is taken as it is, as others like it will be: it is tilted 65 degrees"
     ]
 
 
@@ -205,7 +205,7 @@ def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, 
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 215.0])
-@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (20.0, 0.0), (0.0, -15.0), (-25.0, 10.0)])
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (20.0, 0.0), (0.0, -15.0), (-15.0, 10.0)])
 def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitch_deg, heading_deg):
     how = {"heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
     pose = CameraPose(east_m=0.0, north_m=0.0, height_m=80.0, **how)

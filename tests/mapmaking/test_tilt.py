@@ -1,0 +1,50 @@
+"""The tilt of a camera, by the motion from image to image."""
+
+import numpy as np
+import pytest
+
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
+from edgevpr.mapmaking.tilt import MIN_PAIRS, measure_tilt
+
+CAMERA = Camera(width=320, height=240, focal_px=246.5, noise_sigma=0)
+LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
+
+
+@pytest.fixture(scope="module")
+def ground():
+    rng = np.random.default_rng(1)
+    coarse = rng.integers(60, 200, (120, 120, 3), np.uint8)
+    fine = rng.integers(0, 50, (960, 960, 3), np.uint8)
+    return np.kron(coarse, np.ones((8, 8, 1), np.uint8)) + fine
+
+
+def fly(ground, pitch_deg, count=24):
+    rng = np.random.default_rng(2)
+    for number in range(count):
+        drift_deg = rng.normal(0, 1, 2).tolist()
+        pose = CameraPose(
+            east_m=120,
+            north_m=20 + 6 * number,
+            height_m=50,
+            heading_deg=5 * drift_deg[0],
+            pitch_deg=pitch_deg + drift_deg[1],
+        )
+        yield photograph(ground, 0.25, pose, CAMERA, LIGHT, rng)
+
+
+@pytest.mark.parametrize("pitch_deg", [25, 45])
+def test_measure_tilt_finds_the_tilt_of_a_camera_that_looks_ahead(ground, pitch_deg):
+    tilt = measure_tilt(fly(ground, pitch_deg))
+    assert tilt.pairs >= MIN_PAIRS
+    assert tilt.deg == pytest.approx(pitch_deg, abs=8)
+
+
+def test_measure_tilt_finds_none_of_a_camera_that_looks_straight_down(ground):
+    tilt = measure_tilt(fly(ground, 0))
+    assert tilt is None or tilt.deg < 8
+
+
+def test_measure_tilt_says_nothing_of_images_that_do_not_overlap():
+    rng = np.random.default_rng(3)
+    images = rng.integers(0, 255, (20, 240, 320), np.uint8)
+    assert measure_tilt(images) is None
