@@ -17,19 +17,19 @@ from edgevpr.core.arrays import Doubles, Image
 MAX_UNKNOWN_TILT_DEG = 20.0  # beyond it the ground in the middle lies far from the aircraft: by a third of its height
 TYPICAL_FOV_DEG = 66.0
 MIN_PAIRS = 8
-MAX_GAP = 6  # images from one of a pair to the other, for those taken in quick succession
 _WIDTH_PX = 640
 _FEATURES = 1500
 _REPROJECTION_PX = 3.0
 _MIN_INLIERS = 40
 _MIN_EXTENT = 0.25  # of the longest side, in both directions: points in a corner do not show how motion varies
-_MIN_MOTION = 0.08  # of the longest side
+_MIN_MOTION = 0.1  # of the longest side
 _MIN_SIGMA = 3.0  # of the median: hills tilt single pairs by more than cameras are tilted
 _MEDIAN_SD = 1.86  # standard deviation of a median of n normal values over their median absolute deviation / sqrt(n)
 
 
 class Tilt(NamedTuple):
-    """Tilt of a camera from straight down in degrees, as `pairs` of images show it."""
+    """Tilt of a camera from straight down in degrees, as `pairs` of images show it: rather too small, by up to a third,
+    since the far ground has fewer features."""
 
     deg: float
     pairs: int
@@ -43,14 +43,13 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
     orb = cv2.ORB.create(_FEATURES)
     slopes: list[Doubles] = []
     reference: _Features | None = None
-    gap = 0
     for features in filter(None, (_detect(orb, image) for image in images)):
-        gap += 1
-        slope = _motion_slope(reference, features) if reference else None
-        if slope is not None:
-            slopes.append(slope)
-        if slope is not None or gap > MAX_GAP or reference is None:
-            reference, gap = features, 0
+        motion = _measure_motion(reference, features) if reference else None
+        if motion and motion.length < _MIN_MOTION:
+            continue  # taken in quick succession: the next one shows more
+        if motion:
+            slopes.append(motion.slope)
+        reference = features
     if len(slopes) < MIN_PAIRS:
         return None
     median = np.median(slopes, axis=0)
@@ -79,9 +78,17 @@ def _detect(orb: cv2.ORB, image: Image) -> _Features | None:
     return _Features((np.array([point.pt for point in found]) - middle) / max(small.shape), descriptors)
 
 
-def _motion_slope(before: _Features, after: _Features) -> Doubles | None:
-    """Return how the motion from one image to the next varies across the image, (2,): its relative change per longest
-    side to the right and down, which is the tangent of the tilt over the focal length. None: too little is seen."""
+class _Motion(NamedTuple):
+    """Motion from one image to the next: its `length` in the middle, a share of the longest side, and how it varies
+    across the image, `slope` (2,): its relative change per longest side to the right and down, which is the tangent of
+    the tilt over the focal length."""
+
+    length: float
+    slope: Doubles
+
+
+def _measure_motion(before: _Features, after: _Features) -> _Motion | None:
+    """Return the motion between two images; None if they share too little."""
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(before.descriptors, after.descriptors)
     if len(matches) < _MIN_INLIERS:
         return None
@@ -96,10 +103,8 @@ def _motion_slope(before: _Features, after: _Features) -> Doubles | None:
         return None
     at = np.column_stack([np.ones(len(start)), (start + end) / 2])
     (motion, *slopes), *_ = np.linalg.lstsq(at, end - start, rcond=None)
-    if np.hypot(*motion) < _MIN_MOTION:
-        return None
-    # The slope of the motion is motion x slope (2,), a change of scale and a rotation.
-    (east, south) = motion
-    parts = [[east, 0, 1, 0], [0, east, 0, -1], [south, 0, 0, 1], [0, south, 1, 0]]
+    # The slope of the motion is the motion times `slope`, a change of scale and a rotation.
+    right, down = motion
+    parts = [[right, 0, 1, 0], [0, right, 0, -1], [down, 0, 0, 1], [0, down, 1, 0]]
     found, *_ = np.linalg.lstsq(np.array(parts), np.column_stack(slopes).ravel(), rcond=None)
-    return np.asarray(found[:2])
+    return _Motion(float(np.hypot(*motion)), np.asarray(found[:2]))
