@@ -109,8 +109,8 @@ class Piloted(FlightController):
         checks = {
             "Need Position Estimate": not brain._is_aiding,
             "VisOdom: not healthy": needs_vision and brain.now_s - self._vision_s > 0.3,
-            "GPS 1: Bad fix": brain._source == _GPS and receivers.first.fix_type < FIX_3D,
-            "GPS 2: Bad fix": receivers.has_second and receivers.second.fix_type < FIX_3D,
+            "GPS 1: Bad fix": brain._source == _GPS and receivers.reports[0].fix_type < FIX_3D,
+            "GPS 2: Bad fix": receivers.has_second and receivers.reports[1].fix_type < FIX_3D,
             "GPS 2: not healthy": receivers.has_second and not self.is_second_healthy,
         }
         return next((reason for reason, is_so in checks.items() if is_so), None)

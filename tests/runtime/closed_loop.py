@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Levelled, View
 from edgevpr.lab.simulate.controller import STEP_S, FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
-from edgevpr.lab.simulate.motion import Hover, from_to
+from edgevpr.lab.simulate.motion import Hover, displacement_m
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Health
@@ -156,7 +156,7 @@ class ClosedLoop:
         if before is None or not self.sees_motion:
             return None
         was, from_s, tilt = before
-        moved_m = self.stride_scale * from_to(was.lat_deg, was.lon_deg, truth.lat_deg, truth.lon_deg)
+        moved_m = self.stride_scale * displacement_m(was.point, truth.point)
         moved_m += HEIGHT_M * (self.brain.tilt - tilt) + complex(*self._rng.normal(0, _STRIDE_SD_M, 2))
         return Stride(from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100)
 

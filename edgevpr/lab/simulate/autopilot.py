@@ -21,7 +21,7 @@ from edgevpr.mavlink.ports import Port, open_port
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 _QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
-_WAITING_BYTES = 65_536  # of a port that accepts none: messages beyond that are lost
+_MAX_WAITING_BYTES = 65_536  # of a port that accepts none: messages beyond that are lost
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,8 @@ def run_autopilot(
     gps_until_s: float = math.inf,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> AutopilotSummary:
-    """Simulate an autopilot at `link_url` with `serve`. Its UTC is that of this machine.
+    """Simulate an autopilot at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
+    received. Its UTC is that of this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
@@ -62,36 +63,30 @@ def run_autopilot(
     motion = AlongTrack(track) if track else Motion()
     controller = FlightController(vehicle, motion, gps=gps, gps_until_s=gps_until_s, start_utc_s=time.time())
     for name, text in parameters.items():
-        controller.brain.parameters.set_written(name, text)
-    return serve(controller, link_url, stop)
-
-
-def serve(controller: FlightController, link_url: str, stop: threading.Event | None = None) -> AutopilotSummary:
-    """Connect `controller` to `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
-    received."""
+        controller.brain.parameters.set_text(name, text)
     address = parse_link(link_url)
     try:
-        transport = open_port(address)
+        port = open_port(address)
     except OSError as error:
         raise LinkError(f"{address}: it cannot be opened ({error.strerror or error}): is the other end up?") from error
     log.info("%s is up at %s", controller, address)
-    port = _Conversation(transport, controller)
+    conversation = _Conversation(port, controller)
     try:
-        port.run(stop or threading.Event())
+        conversation.run(stop or threading.Event())
     except KeyboardInterrupt:
         log.debug("%s is asked to end", address)
     except OSError as error:
         log.warning("%s was lost (%s)", address, error)
     finally:
-        transport.close()
-    return port.summary()
+        port.close()
+    return conversation.summary()
 
 
 class _Conversation:
     """Connects a `FlightController` to a port: sends its messages, and passes on and counts those received."""
 
-    def __init__(self, transport: Port, controller: FlightController) -> None:
-        self._transport, self._controller = transport, controller
+    def __init__(self, port: Port, controller: FlightController) -> None:
+        self._port, self._controller = port, controller
         self._packer = mavlink.MAVLink(None, srcSystem=controller.system_id, srcComponent=AUTOPILOT)
         self._receiver = PacketReader()
         self._companion: str | None = None
@@ -103,12 +98,11 @@ class _Conversation:
         """Advance by the clock and answer until `stop` is set."""
         start_s = time.monotonic()
         while not stop.is_set():
-            self._say(self._controller.advance(time.monotonic() - start_s))
-            readable, _, _ = select.select([self._transport], [], [], STEP_S)
-            if readable:
-                for message in self._receiver.feed(self._transport.read()):
-                    self._take(message)
-                    self._say(self._controller.hear(message))
+            self._send(self._controller.advance(time.monotonic() - start_s))
+            readable, _, _ = select.select([self._port], [], [], STEP_S)
+            for message in self._receiver.feed(self._port.read()) if readable else ():
+                self._count(message)
+                self._send(self._controller.hear(message))
 
     def summary(self) -> AutopilotSummary:
         """Return what was received."""
@@ -124,7 +118,7 @@ class _Conversation:
             messages=dict(self._receiver.received),
         )
 
-    def _take(self, message: Message) -> None:
+    def _count(self, message: Message) -> None:
         """Count a received message, and start the motion along the track if a companion does more than ask for
         information. Choose the receiver of the answers: the last companion heard or, before there is one, any sender of
         heartbeats."""
@@ -136,16 +130,16 @@ class _Conversation:
         if message.get_type() == "HEARTBEAT":
             is_companion = message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER
             if is_companion or self._companion is None:
-                self._transport.answer_sender()
+                self._port.answer_sender()
             self._companion = sender if is_companion else self._companion
 
-    def _say(self, messages: list[Message]) -> None:
-        for message in messages if self._transport.connected else ():
+    def _send(self, messages: list[Message]) -> None:
+        for message in messages if self._port.connected else ():
             packet = message.pack(self._packer)
             self._packer.seq = (self._packer.seq + 1) % 256
-            if len(self._waiting) < _WAITING_BYTES:
+            if len(self._waiting) < _MAX_WAITING_BYTES:
                 data = self._waiting + packet
-                self._waiting = data[self._transport.write(data) :]
+                self._waiting = data[self._port.write(data) :]
 
 
 def _is_question(message: Message) -> bool:

@@ -5,10 +5,10 @@ import math
 from collections.abc import Callable
 
 from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
-from edgevpr.lab.simulate.firmware import FAILED, OK, UNSUPPORTED, Firmware
+from edgevpr.lab.simulate.firmware import DENIED, FAILED, OK, UNSUPPORTED, Firmware
 from edgevpr.lab.simulate.motion import Motion
 from edgevpr.lab.simulate.px4_rules import Px4
-from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, SILENT, Report
+from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, Report
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -21,8 +21,6 @@ VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
 }
 _HEARTBEAT_HZ = 1.0
 _UNKNOWN_WIND_M_S = 6.0
-# Messages that do not exist where the position of the vehicle is unknown.
-_WHERE = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN}
 
 
 class FlightController:
@@ -32,6 +30,8 @@ class FlightController:
     to the fixes received, and `reports` the functions that make its messages, by message number. `brain` is the
     simulated firmware."""
 
+    system_id = 1
+
     def __init__(
         self,
         vehicle: str,
@@ -39,21 +39,18 @@ class FlightController:
         *,
         gps: bool,
         gps_until_s: float = math.inf,
-        system_id: int = 1,
         start_utc_s: float = 1_770_000_000.0,
     ) -> None:
         self.brain = VEHICLES[vehicle](motion)
-        self.vehicle, self.system_id, self._gps_until_s = vehicle, system_id, gps_until_s
+        self.brain.start_utc_s = start_utc_s
+        self.vehicle, self._gps_until_s = vehicle, gps_until_s
         self.answers: list[int] = []
-        known = {**REPORTS, self.brain.filter_report: FILTER_REPORTS[self.brain.filter_report]}
-        self.reports: dict[int, Report] = {
-            number: report for number, report in known.items() if motion.is_known or number not in _WHERE
-        }
+        filter_report = self.brain.filter_report
+        self.reports: dict[int, Report] = {**REPORTS, filter_report: FILTER_REPORTS[filter_report]}
         often_hz = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: _HEARTBEAT_HZ, **self.brain.default_hz}
-        self._default_s = {number: 1 / hz for number, hz in often_hz.items() if number in self.reports}
+        self._default_s = {number: 1 / hz for number, hz in often_hz.items()}
         self._interval_s = dict(self._default_s)
         self._due_s = dict.fromkeys(self._interval_s, 0.0)
-        self.brain.start_utc_s = start_utc_s
         if not gps:
             self.brain.lose_gps()
 
@@ -64,26 +61,15 @@ class FlightController:
     @property
     def error_m(self) -> float:
         """Distance in metres between the estimated and the true position."""
-        return abs(self.brain.error_m)
+        return abs(self.brain.estimator.error_m)
 
     def set(self, name: str, value: float) -> None:
         """Set a parameter, as PARAM_SET does. For example, SIM_GPS1_ENABLE 0 switches GPS off."""
         self.brain.parameters.set(name, value)
 
-    def reboot(self) -> None:
-        """Start anew, as after a power cycle: it keeps parameters and forgets message rates, origin and estimate. Its
-        silence meanwhile is left to the caller."""
-        before, self.brain = self.brain, VEHICLES[self.vehicle](self.brain.motion)
-        self.brain.parameters.update(before.parameters)
-        self.brain.start_utc_s, self.brain.truth = before.start_utc_s, before.truth
-        self.brain.now_s = self.brain.booted_s = before.now_s
-        self.brain.is_armed = False
-        self._interval_s = dict(self._default_s)
-        self._due_s = dict.fromkeys(self._interval_s, before.now_s)
-
     def advance(self, now_s: float) -> list[Message]:
         """Simulate up to `now_s` in steps of STEP_S seconds; return the messages sent meanwhile."""
-        said = []
+        messages = []
         while self.brain.now_s + STEP_S <= now_s:
             self.brain.step(STEP_S)
             if self.brain.truth.t_s >= self._gps_until_s:
@@ -93,71 +79,64 @@ class FlightController:
             for number, interval_s in self._interval_s.items():
                 if self.brain.now_s >= self._due_s[number]:
                     self._due_s[number] = max(self._due_s[number] + interval_s, self.brain.now_s)
-                    said += self._made(number)
-        return said
+                    messages += self._make(number)
+        return messages
 
     def hear(self, message: Message) -> list[Message]:
         """Process a received message; return the replies."""
-        if getattr(message, "target_system", 0) not in (0, self.system_id):
+        is_ours = getattr(message, "target_system", 0) in (0, self.system_id)
+        if not is_ours or getattr(message, "target_component", 0) not in (0, AUTOPILOT):
             return []
-        if getattr(message, "target_component", 0) not in (0, AUTOPILOT):
-            return []
+        brain = self.brain
         match message.get_type():
             case "COMMAND_INT" | "COMMAND_LONG":
                 result, answers = self._obey(message)
                 sender = {"target_system": message.get_srcSystem(), "target_component": message.get_srcComponent()}
                 return [mavlink.MAVLink_command_ack_message(message.command, result, **sender), *answers]
             case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
-                return self.brain.parameters.answer(message)
+                return brain.parameters.answer(message)
             case "TIMESYNC" if message.tc1 == 0:
-                return [mavlink.MAVLink_timesync_message(round(self.brain.boot_s * 1e9) + 1, message.ts1)]
+                return [mavlink.MAVLink_timesync_message(round(brain.now_s * 1e9) + 1, message.ts1)]
             case "GPS_INPUT":
-                self.brain.receivers.hear(message, self.brain.now_s)
+                brain.receivers.receive(message, brain.now_s)
             case "ODOMETRY":
-                self.brain.take_odometry(message)
+                brain.take_odometry(message)
             case "GLOBAL_POSITION_SENSOR":
-                self.brain.take_global_position(message)
+                brain.take_global_position(message)
             case "SET_GPS_GLOBAL_ORIGIN":
-                return self._set_origin(message)
+                origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                is_place = abs(origin[0]) <= 90 and abs(origin[1]) <= 180 and origin[:2] != (0, 0)
+                is_set = is_place and brain.set_origin(origin)
+                return self._make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) if is_set else []
         return []
 
     def _obey(self, command: Message) -> tuple[int, list[Message]]:
         """Obey a command. Returns the result (MAV_RESULT) and the messages to send after it."""
         number = int(command.param1) if math.isfinite(command.param1) else -1
-        is_known = number in self.reports or number in SILENT
         match command.command:
             case mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE if command.get_type() == "COMMAND_INT":
                 # PX4 would take it as COMMAND_LONG too, with a latitude in float32.
                 self.answers.append(self.brain.take_fix(command))
                 return self.answers[-1], []
-            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if is_known:
-                self._stream(number, command.param2)
-                return OK, []
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                return mavlink.MAV_RESULT_DENIED, []
+                return self._set_interval(number, command.param2), []
             case mavlink.MAV_CMD_REQUEST_MESSAGE:
-                return OK if is_known else FAILED, self._made(number)
+                return OK if number in self.reports else FAILED, self._make(number)
             case mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
                 return self.brain.use_source_set(command.param1), []
         return UNSUPPORTED, []
 
-    def _stream(self, number: int, interval_us: float) -> None:
-        """Set the interval of message `number` in microseconds (-1: never, 0: default)."""
-        if number in SILENT or not math.isfinite(interval_us):
-            return
+    def _set_interval(self, number: int, interval_us: float) -> int:
+        """Set the interval of message `number` in microseconds (-1: never, 0: default). Returns a MAV_RESULT."""
+        if number not in self.reports or not math.isfinite(interval_us):
+            return DENIED
         interval_s = self._default_s.get(number, 0.0) if interval_us == 0 else interval_us / 1e6
         if interval_s <= 0:
             self._interval_s.pop(number, None)
         else:
             self._interval_s[number], self._due_s[number] = interval_s, self.brain.now_s
+        return OK
 
-    def _made(self, number: int) -> list[Message]:
+    def _make(self, number: int) -> list[Message]:
         message = self.reports[number](self.brain) if number in self.reports else None
         return [message] if message else []
-
-    def _set_origin(self, message: Message) -> list[Message]:
-        lat_deg, lon_deg = message.latitude / 1e7, message.longitude / 1e7
-        is_place = abs(lat_deg) <= 90 and abs(lon_deg) <= 180 and (lat_deg, lon_deg) != (0, 0)
-        if not is_place or not self.brain.set_origin((lat_deg, lon_deg, message.altitude / 1e3)):
-            return []
-        return self._made(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)

@@ -1,5 +1,4 @@
-"""The errors of a simulated autopilot's position estimator. Used by `firmware`. East and north are one complex number,
-east + 1j * north.
+"""The errors of a simulated autopilot's position estimator. Used by `firmware`. Vectors are east + 1j * north.
 
 NavEKF3 and EKF2 estimate position, velocity and attitude together: a position or velocity that contradicts the inertial
 sensors is explained by a tilt too. This is the same Kalman filter for a level vehicle: of each axis the position, the
@@ -20,17 +19,13 @@ _ACCELERATION_NOISE_M_S2 = 0.35  # EK3_ACC_P_NSE
 _GYRO_NOISE_RAD_S = 0.015  # EK3_GYRO_P_NSE
 _POSITION_NOISE_M = 0.05  # in one second
 _MAX_TILT = math.tan(math.radians(5.0))
-_NOISE = np.diag(
-    np.square(
-        [_POSITION_NOISE_M, math.sqrt(_LOOP_S) * _ACCELERATION_NOISE_M_S2, math.sqrt(_LOOP_S) * _GYRO_NOISE_RAD_S]
-    )
-)
+_NOISE = np.diag([_POSITION_NOISE_M**2, _LOOP_S * _ACCELERATION_NOISE_M_S2**2, _LOOP_S * _GYRO_NOISE_RAD_S**2])
 
 
 class Estimator:
     """The estimate minus the truth: `error_m` of the position, `velocity_error_m_s`, and `tilt`, the share of gravity
-    that the error of the attitude takes for an acceleration; all complex. `gyro_error_rad_s` is how fast the tilt goes
-    wrong by itself, in each axis."""
+    that the error of the attitude takes for an acceleration. `gyro_error_rad_s` is how fast the tilt goes wrong by
+    itself, in each axis. `sd_m` and `speed_sd_m_s` are the standard deviations that the filter assumes, of one axis."""
 
     def __init__(self, gyro_error_rad_s: float) -> None:
         self._state = np.zeros(3, complex)
@@ -55,12 +50,10 @@ class Estimator:
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of the position, one axis, as the filter knows it."""
         return math.sqrt(self._covariance[0, 0])
 
     @property
     def speed_sd_m_s(self) -> float:
-        """Standard deviation of the velocity, one axis, as the filter knows it."""
         return math.sqrt(self._covariance[1, 1])
 
     def predict(self, step_s: float) -> None:

@@ -1,5 +1,5 @@
 """The common part of the simulated firmwares, ArduPilot and PX4: parameters and a position estimator. The error of the
-estimate grows by a simple model. East and north are one complex number, east + 1j * north."""
+estimate grows by a simple model. A point is (latitude, longitude) in degrees, a vector east + 1j * north."""
 
 import cmath
 import math
@@ -8,10 +8,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.estimator import Estimator
-from edgevpr.lab.simulate.motion import Motion, beside, from_to
-from edgevpr.lab.simulate.sensors import ExternalNavigation, Origin, PositionMeasurement, Receivers
+from edgevpr.lab.simulate.motion import Motion, displace, displacement_m
+from edgevpr.lab.simulate.sensors import PositionMeasurement, Receivers
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
 # Standard deviations that an innovation may have: EK3_POS_I_GATE, EK3_VEL_I_GATE, EKF2_GPS_P_GATE
@@ -21,17 +22,20 @@ FAILED: int = mavlink.MAV_RESULT_FAILED
 DENIED: int = mavlink.MAV_RESULT_DENIED
 NOT_NOW: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
-SD_GROWS_M_S = {"plane": 1.0, "copter": 3.0}
+_DRIFT_SD_M_S = {"plane": 1.0, "copter": 3.0}
 # EK3_POSNE_M_NSE and EK3_VELNE_M_NSE, EKF2_GPS_P_NOISE and EKF2_GPS_V_NOISE: no measurement counts for better.
-POSITION_NOISE_M, _VELOCITY_NOISE_M_S = 0.5, 0.3
+POSITION_NOISE_M = 0.5
+_VELOCITY_NOISE_M_S = 0.3
 # Of a vehicle that obeys its estimate. With it a copter whose autopilot is sent its own estimate is 119 m away after
 # 55 s and 285 m after 75 s; real ones were 120 m and 330 m away.
 _GYRO_ERROR_RAD_S = math.radians(0.02)
 _INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter dead-reckons
 _WIND_LEARNT_IN_S = 5.0
 _NAME_BYTES = 16
-_MOST = 2**31 - 1
+_MAX_VALUE = 2**31 - 1
 _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_WING}
+
+Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea level
 
 
 class Firmware(ABC):
@@ -41,32 +45,27 @@ class Firmware(ABC):
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
-    filter_report: ClassVar[int]
+    filter_report: ClassVar[int]  # number of the message
     default_hz: ClassVar[Mapping[int, float]] = {}
+    velocity_ratio = 0.1  # innovation of measured velocities to their gate
 
     def __init__(self, kind: str, motion: Motion, parameters: dict[str, float]) -> None:
         self.kind, self.motion = kind, motion
         self.vehicle_type = _TYPES[kind]
-        is_px4 = self.number == mavlink.MAV_AUTOPILOT_PX4
-        self.parameters = Parameters({**parameters, **SIMULATOR}, bytewise=is_px4)
-        self.receivers, self.external = Receivers(self.parameters), ExternalNavigation(self.parameters)
+        self.parameters = Parameters({**parameters, **SIMULATOR}, self.number == mavlink.MAV_AUTOPILOT_PX4)
+        self.receivers = Receivers(self.parameters)
         self.estimator = Estimator(_GYRO_ERROR_RAD_S if motion.obeys_estimate else 0.0)
         self.origin: Origin | None = None
         self.is_armed = motion.is_flying
         self.test_ratio = 0.0
-        self.start_utc_s = self.booted_s = 0.0
+        self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
         self._wind_m_s = 0j  # as the filter has learnt it
-
-    @property
-    def boot_s(self) -> float:
-        """Seconds since the last boot."""
-        return self.now_s - self.booted_s
 
     def step(self, dt_s: float) -> None:
         """Advance by `dt_s` seconds: motion, sensors, estimator."""
         self.now_s += dt_s
-        self.motion.steer(self.error_m, self.estimator.velocity_error_m_s, self.tilt)
+        self.motion.steer(self.estimator.error_m, self.estimator.velocity_error_m_s, self.tilt)
         self.truth = self.motion.step(self.now_s, dt_s)
         self.receivers.step(self.truth, self.now_s)
         from_deg = self.parameters["SIM_WIND_DIR"]
@@ -80,29 +79,24 @@ class Firmware(ABC):
     def flags(self) -> int:
         """Return the flags of the filter's report (EKF_STATUS_REPORT or ESTIMATOR_STATUS)."""
 
-    @property
-    def velocity_ratio(self) -> float:
-        """Innovation of measured velocities to their gate."""
-        return 0.1
-
     @abstractmethod
     def take_fix(self, command: Message) -> int:
         """Process command 43003: correct the position if it is accepted. Returns a MAV_RESULT."""
 
     @abstractmethod
+    def take_odometry(self, message: Message) -> None:
+        """Process an ODOMETRY (331)."""
+
+    @abstractmethod
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
-        """Advance the estimator by `dt_s` seconds. `wind_m_s` is the true wind, complex."""
+        """Advance the estimator by `dt_s` seconds. `wind_m_s` is the true wind."""
 
     def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
-    def take_odometry(self, message: Message) -> None:
-        """Process an ODOMETRY (331)."""
-        self.external.hear(message, self.now_s)
-
-    def set_origin(self, at: Origin) -> bool:
+    def set_origin(self, origin: Origin) -> bool:
         """Set the origin; the vehicle does not move. Returns True if it was set."""
-        self.origin = at
+        self.origin = origin
         return True
 
     def use_source_set(self, number: float) -> int:
@@ -110,59 +104,61 @@ class Firmware(ABC):
         return UNSUPPORTED
 
     @property
-    def error_m(self) -> complex:
-        """Error of the estimated position, east + 1j * north."""
-        return self.estimator.error_m
-
-    @property
-    def sd_m(self) -> float:
-        """Standard deviation of the position that the estimator assumes, one axis."""
-        return self.estimator.sd_m
-
-    @property
     def tilt(self) -> complex:
         """Error of the attitude (see `Estimator`); where the motion is given, so is the attitude."""
         return self.estimator.tilt if self.motion.obeys_estimate else 0j
 
     @property
-    def place(self) -> tuple[float, float]:
-        """The estimated (latitude, longitude) in degrees."""
-        return beside(self.truth.lat_deg, self.truth.lon_deg, self.error_m)
+    def point(self) -> LatLon:
+        """The estimated position."""
+        return displace(self.truth.point, self.estimator.error_m)
 
     @property
     def velocity_m_s(self) -> complex:
-        """The estimated velocity, east + 1j * north."""
+        """The estimated velocity."""
         return self.truth.velocity_m_s + self.estimator.velocity_error_m_s
 
-    def _innovation_m(self, lat_deg: float, lon_deg: float) -> complex:
-        """Return the vector from the estimate to a point, metres (east + 1j * north)."""
-        return from_to(self.truth.lat_deg, self.truth.lon_deg, lat_deg, lon_deg) - self.error_m
+    def _innovation_m(self, point: LatLon, age_s: float = 0.0) -> complex:
+        """Return the vector from the estimate to a point that was measured `age_s` seconds ago, plus the distance flown
+        since."""
+        return displacement_m(self.truth.point, point) - self.estimator.error_m + self.velocity_m_s * age_s
 
-    def _reset_to(self, lat_deg: float, lon_deg: float, sd_m: float, age_s: float = 0.0) -> None:
-        """Set the estimate to a point that was measured `age_s` seconds ago, plus the distance flown since."""
-        error_m = self.error_m + self._innovation_m(lat_deg, lon_deg) + self.velocity_m_s * age_s
-        self.estimator.reset_position(error_m, sd_m)
+    def _reset_to(self, point: LatLon, sd_m: float, age_s: float = 0.0) -> None:
+        """Set the estimate to a point that was measured `age_s` seconds ago."""
+        self.estimator.reset_position(self.estimator.error_m + self._innovation_m(point, age_s), sd_m)
+
+    def _ratio(self, point: LatLon, sd_m: float, age_s: float = 0.0, gate_sd: float = GATE_SD) -> float:
+        """Return the ratio of the innovation of a position to its gate, `gate_sd` standard deviations."""
+        return abs(self._innovation_m(point, age_s)) / (gate_sd * math.hypot(self.estimator.sd_m, sd_m))
+
+    def _fuse_position(self, point: LatLon, sd_m: float, age_s: float = 0.0, gate_sd: float = GATE_SD) -> bool:
+        """Fuse a position if it is within the gate. Returns True if it was."""
+        is_within = self._ratio(point, sd_m, age_s, gate_sd) <= 1
+        if is_within:
+            self.estimator.correct(0, self._innovation_m(point, age_s), sd_m)
+        return is_within
 
     def _fuse_velocity(self, measured: PositionMeasurement, gate_sd: float = GATE_SD) -> None:
         """Fuse a measured velocity, if there is one within the gate."""
         if measured.velocity_m_s is not None:
-            sd_m_s = max(_VELOCITY_NOISE_M_S, measured.speed_sd_m_s) * measured.noise_scale
+            sd_m_s = max(_VELOCITY_NOISE_M_S, measured.speed_sd_m_s)
             innovation_m_s = measured.velocity_m_s - self.velocity_m_s
             if abs(innovation_m_s) <= gate_sd * math.hypot(self.estimator.speed_sd_m_s, sd_m_s):
                 self.estimator.correct(1, innovation_m_s, sd_m_s)
 
     def _learn_wind(self, wind_m_s: complex) -> None:
-        """Let the filter learn the true wind, complex, from a fused position."""
+        """Let the filter learn the true wind from a fused position."""
         self._wind_m_s += (wind_m_s - self._wind_m_s) * min(1.0, 0.2 / _WIND_LEARNT_IN_S)
 
-    def _go_wrong(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
+    def _drift(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
         """Increase the velocity error of the dead reckoning: of a plane by `unnoticed_share` of the change of wind
         since the filter learnt it, of a copter by the error of its accelerometers."""
-        if self.motion.is_flying:
-            self.estimator.expect_drift(SD_GROWS_M_S[self.kind])
-        if self.kind == "plane" or not self.motion.is_flying:
-            unnoticed_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
-            self.estimator.velocity_error_m_s = unnoticed_m_s if self.motion.is_flying else 0j
+        if not self.motion.is_flying:
+            self.estimator.velocity_error_m_s = 0j
+            return
+        self.estimator.expect_drift(_DRIFT_SD_M_S[self.kind])
+        if self.kind == "plane":
+            self.estimator.velocity_error_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
         else:
             self.estimator.velocity_error_m_s += _INERTIAL_M_S2 * dt_s
 
@@ -179,7 +175,7 @@ class Parameters(dict[str, float]):
         """Set the value of an existing parameter."""
         self[name] = type(self[name])(value)
 
-    def set_written(self, name: str, text: str) -> None:
+    def set_text(self, name: str, text: str) -> None:
         """Set a parameter from the user's text. Raises UsageError for an unknown name, and for an invalid value."""
         if name not in self:
             raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self))}.")
@@ -187,10 +183,10 @@ class Parameters(dict[str, float]):
             value = type(self[name])(text)
         except ValueError:
             value = math.nan
-        if not -_MOST <= value <= _MOST:  # false for NaN
+        if not -_MAX_VALUE <= value <= _MAX_VALUE:  # false for NaN
             wanted = "a whole number" if isinstance(self[name], int) else "a number"
             raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self[name]}.")
-        self.set(name, value)
+        self[name] = value
 
     def answer(self, message: Message) -> list[Message]:
         """Return the replies to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""

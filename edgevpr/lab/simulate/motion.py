@@ -1,13 +1,16 @@
 """The motion of a simulated vehicle: along a recorded track, at an unknown place, or where its autopilot's estimate
-leads it. Used by the simulated autopilots. East and north are one complex number, east + 1j * north."""
+leads it. A point is (latitude, longitude) in degrees; a vector on the ground is one complex number, east + 1j * north.
+"""
 
 import cmath
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
+from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m, shorter_deg
 from edgevpr.core.types import Position
@@ -15,16 +18,17 @@ from edgevpr.frames.positions import read_positions
 
 GRAVITY_M_S2 = 9.80665
 _MAX_ACCELERATION_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(30.0))
-_MAX_SPEED_M_S = 5.0  # of a correction
-_SPEED_FOR_M, _ACCELERATION_FOR_M_S = 0.5, 1.5  # gains of the position controller: 1/s
+_MAX_CORRECTION_M_S = 5.0
+_SPEED_GAIN_HZ = 0.5
+_ACCELERATION_GAIN_HZ = 1.5
+_ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrueState:
     """The true state of the vehicle: position in degrees, `alt_m` above sea level, `height_m` above the ground,
-    velocity over the ground (east + 1j * north) and climb rate upwards. Angles and height are NaN where unknown. On a
-    track, `t_s` are the seconds from its start. `acceleration_m_s2` is horizontal (east + 1j * north); a recorded track
-    has none."""
+    velocity over the ground and climb rate upwards. Angles and height are NaN where unknown. On a track, `t_s` are the
+    seconds from its start. `acceleration_m_s2` is horizontal; a recorded track has none."""
 
     lat_deg: float
     lon_deg: float
@@ -37,6 +41,10 @@ class TrueState:
     heading_deg: float = math.nan
     t_s: float = 0.0
     acceleration_m_s2: complex = 0j
+
+    @property
+    def point(self) -> LatLon:
+        return self.lat_deg, self.lon_deg
 
 
 FlownTrack = Sequence[TrueState]  # the path of a vehicle, in the order of time
@@ -51,7 +59,7 @@ class Motion:
     obeys_estimate = False
 
     def begin(self, now_s: float) -> None:
-        """Note that at `now_s` an onboard computer in flight was heard."""
+        """Start the track, if there is one: an onboard computer in flight was heard."""
 
     def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
         """Steer by an estimate with these errors (see `Estimator`), if the vehicle obeys it."""
@@ -71,25 +79,26 @@ class Hover(Motion):
 
     def __init__(self, home: Position, height_m: float, velocity_m_s: complex = 0j) -> None:
         self._home, self._height_m, self._cruise_m_s = home, height_m, velocity_m_s
-        self._target_m = self._at_m = self._acceleration_m_s2 = 0j
+        self._target_m = self._offset_m = self._acceleration_m_s2 = 0j
         self._velocity_m_s = velocity_m_s
         self._heading_deg = 90 - math.degrees(cmath.phase(velocity_m_s)) if velocity_m_s else 0.0
 
     @property
     def away_m(self) -> float:
-        return abs(self._at_m - self._target_m)
+        return abs(self._offset_m - self._target_m)
 
     def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
-        seen_m, seen_m_s = self._at_m + error_m, self._velocity_m_s + velocity_error_m_s
-        wanted_m_s = self._cruise_m_s + _limited(_SPEED_FOR_M * (self._target_m - seen_m), _MAX_SPEED_M_S)
-        wanted_m_s2 = _limited(_ACCELERATION_FOR_M_S * (wanted_m_s - seen_m_s), _MAX_ACCELERATION_M_S2)
-        self._acceleration_m_s2 = wanted_m_s2 - GRAVITY_M_S2 * tilt
+        to_target_m = self._target_m - (self._offset_m + error_m)
+        wanted_m_s = self._cruise_m_s + _limit(_SPEED_GAIN_HZ * to_target_m, _MAX_CORRECTION_M_S)
+        missing_m_s = wanted_m_s - (self._velocity_m_s + velocity_error_m_s)
+        self._acceleration_m_s2 = _limit(_ACCELERATION_GAIN_HZ * missing_m_s, _MAX_ACCELERATION_M_S2)
+        self._acceleration_m_s2 -= GRAVITY_M_S2 * tilt
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
         self._target_m += self._cruise_m_s * dt_s
-        self._at_m += self._velocity_m_s * dt_s + self._acceleration_m_s2 * dt_s**2 / 2
+        self._offset_m += self._velocity_m_s * dt_s + self._acceleration_m_s2 * dt_s**2 / 2
         self._velocity_m_s += self._acceleration_m_s2 * dt_s
-        lat_deg, lon_deg = beside(self._home.lat_deg, self._home.lon_deg, self._at_m)
+        lat_deg, lon_deg = displace((self._home.lat_deg, self._home.lon_deg), self._offset_m)
         roll_deg, pitch_deg = tilt_for(self._acceleration_m_s2, self._heading_deg)
         return TrueState(
             lat_deg=lat_deg,
@@ -124,30 +133,30 @@ class AlongTrack(Motion):
 def read_track(csv_path: str | Path) -> list[TrueState]:
     """Read the rows of a positions.csv with position and time, sorted by time. Without roll and pitch the vehicle flies
     level, without a heading along its way. Raises UsageError if there are no such rows."""
-    track = []
-    for tag in read_positions(csv_path).values():
-        if tag.position and tag.t_utc_s is not None:
-            track.append(
-                TrueState(
-                    lat_deg=tag.position.lat_deg,
-                    lon_deg=tag.position.lon_deg,
-                    alt_m=tag.position.alt_m or 0.0,
-                    height_m=math.nan if tag.height_m is None else tag.height_m,
-                    roll_deg=tag.roll_deg or 0.0,
-                    pitch_deg=tag.pitch_deg or 0.0,
-                    heading_deg=math.nan if tag.heading_deg is None else tag.heading_deg,
-                    t_s=tag.t_utc_s,
-                )
-            )
-    if not track:
+    rows = [
+        (tag.t_utc_s, tag.position, tag)
+        for tag in read_positions(csv_path).values()
+        if tag.position and tag.t_utc_s is not None
+    ]
+    if not rows:
         raise UsageError(f"{csv_path} has no row with lat, lon and time: a track needs them.")
-    track.sort(key=lambda state: state.t_s)
-    start_s, course_deg = track[0].t_s, math.nan
-    for number, (state, ahead) in enumerate(zip(track, [*track[1:], track[-1]], strict=True)):
-        if way_m := from_to(state.lat_deg, state.lon_deg, ahead.lat_deg, ahead.lon_deg):
+    rows.sort(key=lambda row: row[0])
+    points = [(position.lat_deg, position.lon_deg) for _, position, _ in rows]
+    track, course_deg = [], math.nan
+    for (t_s, position, tag), (here, ahead) in zip(rows, pairwise([*points, points[-1]]), strict=True):
+        if way_m := displacement_m(here, ahead):
             course_deg = math.degrees(math.atan2(way_m.real, way_m.imag)) % 360
-        heading_deg = course_deg if math.isnan(state.heading_deg) else state.heading_deg
-        track[number] = replace(state, t_s=state.t_s - start_s, heading_deg=heading_deg)
+        state = TrueState(
+            lat_deg=position.lat_deg,
+            lon_deg=position.lon_deg,
+            alt_m=position.alt_m or 0.0,
+            height_m=math.nan if tag.height_m is None else tag.height_m,
+            roll_deg=tag.roll_deg or 0.0,
+            pitch_deg=tag.pitch_deg or 0.0,
+            heading_deg=course_deg if tag.heading_deg is None else tag.heading_deg,
+            t_s=t_s - rows[0][0],
+        )
+        track.append(state)
     return track
 
 
@@ -160,43 +169,34 @@ def truth_at(track: FlownTrack, t_s: float) -> TrueState:
         return passed
     ahead = track[leg]
     share = (t_s - passed.t_s) / (ahead.t_s - passed.t_s)
-    way_m = from_to(passed.lat_deg, passed.lon_deg, ahead.lat_deg, ahead.lon_deg)
-    angles = {name: getattr(passed, name) for name in ("roll_deg", "pitch_deg", "heading_deg")}
-    return replace(
-        passed,
-        lat_deg=passed.lat_deg + share * (ahead.lat_deg - passed.lat_deg),
-        lon_deg=passed.lon_deg + share * (ahead.lon_deg - passed.lon_deg),
-        alt_m=passed.alt_m + share * (ahead.alt_m - passed.alt_m),
-        height_m=_between(passed.height_m, ahead.height_m - passed.height_m, share),
-        velocity_m_s=way_m / (ahead.t_s - passed.t_s),
-        **{name: _between(angle, shorter_deg(getattr(ahead, name) - angle), share) for name, angle in angles.items()},
-        t_s=t_s,
-    )
+    values = {}
+    for name in ("lat_deg", "lon_deg", "alt_m", "height_m", "roll_deg", "pitch_deg", "heading_deg"):
+        change = getattr(ahead, name) - getattr(passed, name)
+        if not math.isnan(change):
+            values[name] = getattr(passed, name) + share * (shorter_deg(change) if name in _ANGLES else change)
+    velocity_m_s = displacement_m(passed.point, ahead.point) / (ahead.t_s - passed.t_s)
+    return replace(passed, **values, velocity_m_s=velocity_m_s, t_s=t_s)
 
 
 def tilt_for(acceleration_m_s2: complex, heading_deg: float) -> tuple[float, float]:
     """Return the roll and pitch in degrees of a vehicle that only thrusts along its vertical axis, and accelerates
-    horizontally by this much (east + 1j * north) at constant height."""
+    horizontally by this much at constant height."""
     ahead = acceleration_m_s2 * cmath.rect(1.0, math.radians(heading_deg))  # 1j * forward + right
     thrust_m_s2 = math.hypot(GRAVITY_M_S2, abs(acceleration_m_s2))
     roll = math.asin(ahead.real / thrust_m_s2)
     return math.degrees(roll), -math.degrees(math.atan2(ahead.imag, GRAVITY_M_S2))
 
 
-def _limited(value: complex, most: float) -> complex:
-    return value * min(1.0, most / max(abs(value), 1e-9))
-
-
-def _between(value: float, change: float, share: float) -> float:
-    return value if math.isnan(change) else value + share * change
-
-
-def from_to(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> complex:
-    """Return the vector from one point to another, metres (east + 1j * north)."""
-    east_m, north_m = offset_m(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
+def displacement_m(point: LatLon, other: LatLon) -> complex:
+    """Return the vector from one point to another, metres."""
+    east_m, north_m = offset_m(*point, *other)
     return complex(float(east_m), float(north_m))
 
 
-def beside(lat_deg: float, lon_deg: float, step_m: complex) -> tuple[float, float]:
-    """Return (latitude, longitude) at `step_m` metres (east + 1j * north) from a point: the inverse of `from_to`."""
-    return moved(lat_deg, lon_deg, step_m.real, step_m.imag) if step_m else (lat_deg, lon_deg)
+def displace(point: LatLon, vector_m: complex) -> LatLon:
+    """Return the point that lies `vector_m` metres from another: the inverse of `displacement_m`."""
+    return moved(*point, vector_m.real, vector_m.imag) if vector_m else point
+
+
+def _limit(value: complex, most: float) -> complex:
+    return value * min(1.0, most / max(abs(value), 1e-9))

@@ -1,29 +1,30 @@
 """The simulated PX4: the rules of 1.18-beta1 for its filter EKF2, command 43003, message 296 and ODOMETRY, with the
 flags of a real one in its own simulator. Used by `controller`. They are from EKF2.cpp, ekf.cpp
 (resetGlobalPosToExternalObservation), ekf_helper.cpp (updateHorizontalDeadReckoningstatus, get_ekf_soln_status),
-gps_control.cpp, gnss_checks.cpp, aux_global_position.cpp and ev_pos_control.cpp. A 1.17.0 and a 1.18-beta1 were held
-beside it (test_px4_contract).
+gps_control.cpp, gnss_checks.cpp, aux_global_position.cpp and ev_pos_control.cpp. A 1.17.0 and a 1.18-beta1 were
+compared with it (test_px4_contract).
 
-GPS and ours are fused side by side, each within its gate. One that contradicts the estimate resets it only where the
-other is not active: a GPS that comes back while ours is active is refused.
+GPS and our positions are fused side by side, each within its gate. One that contradicts the estimate resets it only
+where the other is not active: a GPS that comes back while ours is active is refused.
 """
 
 import math
 from dataclasses import dataclass
 
+from edgevpr.core.arrays import LatLon
 from edgevpr.lab.simulate.firmware import FAILED, GATE_SD, NOT_NOW, OK, POSITION_NOISE_M, PX4, Firmware
-from edgevpr.lab.simulate.motion import Motion, beside
+from edgevpr.lab.simulate.motion import Motion, displace
 from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 _AIDING_GONE_S = 1.0  # no_aid_timeout_max
 _GOOD_RATIO = 0.1
 _RESET_AFTER_S = 7.0  # reset_timeout_max
-_SILENT_AFTER_S, _VISION_SILENT_AFTER_S = 5.0, 0.4  # of message 296, and of ODOMETRY
+_SENSOR_SILENT_AFTER_S = 5.0  # message 296
+_VISION_SILENT_AFTER_S = 0.4  # ODOMETRY
 _CHECKS_PASS_AFTER_S = 1.0  # since the last GPS check that failed, in flight
-_VISION_RESETS = 5  # _nb_ev_pos_reset_available
 _GPS_POSITION, _GPS_VELOCITY = 1, 4  # bits of EKF2_GPS_CTRL
-_BIAS_FOLLOWS_S = 10.0
+_BIAS_SHARE = 0.01  # by which the bias of ODOMETRY follows each message, ten a second
 _OLDEST_FIX_S = 15.0
 _DEFAULT_ACCURACY_M = 50.0
 
@@ -34,7 +35,7 @@ class _Aid:
     last one that was fused."""
 
     is_active: bool = False
-    heard_s: float = -math.inf
+    received_s: float = -math.inf
     fused_s: float = -math.inf
 
 
@@ -56,71 +57,83 @@ class Px4(Firmware):
         super().__init__(kind, motion, PX4)
         self._velocity_s = -math.inf  # when the velocity of GPS was last fused
         self._gps, self._ours = _Aid(), _Aid()
-        self._is_vision, self._vision_resets = False, _VISION_RESETS  # ours is ODOMETRY
-        self._vision_bias_m: complex | None = None  # of ODOMETRY beside GPS
+        self._is_vision = False  # ours is ODOMETRY
+        self._vision_bias_m: complex | None = None  # of ODOMETRY while GPS is fused
         self._is_gps_faulty = False
         self._checks_failed_s = self._checks_passed_s = -math.inf
         self._aided_s = -math.inf  # last not purely inertial
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
-        self.origin = self.truth.lat_deg, self.truth.lon_deg, self.truth.alt_m
+        self.origin = (*self.truth.point, self.truth.alt_m)
         self._gps.fused_s = self.now_s - 2 * _AIDING_GONE_S
         self._aided_s = self.now_s - _AIDING_GONE_S
 
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         self.estimator.predict(dt_s)
-        if self.now_s - self._ours.heard_s > self._silent_s:
-            self._ours.is_active = False
-        first = self.receivers.first
-        if first.t_s != self._gps.heard_s:
-            self._gps.heard_s = first.t_s
-            if self._hear_gps(first):
+        silent_s = _VISION_SILENT_AFTER_S if self._is_vision else _SENSOR_SILENT_AFTER_S
+        self._ours.is_active &= self.now_s - self._ours.received_s <= silent_s
+        report = self.receivers.reports[0]
+        if report.t_s != self._gps.received_s:
+            self._gps.received_s = report.t_s
+            if self._take_gps(report):
                 self._learn_wind(wind_m_s)
-        fused_s = max(self._gps.fused_s, self._ours.fused_s)
-        is_aided, is_flying = self.now_s - fused_s < _AIDING_GONE_S, self.motion.is_flying
+        is_aided = self.now_s - max(self._gps.fused_s, self._ours.fused_s) < _AIDING_GONE_S
         if not is_aided:
-            self._go_wrong(wind_m_s, dt_s, 1.0)
-        if is_aided or self.kind == "plane" or not is_flying:
+            self._drift(wind_m_s, dt_s, 1.0)
+        if is_aided or self.kind == "plane" or not self.motion.is_flying:
             self._aided_s = self.now_s
 
-    def _hear_gps(self, measured: PositionMeasurement) -> bool:
+    def _take_gps(self, measured: PositionMeasurement) -> bool:
         """Process a report of GPS (Ekf::controlGpsFusion). Returns True if its position was used."""
         control, gps = int(self.parameters["EKF2_GPS_CTRL"]), self._gps
-        if not control & _GPS_POSITION:
-            gps.is_active = False
+        takes_position = bool(control & _GPS_POSITION)
+        gps.is_active &= takes_position
         if measured.fix_type < FIX_3D or self.parameters["SIM_GPS_SPOOF"] or not control:
             self._checks_failed_s = self.now_s
         if self.now_s - self._checks_failed_s <= _CHECKS_PASS_AFTER_S:
             gps.is_active &= self.now_s - self._checks_passed_s <= _RESET_AFTER_S
             return False
         self._checks_passed_s = self.now_s
-        self.origin = self.origin or (measured.lat_deg, measured.lon_deg, measured.alt_m)
+        self.origin = self.origin or (*measured.point, measured.alt_m)
         if control & _GPS_VELOCITY and not self._is_gps_faulty:
             self._velocity_s = self.now_s
             self._fuse_velocity(measured, math.inf)  # nothing else measures it, so one that contradicts resets it
         sd_m = max(POSITION_NOISE_M, measured.sd_m)
-        innovation_m = self._innovation_m(measured.lat_deg, measured.lon_deg)
-        self.test_ratio = abs(innovation_m) / (GATE_SD * math.hypot(self.sd_m, sd_m))
-        if not control & _GPS_POSITION:
+        self.test_ratio = self._ratio(measured.point, sd_m)
+        if not takes_position:
             return False
-        if self.test_ratio <= 1:
-            self.estimator.correct(0, innovation_m, sd_m)
-        elif gps.is_active and self.now_s - gps.fused_s <= _RESET_AFTER_S:
-            return False
-        elif not self._is_gps_faulty and not self._ours.is_active:
-            self._reset_to(measured.lat_deg, measured.lon_deg, sd_m)
-        else:
-            self._is_gps_faulty |= gps.is_active
-            gps.is_active = False
-            return False
-        if not gps.is_active:
+        was_active, may_reset = gps.is_active, not self._is_gps_faulty and not self._ours.is_active
+        is_used = self._fuse_or_reset(gps, measured.point, sd_m, may_reset=may_reset)
+        if is_used and not was_active:
             self._vision_bias_m = None  # the next ODOMETRY sets it
-        gps.is_active, gps.fused_s, self._is_gps_faulty = True, self.now_s, False
+        self._is_gps_faulty = not is_used and (self._is_gps_faulty or (was_active and not gps.is_active))
+        return is_used
+
+    def _fuse_or_reset(
+        self,
+        aid: _Aid,
+        point: LatLon,
+        sd_m: float,
+        *,
+        may_reset: bool,
+        age_s: float = 0.0,
+        gate_sd: float = GATE_SD,
+    ) -> bool:
+        """Fuse a position within the gate. One that stays outside of it resets the estimate after 7 s or, unless it
+        `may_reset`, is no longer fused. Returns True if it was used."""
+        if not self._fuse_position(point, sd_m, age_s, gate_sd):
+            if aid.is_active and self.now_s - aid.fused_s <= _RESET_AFTER_S:
+                return False
+            if not may_reset:
+                aid.is_active = False
+                return False
+            self._reset_to(point, sd_m, age_s)
+        aid.is_active, aid.fused_s = True, self.now_s
         return True
 
     @property
-    def velocity_ratio(self) -> float:
+    def velocity_ratio(self) -> float:  # type: ignore[override]
         """Innovation of the velocity of GPS to its gate; NaN while none is fused."""
         return _GOOD_RATIO if self.now_s - self._velocity_s < _AIDING_GONE_S else math.nan
 
@@ -151,88 +164,51 @@ class Px4(Firmware):
         self.origin = self.origin or (lat_deg, lon_deg, self.truth.alt_m)
         # Within the gate PX4 corrects velocity and wind too, which is not simulated; the position follows either way.
         age_s = min(max(command.param2, 0.0), _OLDEST_FIX_S) if self._is_valid() else 0.0
-        self._reset_to(lat_deg, lon_deg, accuracy_m, age_s)
+        self._reset_to((lat_deg, lon_deg), accuracy_m, age_s)
         return OK
 
     def take_global_position(self, message: Message) -> None:
-        """Fuse a GLOBAL_POSITION_SENSOR (296). Its time stamps are ignored: EKF2_AGP0_DELAY (ms) is its age."""
-        is_ours = message.id == self.parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
-        if not message.eph > 0 or not is_ours or not int(self.parameters["EKF2_AGP0_CTRL"]) & 1:
+        """Fuse a GLOBAL_POSITION_SENSOR (296, AgpSource::update). Its time stamps are ignored: EKF2_AGP0_DELAY (ms) is
+        its age."""
+        parameters, ours, point = self.parameters, self._ours, (message.lat / 1e7, message.lon / 1e7)
+        is_ours = message.id == parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
+        if not message.eph > 0 or not is_ours or not int(parameters["EKF2_AGP0_CTRL"]) & 1:
             return
-        self._is_vision, noise_m = False, max(message.eph, self.parameters["EKF2_AGP0_NOISE"])
-        self._ours.heard_s = self.now_s
-        lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
+        sd_m, age_s = max(message.eph, parameters["EKF2_AGP0_NOISE"]), parameters["EKF2_AGP0_DELAY"] / 1e3
+        self._is_vision, ours.received_s = False, self.now_s
         if self.origin is None:
-            self.origin = lat_deg, lon_deg, message.alt
-            self._reset_to(lat_deg, lon_deg, noise_m)
-            self._ours.is_active, self._ours.fused_s = True, self.now_s
-        else:
-            self._take_position(lat_deg, lon_deg, noise_m)
-
-    def _take_position(self, lat_deg: float, lon_deg: float, noise_m: float) -> None:
-        """Fuse a position of message 296 (AgpSource::update)."""
-        delay_s, ours = self.parameters["EKF2_AGP0_DELAY"] / 1e3, self._ours
-        if self._correct_within(lat_deg, lon_deg, noise_m, delay_s, self.parameters["EKF2_AGP0_GATE"]):
-            pass
-        elif ours.is_active and self.now_s - ours.fused_s <= _RESET_AFTER_S:
-            return
-        elif not self._gps.is_active:
-            self._reset_to(lat_deg, lon_deg, noise_m, delay_s)
-        else:
-            ours.is_active = False
-            return
-        ours.is_active, ours.fused_s = True, self.now_s
+            self.origin = (*point, message.alt)
+            self._reset_to(point, sd_m)
+        may_reset, gate_sd = not self._gps.is_active, parameters["EKF2_AGP0_GATE"]
+        self._fuse_or_reset(ours, point, sd_m, may_reset=may_reset, age_s=age_s, gate_sd=gate_sd)
 
     def take_odometry(self, message: Message) -> None:
-        """Fuse the position of an ODOMETRY in the local frame, as external vision. Its time stamp is ignored."""
-        variance_m2, is_used = message.pose_covariance[0], int(self.parameters["EKF2_EV_CTRL"]) & 1
-        if not is_used or self.origin is None or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
+        """Fuse the position of an ODOMETRY in the local frame, as external vision (Ekf::controlEvPosFusion). Its time
+        stamp is ignored. While GPS is fused it only shows how the vehicle moves: what it is off by is a bias, which
+        stays when GPS is lost."""
+        parameters, ours, variance_m2 = self.parameters, self._ours, message.pose_covariance[0]
+        if not int(parameters["EKF2_EV_CTRL"]) & 1 or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
             return
-        if not all(map(math.isfinite, (message.x, message.y, message.z, variance_m2))):
+        is_whole = all(map(math.isfinite, (message.x, message.y, message.z, variance_m2)))
+        if self.origin is None or not is_whole:
             return
-        lat_deg, lon_deg = beside(self.origin[0], self.origin[1], complex(message.y, message.x))
-        noise_m = max(math.sqrt(variance_m2), self.parameters["EKF2_EVP_NOISE"])
-        self._is_vision, self._ours.heard_s = True, self.now_s
-        self._take_vision(lat_deg, lon_deg, noise_m)
-
-    def _take_vision(self, lat_deg: float, lon_deg: float, noise_m: float) -> None:
-        """Fuse a position of ODOMETRY (Ekf::controlEvPosFusion). Beside GPS it only shows how the vehicle moves: what
-        it is off by is a bias, which stays when GPS is lost."""
-        ours, delay_s = self._ours, self.parameters["EKF2_EV_DELAY"] / 1e3
-        off_m = self._innovation_m(lat_deg, lon_deg) + self.velocity_m_s * delay_s
+        self._is_vision, ours.received_s = True, self.now_s
+        point = displace(self.origin[:2], complex(message.y, message.x))
+        sd_m, age_s = max(math.sqrt(variance_m2), parameters["EKF2_EVP_NOISE"]), parameters["EKF2_EV_DELAY"] / 1e3
+        off_m = self._innovation_m(point, age_s)
         if self._gps.is_active:
             if self._vision_bias_m is None or not ours.is_active:
                 self._vision_bias_m = off_m
-            self._vision_bias_m += (off_m - self._vision_bias_m) * min(1.0, 0.1 / _BIAS_FOLLOWS_S)
-        lat_deg, lon_deg = beside(lat_deg, lon_deg, -(self._vision_bias_m or 0j))
-        is_used = ours.is_active and self._correct_within(
-            lat_deg, lon_deg, noise_m, delay_s, self.parameters["EKF2_EVP_GATE"]
-        )
-        if not is_used:
+            self._vision_bias_m += (off_m - self._vision_bias_m) * _BIAS_SHARE
+        point = displace(point, -(self._vision_bias_m or 0j))
+        if not ours.is_active or not self._fuse_position(point, sd_m, age_s, parameters["EKF2_EVP_GATE"]):
             if ours.is_active and self.now_s - ours.fused_s <= _AIDING_GONE_S:
                 return
-            if ours.is_active and self._vision_resets == 0:
-                ours.is_active = False
-                return
-            self._vision_resets = self._vision_resets - 1 if ours.is_active else _VISION_RESETS
             if self._gps.is_active:
                 self._vision_bias_m = off_m
             else:
-                self._reset_to(lat_deg, lon_deg, noise_m, delay_s)
+                self._reset_to(point, sd_m, age_s)
         ours.is_active, ours.fused_s = True, self.now_s
-
-    def _correct_within(self, lat_deg: float, lon_deg: float, noise_m: float, delay_s: float, gate_sd: float) -> bool:
-        """Fuse a position that is `delay_s` old if it is within the gate. Returns True if it was."""
-        innovation_m = self._innovation_m(lat_deg, lon_deg) + self.velocity_m_s * delay_s
-        if abs(innovation_m) > gate_sd * math.hypot(self.sd_m, noise_m):
-            return False
-        self.estimator.correct(0, innovation_m, noise_m)
-        return True
-
-    @property
-    def _silent_s(self) -> float:
-        """The time after which no position of ours is fused any more."""
-        return _VISION_SILENT_AFTER_S if self._is_vision else _SILENT_AFTER_S
 
     def _is_valid(self) -> bool:
         return self.now_s - self._aided_s <= self.parameters["EKF2_NOAID_TOUT"] / 1e6

@@ -6,7 +6,7 @@ import pytest
 from freeflight import Piloted
 from pilots import state_at
 
-from edgevpr.lab.simulate.controller import VEHICLES, FlightController
+from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import GRAVITY_M_S2, Hover, TrueState, tilt_for
 from edgevpr.mavlink import messages
@@ -144,7 +144,7 @@ def test_primary_receiver_is_that_with_more_satellites(switch, satellites, secon
     for _ in range(round(seconds * 10) + 15):
         flown.tell(gps_input(flown.truth, 1.0))
         flown.wait(0.1)
-    uses_ours = flown.controller.brain.receivers.primary is flown.controller.brain.receivers.second
+    uses_ours = flown.controller.brain.receivers.primary is flown.controller.brain.receivers.reports[1]
     assert uses_ours == is_ours
 
 
@@ -192,7 +192,7 @@ def test_vehicle_that_is_told_its_own_estimate_runs_away_with_a_tilt():
         brain = controller.brain
         message = gps_input(brain.truth, accuracy_m=5.0)
         velocity_m_s = brain.velocity_m_s
-        message.lat, message.lon = (round(each * 1e7) for each in brain.place)
+        message.lat, message.lon = (round(each * 1e7) for each in brain.point)
         message.ve, message.vn = velocity_m_s.real, velocity_m_s.imag
         return message if brain.now_s > 20 else None
 
@@ -241,7 +241,7 @@ def test_px4_takes_a_fix_while_it_reckons_and_names_no_frame():
     assert flown.wait(60).error_m > 200
     assert flown.fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=math.nan, param3=math.nan) == ACCEPTED
     assert flown.error_m < 1
-    assert flown.controller.brain.sd_m == 50, "where the sender says none"
+    assert flown.controller.brain.estimator.sd_m == 50, "where the sender says none"
     assert flown.fix(param2=math.nan) == NOT_NOW
     assert flown.fix(x=1_000_000_000) == FAILED
 
@@ -366,24 +366,3 @@ def test_accelerometers_and_attitude_show_the_acceleration_and_the_tilt(accelera
         angles_deg = (math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw))
         felt = complex(*over_ground(force_m_s2, *angles_deg))
         assert felt == pytest.approx(acceleration_m_s2 + GRAVITY_M_S2 * error, abs=0.05)
-
-
-@pytest.mark.parametrize("vehicle", VEHICLES)
-def test_a_reboot_keeps_parameters_and_starts_all_else_anew(vehicle):
-    flown = Flown(vehicle).in_air()
-    flown.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_SCALED_IMU, 40_000)
-    flown.controller.set("SIM_WIND_SPD", 3.0)
-    place = flown.truth
-    flown.controller.set("SIM_GPS1_ENABLE", 0)
-    flown.controller.reboot()
-    brain = flown.controller.brain
-    assert (brain.boot_s, brain.origin, brain.is_armed, brain.truth) == (0.0, None, False, place)
-    assert brain.parameters["SIM_WIND_SPD"] == 3.0
-    flown.wait(2.0)
-    assert "SCALED_IMU" not in {message.get_type() for message in flown.said}
-    (answer,) = flown.tell(mavlink.MAVLink_timesync_message(0, 7))
-    assert (answer.ts1, answer.tc1) == (7, pytest.approx(2e9, abs=0.05e9))
-    request = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, *[0] * 6
-    _, time = flown.tell(mavlink.MAVLink_command_long_message(1, 1, *request))
-    assert time.time_boot_ms == pytest.approx(2000, abs=50)
-    assert time.time_unix_usec / 1e6 - flown.controller.brain.start_utc_s == pytest.approx(42.0, abs=0.1), "it goes on"

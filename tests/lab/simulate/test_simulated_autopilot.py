@@ -138,9 +138,9 @@ def test_it_loses_gps_on_its_way_in_a_wind_that_it_does_not_know():
     controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=20)
     controller.brain.motion.begin(0.0)
     controller.advance(19.5)
-    assert (controller.brain.receivers.first.fix_type, round(controller.error_m, 1)) == (6, 0)
+    assert (controller.brain.receivers.reports[0].fix_type, round(controller.error_m, 1)) == (6, 0)
     controller.advance(22.0)
-    assert controller.brain.receivers.first.fix_type == 1
+    assert controller.brain.receivers.reports[0].fix_type == 1
     controller.advance(40.0)
     assert 60 < controller.error_m < 6 * 20
     assert controller.hear(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
