@@ -147,7 +147,7 @@ def _require_seed(args: Namespace) -> None:
 
 def simulate_rehearsal(args: Namespace) -> int:
     """Run `simulate rehearsal`: rehearse a mission over a map, and print what to expect of it."""
-    from edgevpr.lab.simulate.mission import Mission, answer_of, rehearse
+    from edgevpr.lab.simulate.mission import Mission, rehearse
 
     _require_seed(args)
     shots, numbers = _shots_of(args, _REHEARSED)
@@ -155,13 +155,12 @@ def simulate_rehearsal(args: Namespace) -> int:
         place_map=args.map,
         shots=shots,
         orthophoto=args.orthophoto,
-        every_m=numbers["every_m"],
         fov_deg=numbers["fov_deg"],
         seed=args.seed,
         map_images=args.map_images,
     )
-    found = rehearse(mission, Path(args.out))
-    show(found, args.json, of_rehearsal(answer_of(found), found, args.out))
+    report = rehearse(mission, Path(args.out))
+    show(report, args.json, of_rehearsal(report, args.out))
     return 0
 
 

@@ -9,7 +9,7 @@ from edgevpr.cli.shared import lines_of
 from edgevpr.core.text import aligned, beside, nines, shown
 
 if TYPE_CHECKING:
-    from edgevpr.lab.simulate.foreseen import Foreseen
+    from edgevpr.lab.simulate.rehearsal_report import RehearsalReport
     from edgevpr.mapmaking.making import MadeMap
     from edgevpr.mapmaking.moving import MapMove
     from edgevpr.mapmaking.refine import Refined
@@ -155,9 +155,9 @@ def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
         yield f"It ends before the flight: {why_ended}."
 
 
-def of_rehearsal(answer: str, found: "Foreseen", folder: str) -> Iterator[str]:
+def of_rehearsal(found: "RehearsalReport", folder: str) -> Iterator[str]:
     """Yield what a rehearsed mission lets expect: the answer, its figures, and where nothing was recognised."""
-    yield answer
+    yield found.answer
     known_s = f"{found.gps_until_s:.0f} s"
     yield f"  queries          {found.queries} along {found.way_m / 1e3:.1f} km, with GPS for the first {known_s}"
     yield f"  accepted         {found.accepted}, {found.wrong} of them wrong ({found.wrong_from_m:.0f} m off or more)"

@@ -26,8 +26,8 @@ def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
     for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
         (tmp_path / left_over).write_text('{"kind": "query"}\n')
     said = demo.run_demo(tmp_path)
-    answers = demo.read_answers(tmp_path / "flight.jsonl", tmp_path / "flight-1", tmp_path / "flight-2")
-    assert len(answers) == 6
+    queries, _ = demo.read_queries(tmp_path / "flight.jsonl", tmp_path / "flight-1", tmp_path / "flight-2")
+    assert len(queries) == 6
     mavlink = list(flight_of(tmp_path / "flight.jsonl"))[-1]["mavlink"]
     assert mavlink["received"]["HEARTBEAT"] > 0
     assert set(mavlink["acks"]) <= {"ACCEPTED"}

@@ -11,7 +11,7 @@ import pytest
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.camera import ground_to_pixel
-from edgevpr.lab.simulate.demo import read_answers, summary_of
+from edgevpr.lab.simulate.demo import is_right, read_queries, summarise
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -101,16 +101,13 @@ def test_answers_are_judged_by_the_true_positions(tmp_path):
         for query, place, fix_deg in said:
             located = fix_deg and {"lat_deg": fix_deg, "lon_deg": 8.0}
             accepted = fix_deg is not None
-            log.write("query", query=query, reference_image=place, score=0.9, accepted=accepted, located=located)
+            position = {"lat_deg": 50.0 if place == "p0" else 50.001, "lon_deg": 8.0}
+            log.write("query", query=query, position=position, score=0.9, accepted=accepted, located=located)
         log.write("end")
-    answers = read_answers(tmp_path / "log.jsonl", tmp_path / "map", tmp_path / "query")
-    assert [(answer.on_map, answer.is_right) for answer in answers] == [(True, True), (True, False), (False, False)]
-    assert [answer.fix_off_m for answer in answers] == [
-        pytest.approx(5.56, abs=0.01),
-        pytest.approx(88.96, abs=0.1),
-        None,
-    ]
-    assert [re.findall(r"[\d.]+", line) for line in summary_of(answers).split("\n")[1:]] == [
+    queries, places = read_queries(tmp_path / "log.jsonl", tmp_path / "map", tmp_path / "query")
+    assert [is_right(query) for query in queries] == [True, False, False]
+    assert [query.off_m for query in queries] == [pytest.approx(5.56, abs=0.01), pytest.approx(88.96, abs=0.1), None]
+    assert [re.findall(r"[\d.]+", line) for line in summarise(queries, places).split("\n")[1:]] == [
         ["3", "2", "1"],  # queries, on the map, beyond it
         ["1", "0.50", "55"],
         ["2", "1"],  # accepted, wrong
