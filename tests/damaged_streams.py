@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import imageio_ffmpeg
@@ -75,40 +75,43 @@ class Film:
             yield number, picture
 
 
-class Camera(Protocol):
+class Camera:
     """A camera at `uri`, which films when told to `roll`. `sent_s` is when each picture began to leave it, by its
     number, on the monotonic clock; `done` is set once the last one has left."""
 
-    uri: str
-    sent_s: dict[int, float]
-    done: threading.Event
+    uri = ""
 
-    def roll(self) -> None: ...
-
-    def close(self) -> None:
-        """Wait until all is sent, and release the sockets."""
-        ...
-
-
-class MjpegCamera:
-    """MJPEG over HTTP, to one viewer; `damage` changes the JPEG file of a picture."""
-
-    def __init__(self, film: Film, damage: Callable[[bytes], bytes]) -> None:
+    def __init__(self, film: Film) -> None:
         self.sent_s: dict[int, float] = {}
         self.done = threading.Event()
-        self._film, self._damage, self._rolls = film, damage, threading.Event()
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self._server.settimeout(60)
-        self.uri = f"http://127.0.0.1:{self._server.getsockname()[1]}/"
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
+        self._film, self._rolls = film, threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def _start(self, *works: Callable[[], None]) -> None:
+        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
+        for thread in self._threads:
+            thread.start()
 
     def roll(self) -> None:
         self._rolls.set()
 
     def close(self) -> None:
+        """Wait until all is sent, and release the sockets."""
         self._rolls.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
+
+
+class MjpegCamera(Camera):
+    """MJPEG over HTTP, to one viewer; `damage` changes the JPEG file of a picture."""
+
+    def __init__(self, film: Film, damage: Callable[[bytes], bytes]) -> None:
+        super().__init__(film)
+        self._damage = damage
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server.settimeout(60)
+        self.uri = f"http://127.0.0.1:{self._server.getsockname()[1]}/"
+        self._start(self._serve)
 
     def _serve(self) -> None:
         with self._server, self._server.accept()[0] as viewer:
@@ -128,31 +131,27 @@ class MjpegCamera:
         self.done.set()
 
 
-class LossyCamera:
+class LossyCamera(Camera):
     """An encoder of which a share of the datagrams is lost: MPEG-TS over UDP, RTP described by an .sdp file, or an RTSP
     server behind such a lossy radio, which itself loses nothing."""
 
     def __init__(self, film: Film, encoder: tuple[str, ...], transport: str, lost: float, seed: int) -> None:
-        self.sent_s: dict[int, float] = {}
-        self.done = threading.Event()
-        self._film, self._lost, self._random = film, lost, random.Random(seed)
-        self._rolls, self._filmed = threading.Event(), threading.Event()
+        super().__init__(film)
+        self._lost, self._random, self._filmed = lost, random.Random(seed), threading.Event()
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._in.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
         self._in.bind(("127.0.0.1", 0))
         self._in.settimeout(0.2)
         inner, outer = self._in.getsockname()[1], free_port()
         self._viewer = "127.0.0.1", outer
-        self._pictures_begun = _PicturesInTs() if transport == "MPEG-TS" else _PicturesInRtp()
+        self._count_begun, self._stamp = (self._in_ts if transport == "MPEG-TS" else self._in_rtp), b""
         self._folder = tempfile.TemporaryDirectory()
         sdp = Path(self._folder.name) / "camera.sdp"
         target = ["-f", "rtp", "-sdp_file", str(sdp), f"rtp://127.0.0.1:{inner}?pkt_size=1200"]
         if transport == "MPEG-TS":
             target = ["-f", "mpegts", f"udp://127.0.0.1:{inner}?pkt_size=1316"]
         self._encoder = _encoder(film, encoder, target)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._feed, self._hand_on)]
-        for thread in self._threads:
-            thread.start()
+        self._start(self._feed, self._hand_on)
         self._server: RtspCamera | None = None
         self.uri = f"udp://127.0.0.1:{outer}"
         if transport != "MPEG-TS":
@@ -164,13 +163,8 @@ class LossyCamera:
             self._server = RtspCamera(sdp.read_text(), outer, free_port())
             self.uri = self._server.uri
 
-    def roll(self) -> None:
-        self._rolls.set()
-
     def close(self) -> None:
-        self._rolls.set()
-        for thread in self._threads:
-            thread.join()
+        super().close()
         if self._server:
             self._server.switch_off()
         self._folder.cleanup()
@@ -196,7 +190,7 @@ class LossyCamera:
                     if self._filmed.is_set():
                         break
                     continue
-                for _ in range(self._pictures_begun.in_datagram(datagram)):
+                for _ in range(self._count_begun(datagram)):
                     number += 1
                     if number >= 0:
                         self.sent_s[number] = time.monotonic()
@@ -204,22 +198,13 @@ class LossyCamera:
                     out.sendto(datagram, self._viewer)
         self.done.set()
 
-
-class _PicturesInTs:
-    """Counts the pictures that begin in a datagram of MPEG-TS packets: the units of FFmpeg's first stream."""
-
-    def in_datagram(self, datagram: bytes) -> int:
+    def _in_ts(self, datagram: bytes) -> int:
+        """Count the pictures that begin in a datagram of MPEG-TS packets: the units of FFmpeg's first stream."""
         packets = (datagram[start : start + 188] for start in range(0, len(datagram), 188))
         return sum(packet[1] == 0x41 and packet[2] == 0 for packet in packets)
 
-
-class _PicturesInRtp:
-    """Counts the pictures that begin in an RTP datagram, one at most: each has a time stamp of its own."""
-
-    def __init__(self) -> None:
-        self._stamp = b""
-
-    def in_datagram(self, datagram: bytes) -> int:
+    def _in_rtp(self, datagram: bytes) -> int:
+        """Count the pictures that begin in an RTP datagram, one at most: each has a time stamp of its own."""
         before, self._stamp = self._stamp, datagram[4:8]
         return before != self._stamp
 
@@ -234,32 +219,16 @@ def _encoder(film: Film, codec: tuple[str, ...], target: list[str]) -> subproces
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """A way to send a film. `camera` makes the camera of a film that does so, with damage drawn from a seed."""
-
-    name: str
-    is_whole: bool
-    camera: Callable[[Film, int], Camera]
-
-
-def streams() -> list[Stream]:
-    """List all streams."""
-    return [_mjpeg(kind) for kind in _MJPEG] + [
-        _lossy(codec, transport, lost) for codec, transport, shares in _LOSSY for lost in shares
-    ]
-
-
-def _mjpeg(kind: str) -> Stream:
-    name = f"MJPEG over HTTP, {kind}"
-    return Stream(name, kind == "whole", lambda film, seed: MjpegCamera(film, _damage(kind, random.Random(seed))))
-
-
-def _lossy(codec: str, transport: str, lost: float) -> Stream:
-    def camera(film: Film, seed: int) -> Camera:
-        return LossyCamera(film, _ENCODERS[codec], transport, lost, seed)
-
-    return Stream(f"{codec} in {transport}, {lost:.0%} lost", not lost, camera)
+def streams(seed: int) -> dict[str, Callable[[Film], Camera]]:
+    """Return what makes the camera of each stream, by name, with damage drawn from a seed."""
+    cameras: dict[str, Callable[[Film], Camera]] = {}
+    for kind in _MJPEG:
+        cameras[f"MJPEG over HTTP, {kind}"] = partial(MjpegCamera, damage=_damage(kind, random.Random(seed)))
+    for codec, transport, shares in _LOSSY:
+        for lost in shares:
+            way = {"encoder": _ENCODERS[codec], "transport": transport, "lost": lost, "seed": seed}
+            cameras[f"{codec} in {transport}, {lost:.0%} lost"] = partial(LossyCamera, **way)
+    return cameras
 
 
 def _damage(kind: str, dice: random.Random) -> Callable[[bytes], bytes]:
@@ -304,15 +273,13 @@ def run(
     """Send `count` pictures over every stream whose name is wanted, and judge what is delivered; then over some once
     more, with a decoder that is too slow for them."""
     film = Film(picture=picture, count=count, rate_hz=rate_hz, whole_at_first=_WHOLE_AT_FIRST)
-    rows = [
-        _judged(stream.name, stream.is_whole, stream.camera(film, seed)) for stream in streams() if only(stream.name)
-    ]
-    long = replace(film, count=_LONGER * count)
-    for stream in streams():
-        name = f"{stream.name}, decoded too slowly"
-        if stream.name in _TOO_SLOW and only(name):
+    cameras = streams(seed)
+    rows = [_judge(name, make(film)) for name, make in cameras.items() if only(name)]
+    for name in _TOO_SLOW:
+        slow = f"{name}, decoded too slowly"
+        if only(slow):
             with _slow_decoder(_SLOWER / rate_hz):
-                rows.append(_judged(name, False, stream.camera(long, seed)))
+                rows.append(_judge(slow, cameras[name](replace(film, count=_LONGER * count))))
     return rows
 
 
@@ -332,7 +299,7 @@ def _slow_decoder(work_s: float) -> Iterator[None]:
         WholePictures.decode = decode
 
 
-def _judged(stream: str, is_whole: bool, camera: Camera) -> Row:
+def _judge(stream: str, camera: Camera) -> Row:
     source = open_source(camera.uri, live=True)
     camera.roll()
     looked_at = old = broken = 0
@@ -357,7 +324,7 @@ def _judged(stream: str, is_whole: bool, camera: Camera) -> Row:
     camera.close()
     return Row(
         stream=stream,
-        is_whole=is_whole,
+        is_whole=stream.endswith((", whole", " 0% lost")),
         sent=len(camera.sent_s) - (first or 0),
         delivered=delivered,
         refused=refused,

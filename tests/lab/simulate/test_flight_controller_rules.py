@@ -97,17 +97,6 @@ def test_a_plane_drifts_with_the_wind_that_it_does_not_know_only():
     assert unknown.controller.brain.is_armed
 
 
-def test_ardupilot_brings_a_fix_forward_by_five_seconds_at_the_most():
-    flown = lost("arducopter", wind_m_s=0).wait(3)
-    flown.motion.fly(10j, flown.now_s)
-    flown.wait(2)
-    assert flown.fix(north_m=-20, age_s=2.0) == ACCEPTED
-    assert flown.error_m < 1.5
-    flown.motion.fly(10j, flown.now_s)
-    assert flown.wait(2).fix(north_m=-80, age_s=8.0) == ACCEPTED
-    assert flown.error_m == pytest.approx(30, abs=3)
-
-
 def gps_input(place: TrueState, north_m: float = 0.0, satellites: int = 6, fix_type: int = 3, accuracy_m: float = 1.0):
     velocity_m_s = place.velocity_m_s.real, place.velocity_m_s.imag, 0.0
     at = place.lat_deg + north_m / 111_195, place.lon_deg, place.alt_m
@@ -342,12 +331,6 @@ def test_every_parameter_is_listed_with_its_index():
     listed = Flown("px4-copter").tell(mavlink.MAVLink_param_request_list_message(1, 1))
     assert {each.param_id for each in listed} >= {"EKF2_AGP0_CTRL", "SIM_GPS1_ENABLE"}
     assert [each.param_index for each in listed] == list(range(listed[0].param_count))
-
-
-def test_what_is_for_another_is_not_answered():
-    flown = Flown("arducopter")
-    assert flown.tell(mavlink.MAVLink_command_long_message(2, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []
-    assert flown.tell(mavlink.MAVLink_command_long_message(1, 197, 512, 0, 148, 0, 0, 0, 0, 0, 0)) == []
 
 
 @pytest.mark.parametrize("acceleration_m_s2", [3 + 1j, -2j, 0j])

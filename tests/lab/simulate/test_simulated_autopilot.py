@@ -5,7 +5,6 @@ import math
 import socket
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -146,40 +145,34 @@ def test_it_loses_gps_on_its_way_in_a_wind_that_it_does_not_know():
     assert controller.hear(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_it_says_how_it_hangs_in_the_air_where_the_track_knows(tmp_path):
+@pytest.mark.parametrize(
+    ("rows", "attitude_deg", "height_mm", "heading_cdeg"),
+    [
+        (
+            ["roll_deg,pitch_deg,yaw_deg,rel_alt,time,lat,lon,alt", "-12,7,300,80.5,0,50,8,100"],
+            (-12, 7, -60),
+            80_500,
+            30_000,
+        ),
+        (["roll_deg,time,lat,lon", ",10,50.0,8.001", ",0,50.0,8.0"], (0, 0, 90), 0, 9000),
+    ],
+    ids=["known", "level along its way"],
+)
+def test_attitude_is_that_of_the_track_else_level(tmp_path, rows, attitude_deg, height_mm, heading_cdeg):
     csv = tmp_path / "positions.csv"
-    row = "a.jpg,50.000,8.0,100,80.5,300,-12,7,2026-02-14T00:30:00Z"
-    csv.write_text(f"file,lat,lon,alt,rel_alt,yaw_deg,roll_deg,pitch_deg,time\n{row}\n")
+    csv.write_text("\n".join([f"file,{rows[0]}", *(f"{number}.jpg,{row}" for number, row in enumerate(rows[1:]))]))
     controller = FlightController("px4-copter", AlongTrack(read_track(csv)), gps=True)
     said = {message.get_type(): message for message in controller.advance(1.0)}
     attitude, position = said["ATTITUDE"], said["GLOBAL_POSITION_INT"]
-    degrees = [math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw)]
-    assert degrees == pytest.approx((-12, 7, -60), abs=1e-3)
-    assert (position.relative_alt, position.hdg) == (80_500, 30_000)
-
-
-def test_it_flies_level_along_its_way_where_the_track_knows_no_attitude(tmp_path):
-    csv = tmp_path / "positions.csv"
-    csv.write_text("file,lat,lon,roll_deg,time\nb.jpg,50.0,8.001,,10\na.jpg,50.0,8.0,,0\n")
-    assert [(each.roll_deg, each.pitch_deg) for each in read_track(csv)] == [(0.0, 0.0)] * 2
-    controller = FlightController("px4-copter", AlongTrack(read_track(csv)), gps=True)
-    said = {message.get_type(): message for message in controller.advance(1.0)}
-    assert (said["ATTITUDE"].roll, said["ATTITUDE"].pitch) == (0, 0)
-    assert said["GLOBAL_POSITION_INT"].hdg == pytest.approx(9000, abs=1), "east"
+    degrees = [math.degrees(angle) for angle in (attitude.roll, attitude.pitch, attitude.yaw)]
+    assert degrees == pytest.approx(attitude_deg, abs=1e-3)
+    assert (position.relative_alt, position.hdg) == (height_mm, pytest.approx(heading_cdeg, abs=1))
 
 
 def test_a_track_without_times_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
     with pytest.raises(UsageError, match="lon and"):
         read_track(tmp_path / "p.csv")
-
-
-@pytest.mark.parametrize("vehicle", ["arduplane", "px4-copter"])
-def test_it_says_that_it_heard_nobody(vehicle):
-    stop = threading.Event()
-    stop.set()
-    summary = run_autopilot(f"udpin:127.0.0.1:{free_port()}", stop, vehicle=vehicle)
-    assert (summary.messages, summary.companion) == ({}, None)
 
 
 @pytest.mark.parametrize("link", ["tcp:127.0.0.1:{}", "serial:/dev/no-such-device:{}"])
