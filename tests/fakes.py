@@ -1,4 +1,4 @@
-"""Stand-ins for time, a camera, a source of frames and a flight controller's link, for tests of what lies above them.
+"""Stand-ins for time, a source of frames and a flight controller's link, for tests of what lies above them.
 
 Each keeps the promises of the real thing, and `test_fakes.py` holds both to them.
 """
@@ -24,6 +24,13 @@ from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.herald import Herald
+
+_STATES = {
+    Condition.LOST: "lost, reopening in 0.5 s",
+    Condition.FROZEN: "frozen: the same picture over and over",
+    Condition.OPENING: "opening, no picture yet",
+    Condition.ENDED: "ended",
+}
 
 
 class FakeClock:
@@ -93,24 +100,17 @@ class FakeSource:
 
     @property
     def condition(self) -> Condition:
-        if self.is_lost:
-            return Condition.LOST
-        if self.is_frozen:
-            return Condition.FROZEN
-        if self.is_opening:
-            return Condition.OPENING
-        return Condition.ENDED if self.ended else Condition.RUNNING
+        is_in = {
+            Condition.LOST: self.is_lost,
+            Condition.FROZEN: self.is_frozen,
+            Condition.OPENING: self.is_opening,
+            Condition.ENDED: self.ended,
+        }
+        return next((condition for condition, is_so in is_in.items() if is_so), Condition.RUNNING)
 
     @property
     def state(self) -> str:
-        words = {
-            Condition.LOST: "lost, reopening in 0.5 s",
-            Condition.FROZEN: "frozen: the same picture over and over",
-            Condition.OPENING: "opening, no picture yet",
-            Condition.ENDED: "ended",
-            Condition.RUNNING: "streaming" if self.is_live else "reading",
-        }
-        return words[self.condition]
+        return _STATES.get(self.condition, "streaming" if self.is_live else "reading")
 
     def read(self, timeout_s: float) -> Frame | None:
         if not self._left:
@@ -252,25 +252,6 @@ class FakeLink:
             sending.settle(True)
             self._waiting.hear(self.answer, Readiness(gps_s=0.0).why(self.answer, 0.0), self._clock())
             self._acks[self.answer] += 1
-
-
-class FakeCapture:
-    """What OpenCV gives for a camera: pictures one after another, each `work`, and then no more."""
-
-    def __init__(self, pictures: Iterable[np.ndarray], work: Callable[[], None] = lambda: None) -> None:
-        self._left, self._work = iter(pictures), work
-        self.is_released = False
-
-    def get(self, prop: int) -> float:
-        return 0.0
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        self._work()
-        picture = next(self._left, None)
-        return picture is not None, picture
-
-    def release(self) -> None:
-        self.is_released = True
 
 
 def receiver_at(at_deg: tuple[float, float], sd_m: float, t_s: float, **other) -> Receiver:

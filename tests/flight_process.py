@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
+from pictures import textured
 
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -17,21 +17,11 @@ _PATIENCE_S = 60.0
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
-def textured_grey(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Return noise of several sizes, float32 (H, W) 0 to 255."""
-    layers = [rng.random((2**size, 2**size), np.float32) / size for size in range(2, 6)]
-    picture = sum(cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in layers)
-    return cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
-
-
 def write_frames(folder: Path, count: int) -> None:
-    """Write pictures as a camera gives them, 640x480 in colour, as JPEG files: noise of several sizes, and a flat
-    corner, whose regions say nothing."""
+    """Write pictures as a camera gives them, 640x480 in colour, as JPEG files."""
     folder.mkdir()
     for number in range(count):
-        grey = textured_grey(np.random.default_rng(number), 640, 480).astype(np.uint8)
-        grey[:160, :213] = 90
-        cv2.imwrite(str(folder / f"{number:04d}.jpg"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+        cv2.imwrite(str(folder / f"{number:04d}.jpg"), cv2.cvtColor(textured(number, 480, 640), cv2.COLOR_GRAY2BGR))
 
 
 def start(

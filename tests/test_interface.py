@@ -98,9 +98,12 @@ def test_what_cannot_be_done_gets_a_sentence(flight, valley, tmp_path):
 
 
 @pytest.mark.process
-def test_the_package_is_light_until_the_interface_is_asked_for():
-    code = "import sys, edgevpr; assert 'numpy' not in sys.modules; edgevpr.Map; assert 'numpy' in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+@pytest.mark.parametrize("module", ["edgevpr", "edgevpr.cli"])
+def test_import_loads_nothing_heavy_before_it_is_needed(module):
+    code = f"import sys, {module}; print(*sys.modules); edgevpr.Map; assert 'numpy' in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"av", "cv2", "numpy", "onnxruntime", "pymavlink", "yaml", "psutil", "serial"}
+    assert not heavy & set(done.stdout.split())
 
 
 @pytest.mark.process

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from edgevpr.lab.simulate.firmware import Firmware
 from edgevpr.lab.simulate.motion import GRAVITY_M_S2, TrueState, tilt_for
-from edgevpr.lab.simulate.sensors import NO_FIX, NOTHING, PositionMeasurement
+from edgevpr.lab.simulate.sensors import NOTHING, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
 
 Report = Callable[[Firmware], Message | None]
@@ -67,9 +67,7 @@ def _specific_force(brain: Firmware) -> Message:
 
 def _gps(report: PositionMeasurement, brain: Firmware) -> dict[str, int]:
     """Return the fields that GPS_RAW_INT and GPS2_RAW share."""
-    if report is NOTHING or not brain.motion.is_known:  # a second GPS that is silent
-        lost = {"lat": 0, "lon": 0, "alt": 0, "eph": 9999, "epv": 9999, "vel": 0, "cog": 0}
-        return {"time_usec": 0, "fix_type": NO_FIX, **lost, "satellites_visible": 0}
+    report = report if brain.motion.is_known else NOTHING
     velocity_m_s = report.velocity_m_s or 0j
     return {
         "time_usec": round(report.t_s * 1e6),

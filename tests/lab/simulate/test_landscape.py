@@ -51,18 +51,6 @@ def test_a_known_point_appears_where_it_must(marked, change, column, row):
     assert mark_in(frame) == pytest.approx((MIDDLE[0] + column, MIDDLE[1] + row), abs=0.6)
 
 
-def test_motion_blurs_along_the_flight_only(marked):
-    def extent(blur_px: float) -> tuple[int, int]:
-        camera = replace(CAMERA, blur_px=blur_px)
-        frame = photograph(lit(marked, NOON, 0), 0.25, ABOVE, camera, NOON, np.random.default_rng(0))
-        rows, columns = np.nonzero(frame.max(axis=2) > 40)
-        return int(np.ptp(columns)), int(np.ptp(rows))
-
-    (wide, high), (wide_blurred, high_blurred) = extent(0), extent(8)
-    assert wide_blurred == wide
-    assert high_blurred >= high + 4
-
-
 def plain(width_m: float = 60, metres_per_pixel: float = 0.5) -> Scene:
     side = round(width_m / metres_per_pixel)
     return Scene(np.full((side, side, 3), 120, np.uint8), np.full((side, side), 300, np.uint16), metres_per_pixel)

@@ -93,58 +93,49 @@ def test_with_gps_too_a_fix_is_taken_and_edgevpr_sends_none_then(pilot):
     assert pilot.fix(*moved(*place(pilot), 0.5, 0.0)) == ACCEPTED
 
 
-def test_a_receiver_that_it_does_not_use_is_seen_in_its_flags_and_nothing_else(pilot):
+@pytest.fixture
+def unused_gps(pilot):
+    """The pilot at a vehicle that does not use its GPS until the end of the test."""
+    set_whole(pilot, "EKF2_GPS_CTRL", 0)
+    pilot.until(lambda: not flags(pilot) & FUSES, "no GPS in use")
+    yield pilot
+    set_whole(pilot, "EKF2_EV_CTRL", 0)
+    set_whole(pilot, "EKF2_GPS_CTRL", 7)
+    pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
+
+
+def test_a_receiver_that_it_does_not_use_is_seen_in_its_flags_and_nothing_else(unused_gps):
     """This is how edgevpr knows that it is to send."""
-    set_whole(pilot, "EKF2_GPS_CTRL", 0)
-    try:
-        pilot.until(lambda: not flags(pilot) & FUSES, "no GPS in use")
-        assert pilot.next("GPS_RAW_INT").fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
-    finally:
-        set_whole(pilot, "EKF2_GPS_CTRL", 7)
-    pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
+    assert unused_gps.next("GPS_RAW_INT").fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
 
 
-def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(pilot):
-    set_whole(pilot, "EKF2_GPS_CTRL", 0)
+def assert_fused_and_unanswered(pilot, make_message, fused):
+    """Send positions 2 m north of the vehicle for 6 s: its flags say that they are fused, and it moves there."""
+    pilot.wait(6)
+    there = moved(*place(pilot), 0.0, 2.0)
+    answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
+    for _ in range(60):
+        pilot.send(make_message(state_at(pilot.now_s, *there, alt_m=0.0)))
+        pilot.wait(0.1)
+    assert flags(pilot) & (FUSES | FUSES_ANY) == fused
+    assert distance_m(*place(pilot), *there) < 1.5
+    assert sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard) == answered
+
+
+def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(unused_gps):
+    pilot = unused_gps
     set_whole(pilot, "EKF2_EV_CTRL", 1)
-    try:
-        assert pilot.command(512, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) == ACCEPTED
-        said = pilot.until(lambda: pilot.last.get("GPS_GLOBAL_ORIGIN"), "the origin")
-        origin = said.latitude / 1e7, said.longitude / 1e7, said.altitude / 1e3
-        pilot.until(lambda: not flags(pilot) & FUSES, "no GPS in use")
-        pilot.wait(6)
-        there = moved(*place(pilot), 0.0, 2.0)
-        answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
-        for _ in range(60):
-            pilot.send(messages.vision_position(state_at(pilot.now_s, *there, alt_m=0.0), origin))
-            pilot.wait(0.1)
-        assert flags(pilot) & (FUSES | FUSES_ANY) == FUSES_ANY
-        assert distance_m(*place(pilot), *there) < 1.5
-        assert sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard) == answered
-        pilot.until(lambda: not flags(pilot) & FUSES_ANY, "an end of it")
-    finally:
-        set_whole(pilot, "EKF2_EV_CTRL", 0)
-        set_whole(pilot, "EKF2_GPS_CTRL", 7)
-    pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
+    assert pilot.command(512, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) == ACCEPTED
+    said = pilot.until(lambda: pilot.last.get("GPS_GLOBAL_ORIGIN"), "the origin")
+    origin = said.latitude / 1e7, said.longitude / 1e7, said.altitude / 1e3
+    assert_fused_and_unanswered(pilot, lambda state: messages.vision_position(state, origin), FUSES_ANY)
+    pilot.until(lambda: not flags(pilot) & FUSES_ANY, "an end of it")
 
 
-def test_positions_of_message_296_are_fused_and_never_answered(pilot):
-    if version_of(pilot) < (1, 18):
+def test_positions_of_message_296_are_fused_and_never_answered(unused_gps):
+    if version_of(unused_gps) < (1, 18):
         pytest.skip("1.17.0 has no message 296")
-    set_whole(pilot, "EKF2_GPS_CTRL", 0)
-    try:
-        pilot.until(lambda: not flags(pilot) & FUSES, "no GPS in use")
-        pilot.wait(6)
-        there = moved(*place(pilot), 0.0, 2.0)
-        answered = sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard)
-        for _ in range(60):
-            pilot.send(messages.position_sensor(state_at(pilot.now_s, *there, alt_m=0.0)))
-            pilot.wait(0.1)
-        assert flags(pilot) & FUSES
-        assert distance_m(*place(pilot), *there) < 1.5
-        assert sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard) == answered
-    finally:
-        set_whole(pilot, "EKF2_GPS_CTRL", 7)
+    assert_fused_and_unanswered(unused_gps, messages.position_sensor, FUSES | FUSES_ANY)
 
 
 def test_the_command_has_the_number_that_edgevpr_sends():
