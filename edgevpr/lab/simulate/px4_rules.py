@@ -117,18 +117,17 @@ class Px4(Firmware):
         sd_m: float,
         *,
         may_reset: bool,
-        age_s: float = 0.0,
         gate_sd: float = GATE_SD,
     ) -> bool:
         """Fuse a position within the gate. One that stays outside of it resets the estimate after 7 s or, unless it
         `may_reset`, is no longer fused. Returns True if it was used."""
-        if not self._fuse_position(point, sd_m, age_s, gate_sd):
+        if not self._fuse_position(point, sd_m, gate_sd=gate_sd):
             if aid.is_active and self.now_s - aid.fused_s <= _RESET_AFTER_S:
                 return False
             if not may_reset:
                 aid.is_active = False
                 return False
-            self._reset_to(point, sd_m, age_s)
+            self._reset_to(point, sd_m)
         aid.is_active, aid.fused_s = True, self.now_s
         return True
 
@@ -168,19 +167,18 @@ class Px4(Firmware):
         return OK
 
     def take_global_position(self, message: Message) -> None:
-        """Fuse a GLOBAL_POSITION_SENSOR (296, AgpSource::update). Its time stamps are ignored: EKF2_AGP0_DELAY (ms) is
-        its age."""
+        """Fuse a GLOBAL_POSITION_SENSOR (296, AgpSource::update). Its time stamps are ignored."""
         parameters, ours, point = self.parameters, self._ours, (message.lat / 1e7, message.lon / 1e7)
         is_ours = message.id == parameters["EKF2_AGP0_ID"] != 0  # 0: the slot is off
         if not message.eph > 0 or not is_ours or not int(parameters["EKF2_AGP0_CTRL"]) & 1:
             return
-        sd_m, age_s = max(message.eph, parameters["EKF2_AGP0_NOISE"]), parameters["EKF2_AGP0_DELAY"] / 1e3
+        sd_m = max(message.eph, parameters["EKF2_AGP0_NOISE"])
         self._is_vision, ours.received_s = False, self.now_s
         if self.origin is None:
             self.origin = (*point, message.alt)
             self._reset_to(point, sd_m)
-        may_reset, gate_sd = not self._gps.is_active, parameters["EKF2_AGP0_GATE"]
-        self._fuse_or_reset(ours, point, sd_m, may_reset=may_reset, age_s=age_s, gate_sd=gate_sd)
+        gate_sd = parameters["EKF2_AGP0_GATE"]
+        self._fuse_or_reset(ours, point, sd_m, may_reset=not self._gps.is_active, gate_sd=gate_sd)
 
     def take_odometry(self, message: Message) -> None:
         """Fuse the position of an ODOMETRY in the local frame, as external vision (Ekf::controlEvPosFusion). Its time
@@ -194,20 +192,20 @@ class Px4(Firmware):
             return
         self._is_vision, ours.received_s = True, self.now_s
         point = displace(self.origin[:2], complex(message.y, message.x))
-        sd_m, age_s = max(math.sqrt(variance_m2), parameters["EKF2_EVP_NOISE"]), parameters["EKF2_EV_DELAY"] / 1e3
-        off_m = self._innovation_m(point, age_s)
+        sd_m, gate_sd = max(math.sqrt(variance_m2), parameters["EKF2_EVP_NOISE"]), parameters["EKF2_EVP_GATE"]
+        off_m = self._innovation_m(point)
         if self._gps.is_active:
             if self._vision_bias_m is None or not ours.is_active:
                 self._vision_bias_m = off_m
             self._vision_bias_m += (off_m - self._vision_bias_m) * _BIAS_SHARE
         point = displace(point, -(self._vision_bias_m or 0j))
-        if not ours.is_active or not self._fuse_position(point, sd_m, age_s, parameters["EKF2_EVP_GATE"]):
+        if not ours.is_active or not self._fuse_position(point, sd_m, gate_sd=gate_sd):
             if ours.is_active and self.now_s - ours.fused_s <= _AIDING_GONE_S:
                 return
             if self._gps.is_active:
                 self._vision_bias_m = off_m
             else:
-                self._reset_to(point, sd_m, age_s)
+                self._reset_to(point, sd_m)
         ours.is_active, ours.fused_s = True, self.now_s
 
     def _is_valid(self) -> bool:
