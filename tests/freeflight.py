@@ -121,12 +121,12 @@ class Piloted(FlightController):
         intervals_s = [after - before for before, after in pairwise(self._gps_s[-50:])]
         return bool(intervals_s) and fmean(intervals_s) < 0.215 and min(intervals_s[-2:]) < 0.245
 
-    def hear(self, message):
+    def receive(self, message):
         if message.get_type() == "GPS_INPUT":
             self._gps_s.append(self.brain.now_s)
         if message.get_type() == "ODOMETRY" and message.frame_id == mavlink.MAV_FRAME_LOCAL_FRD:
             self._vision_s = self.brain.now_s
-        return super().hear(message)
+        return super().receive(message)
 
     def arm(self) -> None:
         """Arm; a plane with ArduPilot, whose mode is TAKEOFF, then takes off."""

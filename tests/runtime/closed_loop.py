@@ -94,7 +94,7 @@ class ClosedLoop:
     def command(self, number, *values):
         """Send a command to the autopilot."""
         padded = [*values, *[0] * (7 - len(values))]
-        self._exchange(self.controller.hear(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded)))
+        self._exchange(self.controller.receive(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded)))
 
     def ask(self, number, *values):
         """Let the ground station send a command to edgevpr; return the result."""
@@ -122,7 +122,7 @@ class ClosedLoop:
                 sending += [packet[1]] if packet[1] else []
                 for message in self._reader.feed(packet[0]):
                     self.sent.append((self.now_s, message))
-                    said += self.controller.hear(message)
+                    said += self.controller.receive(message)
             conversation.note_departed(sending)
             if not said:
                 break

@@ -117,4 +117,4 @@ class Controlled:
             data, self._to = self._sock.recvfrom(65_536)
             for message in self._receiver.feed(data):
                 self.heard.append((self.now_s, message))
-                self._say(self.controller.hear(message))
+                self._say(self.controller.receive(message))

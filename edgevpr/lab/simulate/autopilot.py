@@ -102,7 +102,7 @@ class _Conversation:
             readable, _, _ = select.select([self._port], [], [], STEP_S)
             for message in self._receiver.feed(self._port.read()) if readable else ():
                 self._count(message)
-                self._send(self._controller.hear(message))
+                self._send(self._controller.receive(message))
 
     def summary(self) -> AutopilotSummary:
         """Return what was received."""

@@ -82,7 +82,7 @@ class FlightController:
                     messages += self._make(number)
         return messages
 
-    def hear(self, message: Message) -> list[Message]:
+    def receive(self, message: Message) -> list[Message]:
         """Process a received message; return the replies."""
         is_ours = getattr(message, "target_system", 0) in (0, self.system_id)
         if not is_ours or getattr(message, "target_component", 0) not in (0, AUTOPILOT):

@@ -177,7 +177,7 @@ class _Simulated:
 
     def send(self, data: bytes) -> None:
         for message in self._receiver.feed(data):
-            self._say(self.controller.hear(message))
+            self._say(self.controller.receive(message))
 
     def recv(self, size: int) -> bytes:
         self._now_s += 0.05

@@ -22,7 +22,7 @@ def small(monkeypatch):
         monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
 
 
-def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
+def test_run_demo_maps_flies_and_draws(small, tmp_path):
     for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
         (tmp_path / left_over).write_text('{"kind": "query"}\n')
     said = demo.run_demo(tmp_path)
@@ -37,7 +37,7 @@ def test_the_demo_maps_flies_tells_and_draws(small, tmp_path):
     assert "recall@1" in said
 
 
-def test_a_command_that_fails_is_named_and_nothing_is_left_running(small, tmp_path, monkeypatch):
+def test_run_demo_names_a_command_that_fails_and_leaves_nothing_running(small, tmp_path, monkeypatch):
     started = []
     popen = processes.subprocess.Popen
     monkeypatch.setattr(processes.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])

@@ -51,7 +51,7 @@ def pilot(request, tmp_path_factory):
 
 
 @plane
-def test_it_says_what_it_is(pilot):
+def test_heartbeat_and_version_name_the_firmware(pilot):
     assert pilot.last["HEARTBEAT"].autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     assert pilot.last["HEARTBEAT"].type == mavlink.MAV_TYPE_FIXED_WING
     assert pilot.command(512, VERSION) == ACCEPTED
@@ -61,7 +61,7 @@ def test_it_says_what_it_is(pilot):
 
 
 @plane
-def test_a_message_comes_at_the_interval_that_was_asked_for(pilot):
+def test_message_interval_sets_the_rate_of_a_message(pilot):
     for interval_s in (0.2, 0.1):
         assert pilot.command(511, ATTITUDE, interval_s * 1e6) == ACCEPTED
         pilot.next("ATTITUDE")
@@ -77,7 +77,7 @@ def test_a_message_comes_at_the_interval_that_was_asked_for(pilot):
 
 
 @plane
-def test_parameters_can_be_read_and_set(pilot):
+def test_parameters_are_read_and_set(pilot):
     assert pilot.get("SIM_GPS1_ENABLE") == 1
     pilot.set("SIM_WIND_DIR", 270)
     assert pilot.get("SIM_WIND_DIR") == 270
@@ -89,19 +89,19 @@ def test_parameters_can_be_read_and_set(pilot):
 
 
 @plane
-def test_time_is_told(pilot):
+def test_timesync_is_answered(pilot):
     pilot.send(mavlink.MAVLink_timesync_message(0, 12_345))
     assert pilot.next("TIMESYNC", lambda said: said.ts1 == 12_345).tc1 > 0
 
 
 @plane
-def test_with_gps_no_fix_is_taken(pilot):
+def test_fix_fails_while_there_is_gps(pilot):
     assert pilot.fix(*pilot.true_place) == FAILED
     assert pilot.error_m < 5
 
 
 @plane
-def test_a_fix_of_the_wrong_form_is_denied(pilot):
+def test_fix_of_the_wrong_form_is_denied(pilot):
     assert pilot.fix(*pilot.true_place, frame=3) == DENIED, "relative to home"
     assert pilot.fix(*pilot.true_place, frame=6) == DENIED
     assert pilot.fix(*pilot.true_place, z=100.0) == DENIED
@@ -109,13 +109,13 @@ def test_a_fix_of_the_wrong_form_is_denied(pilot):
 
 
 @plane
-def test_a_fix_as_command_long_is_unsupported_as_is_an_unknown_command(pilot):
+def test_fix_as_command_long_is_unsupported_as_is_an_unknown_command(pilot):
     assert pilot.command(FIX, 0, 0, 5, 0, *pilot.true_place) == UNSUPPORTED
     assert pilot.command(31_999) == UNSUPPORTED
 
 
 @plane
-def test_a_glitch_moves_what_gps_says(pilot):
+def test_glitch_moves_the_position_of_gps(pilot):
     def north_of_truth_deg():
         seen = pilot.next("GPS_RAW_INT", lambda gps: gps.fix_type >= 3)
         return seen.lat / 1e7 - pilot.true_place[0]
@@ -129,7 +129,7 @@ def test_a_glitch_moves_what_gps_says(pilot):
 
 
 @plane
-def test_a_plane_without_gps_drifts_with_the_wind_and_a_fix_brings_it_back(pilot):
+def test_plane_without_gps_drifts_with_the_wind_and_a_fix_brings_it_back(pilot):
     pilot.set("SIM_GPS1_ENABLE", 0)
     pilot.set("SIM_WIND_SPD", 6)
     pilot.wait(25)
@@ -149,7 +149,7 @@ def test_a_plane_without_gps_drifts_with_the_wind_and_a_fix_brings_it_back(pilot
 
 
 @plane
-def test_a_late_fix_is_brought_forward(pilot):
+def test_fix_that_is_late_is_brought_forward(pilot):
     pilot.wait(3)
     then_s, *place = next(each for each in pilot.truths if each[0] >= pilot.now_s - 2)
     assert pilot.fix(*place, age_s=pilot.now_s - then_s) == ACCEPTED
@@ -159,7 +159,7 @@ def test_a_late_fix_is_brought_forward(pilot):
 
 
 @plane
-def test_with_gps_again_all_is_well(pilot):
+def test_gps_that_is_back_is_used_again(pilot):
     pilot.set("SIM_GPS1_ENABLE", 1)
     pilot.until(lambda: pilot.flags & mavlink.EKF_POS_HORIZ_ABS and pilot.error_m < 5, "the right place again")
     pilot.wait(1)
@@ -167,7 +167,7 @@ def test_with_gps_again_all_is_well(pilot):
 
 
 @copter
-def test_a_second_gps_takes_over(pilot):
+def test_second_gps_takes_over(pilot):
     pilot.on_truth = lambda truth: _play_gps(pilot, truth)
     pilot.wait(10)
     pilot.arm(GUIDED)
@@ -180,7 +180,7 @@ def test_a_second_gps_takes_over(pilot):
 
 
 @copter
-def test_a_jump_of_the_second_gps_is_not_followed_at_once(pilot):
+def test_second_gps_that_jumps_is_not_followed_at_once(pilot):
     pilot.on_truth = lambda truth: _play_gps(pilot, truth, east_m=25.0)
     pilot.wait(4)
     assert pilot.error_m < 8
@@ -191,7 +191,7 @@ def test_a_jump_of_the_second_gps_is_not_followed_at_once(pilot):
 
 
 @copter
-def test_a_copter_without_any_gps_has_no_position_soon_and_no_fix_prevents_that(pilot):
+def test_copter_without_any_gps_loses_its_position_in_spite_of_a_fix(pilot):
     pilot.on_truth = None
     begin_s, has_position = pilot.now_s, mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
     pilot.wait(4)

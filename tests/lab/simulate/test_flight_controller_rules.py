@@ -41,7 +41,7 @@ class Flown:
 
     def tell(self, message):
         """Send a message; return the answers."""
-        return self.controller.hear(message)
+        return self.controller.receive(message)
 
     def command(self, number: int, *values: float) -> int:
         padded = [*values, *[0] * (7 - len(values))]
@@ -77,7 +77,7 @@ def lost(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
     return flown
 
 
-def test_ardupilot_fails_a_fix_for_a_second_after_the_loss_and_before_it_has_an_origin():
+def test_ardupilot_fails_a_fix_for_a_second_after_the_loss_and_without_an_origin():
     assert Flown("arduplane", SIM_GPS1_ENABLE=0).wait(20).fix() == FAILED
     flown = lost("arduplane")
     flown.wait(0.5)
@@ -86,7 +86,7 @@ def test_ardupilot_fails_a_fix_for_a_second_after_the_loss_and_before_it_has_an_
     assert flown.fix() == ACCEPTED
 
 
-def test_a_plane_drifts_with_the_wind_that_it_does_not_know_only():
+def test_plane_drifts_only_with_the_wind_that_it_does_not_know():
     known = Flown("arduplane", SIM_WIND_SPD=6).in_air()
     known.wait(30)
     known.controller.set("SIM_GPS1_ENABLE", 0)
@@ -164,7 +164,7 @@ def hovering(steps: int, told, **parameters: float) -> tuple[FlightController, H
     for number in range(steps):
         controller.advance(number / 10)
         if message := told(controller):
-            controller.hear(message)
+            controller.receive(message)
     return controller, motion
 
 
@@ -176,7 +176,7 @@ def test_vehicle_that_obeys_its_estimate_is_flown_away_by_wrong_positions():
     assert motion.away_m < 0.5
 
 
-def test_vehicle_that_is_told_its_own_estimate_runs_away_with_a_tilt():
+def test_vehicle_that_receives_its_own_estimate_runs_away_with_a_tilt():
     def own(controller):
         brain = controller.brain
         message = gps_input(brain.truth, accuracy_m=5.0)
@@ -197,7 +197,7 @@ def odometry(north_m: float, frame: int = 20, quality: int = 0):
     )
 
 
-def test_a_copter_flies_by_odometry_without_any_gps():
+def test_copter_flies_by_odometry_without_any_gps():
     flown = Flown("arducopter", SIM_GPS1_ENABLE=0, VISO_TYPE=1, EK3_SRC1_POSXY=6, VISO_QUAL_MIN=10).wait(1)
     assert flown.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == FAILED
     origin = mavlink.MAVLink_set_gps_global_origin_message(1, round(ORIGIN.lat_deg * 1e7), 1491652300, 584_000)
@@ -217,7 +217,7 @@ def test_a_copter_flies_by_odometry_without_any_gps():
     assert "VisOdom" in flown.controller.why_not_arm()
 
 
-def test_a_source_set_is_chosen_by_command():
+def test_source_set_is_chosen_by_command():
     flown = Flown("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6).in_air()
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
@@ -244,7 +244,7 @@ def test_px4_on_the_ground_without_gps_starts_from_a_fix():
     assert "GLOBAL_POSITION_INT" in {each.get_type() for each in flown.said}, "streams that come by themselves"
 
 
-def test_a_px4_copter_without_any_aid_has_no_position_after_five_seconds():
+def test_px4_copter_without_any_aid_has_no_position_after_five_seconds():
     flown = lost("px4-copter").wait(4)
     assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
     assert not flown.wait(3).flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
@@ -327,7 +327,7 @@ def test_px4_takes_no_position_from_gps_while_its_parameter_forbids_it():
         assert bool(flown.wait(2).flags & fused) == is_fused
 
 
-def test_every_parameter_is_listed_with_its_index():
+def test_parameters_are_listed_with_their_indices():
     listed = Flown("px4-copter").tell(mavlink.MAVLink_param_request_list_message(1, 1))
     assert {each.param_id for each in listed} >= {"EKF2_AGP0_CTRL", "SIM_GPS1_ENABLE"}
     assert [each.param_index for each in listed] == list(range(listed[0].param_count))

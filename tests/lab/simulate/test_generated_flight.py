@@ -33,7 +33,7 @@ def scene():
 
 
 @pytest.mark.parametrize("flight", [mapping_flight(1), later_flight(1), later_flight(9)])
-def test_every_picture_shows_the_scene_and_nothing_beyond_its_edge(flight):
+def test_poses_show_nothing_beyond_the_edge_of_the_scene(flight):
     camera = flight.camera
     corners = np.array([[(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]], float)
     for pose in flight.poses:
@@ -42,7 +42,7 @@ def test_every_picture_shows_the_scene_and_nothing_beyond_its_edge(flight):
         assert (ground <= (SCENE_WIDTH_M, SCENE_DEPTH_M)).all()
 
 
-def test_the_later_flight_comes_back_and_leaves_the_map():
+def test_later_flight_comes_back_and_leaves_the_map():
     places, queries = (
         [(pose.east_m, pose.north_m) for pose in flight(1).poses] for flight in (mapping_flight, later_flight)
     )
@@ -53,7 +53,7 @@ def test_the_later_flight_comes_back_and_leaves_the_map():
 
 
 @pytest.mark.slow
-def test_positions_come_back_to_a_decimetre(tmp_path, scene):
+def test_write_flight_writes_positions_to_a_decimetre(tmp_path, scene):
     flight = first_frames(mapping_flight(1), 17)
     names = list(write_flight(tmp_path, scene, flight))
     tags = read_positions(tmp_path / "positions.csv")
@@ -65,7 +65,7 @@ def test_positions_come_back_to_a_decimetre(tmp_path, scene):
         assert tag.heading_deg == pytest.approx(pose.heading_deg % 360, abs=0.01)
 
 
-def test_a_flight_is_the_same_each_time_it_is_flown(tmp_path, scene):
+def test_write_flight_writes_the_same_each_time(tmp_path, scene):
     for folder in ("one", "two"):
         list(write_flight(tmp_path / folder, scene, first_frames(later_flight(4), 2)))
     one, two = ((tmp_path / folder / "images" / "frame_0001.jpg").read_bytes() for folder in ("one", "two"))
@@ -73,7 +73,7 @@ def test_a_flight_is_the_same_each_time_it_is_flown(tmp_path, scene):
     assert cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR).shape == (480, 640, 3)
 
 
-def test_answers_are_judged_by_the_true_positions(tmp_path):
+def test_summarise_judges_queries_by_true_positions(tmp_path):
     for folder, rows in (
         ("map", ("p0,50.0,8.0", "p1,50.001,8.0")),
         ("query", ("q0,50.0001,8.0", "q1,50.001,8.0", "q2,50.01,8.0")),

@@ -44,7 +44,7 @@ def mark_in(frame: np.ndarray) -> np.ndarray:
         ({"pitch_deg": 5}, 0, F * np.tan(np.radians(5))),  # nose up: it looks ahead
     ],
 )
-def test_a_known_point_appears_where_it_must(marked, change, column, row):
+def test_photograph_shows_a_point_where_it_must(marked, change, column, row):
     pose = replace(ABOVE, **change)
     frame = photograph(lit(marked, NOON, 0), 0.25, pose, CAMERA, NOON, np.random.default_rng(0))
     assert frame.shape == (480, 640, 3)
@@ -56,7 +56,7 @@ def plain(width_m: float = 60, metres_per_pixel: float = 0.5) -> Scene:
     return Scene(np.full((side, side, 3), 120, np.uint8), np.full((side, side), 300, np.uint16), metres_per_pixel)
 
 
-def test_a_scene_has_texture_everywhere_and_things_that_stand_on_it():
+def test_make_scene_has_texture_everywhere_and_things_that_stand_on_it():
     scene = make_scene(3, 240, 180, metres_per_pixel=0.4)
     grey = scene.albedo.mean(axis=2)
     blocks = grey[: 440 // 40 * 40, : 600 // 40 * 40].reshape(11, 40, 15, 40)
@@ -74,14 +74,14 @@ def test_a_scene_has_texture_everywhere_and_things_that_stand_on_it():
         (180, (50, 60), (70, 60)),
     ],
 )
-def test_a_mast_casts_its_shadow_away_from_the_sun(sun_azimuth_deg, shaded, sunny):
+def test_lit_casts_the_shadow_of_a_mast_away_from_the_sun(sun_azimuth_deg, shaded, sunny):
     scene = plain()
     scene.height_cm[59:62, 59:62] += 1000
     ground = lit(scene, Light(sun_azimuth_deg=sun_azimuth_deg, sun_elevation_deg=45), seed=0)
     assert ground[shaded].max() < 0.6 * ground[sunny].max()
 
 
-def test_flat_ground_in_full_sun_is_evenly_lit_and_clouds_take_their_share():
+def test_lit_is_even_on_flat_ground_and_clouds_take_their_share():
     clear = lit(plain(), NOON, seed=1)
     assert np.ptp(clear.reshape(-1, 3), axis=0).max() == 0
     cloudy = lit(plain(), Light(sun_azimuth_deg=180, sun_elevation_deg=60, cloud_frac=0.4), seed=1)

@@ -55,7 +55,7 @@ def expected(to_m=1000, **change):
     return report_on(flown(**change), places(to_m), footprint_m=100.0, gps_until_s=20.0)
 
 
-def test_a_flight_that_knew_its_place_all_the_way_is_to_work():
+def test_report_on_a_flight_that_was_recognised_all_the_way():
     found = expected()
     assert found.is_to_work
     assert (found.queries, found.accepted, found.wrong, found.longest_gap_s) == (100, 100, 0, 0)
@@ -76,13 +76,13 @@ def test_a_flight_that_knew_its_place_all_the_way_is_to_work():
         ({"seconds": 15}, "no position without GPS"),
     ],
 )
-def test_what_is_in_the_way_of_a_mission_is_said(change, said):
+def test_report_on_a_flight_has_the_reasons_against_the_mission(change, said):
     found = expected(**change)
     assert not found.is_to_work
     assert said in found.answer
 
 
-def test_where_nothing_is_recognised_is_said_with_the_edge_of_the_map():
+def test_report_on_a_flight_has_the_stretches_without_a_match():
     found = expected(to_m=700, refused={*range(30, 41), 50, *range(80, 100)})
     assert [(each.from_m, each.to_m, each.on_map) for each in found.unrecognised] == [
         (290, 410, True),
@@ -94,7 +94,7 @@ def test_where_nothing_is_recognised_is_said_with_the_edge_of_the_map():
     assert said.count("beyond the map") == 1
 
 
-def test_pictures_that_come_later_and_later_are_seen():
+def test_find_start_sees_pictures_that_come_late():
     assert find_start([0, 1, 2, 3], [10.2, 11.0, 12.6, 13.0]) == (10, True)
     assert find_start(list(range(20)), [10.0 + at + (at == 7) for at in range(20)]) == (10, False), "one is no matter"
 
@@ -125,7 +125,7 @@ def rehearsed(valley, track, folder):
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.network
-def test_a_mission_is_rehearsed_from_the_command_to_the_page(tmp_path, valley, capsys, monkeypatch):
+def test_simulate_rehearsal_flies_and_writes_its_page(tmp_path, valley, capsys, monkeypatch):
     monkeypatch.setattr("edgevpr.lab.simulate.mission._MIN_S", 25.0)
     capsys.readouterr()
     out = tmp_path / "out"
@@ -145,7 +145,7 @@ def test_a_mission_is_rehearsed_from_the_command_to_the_page(tmp_path, valley, c
 
 
 @pytest.mark.slow
-def test_a_rehearsal_that_cannot_be_is_one_sentence_and_leaves_nothing(tmp_path, valley, capsys):
+def test_simulate_rehearsal_refuses_in_a_sentence_and_leaves_nothing(tmp_path, valley, capsys):
     out = tmp_path / "out"
     for length_m, said in ((300, "needs one of 40 s"), (900, "does not cover the track"), (100_000, "not taken")):
         capsys.readouterr()

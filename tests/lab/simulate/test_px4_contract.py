@@ -7,7 +7,7 @@ import math
 import struct
 
 import pytest
-from pilots import FIX, PX4, pilot_of, state_at
+from pilots import PX4, pilot_of, state_at
 
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.mavlink import messages
@@ -64,32 +64,28 @@ def version_of(pilot):
     return version >> 24, version >> 16 & 255
 
 
-def test_it_says_what_it_is(pilot):
+def test_heartbeat_and_version_name_the_firmware(pilot):
     assert pilot.last["HEARTBEAT"].autopilot == mavlink.MAV_AUTOPILOT_PX4
     assert version_of(pilot) in ((1, 17), (1, 18))
 
 
-def test_whole_numbers_are_the_bytes_of_a_float(pilot):
-    assert whole(pilot, "EKF2_GPS_CTRL") == 7
-
-
-def test_on_the_pad_its_filter_is_at_rest_and_fuses_gps(pilot):
+def test_filter_on_the_pad_is_at_rest_and_fuses_gps(pilot):
     assert pilot.next("GPS_RAW_INT").fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
     assert flags(pilot) & (KNOWN | FUSES | AT_REST) == KNOWN | FUSES | AT_REST
     assert 0 < pilot.last["ESTIMATOR_STATUS"].pos_horiz_accuracy < 5
 
 
-def test_it_says_what_its_accelerometers_feel(pilot):
+def test_scaled_imu_has_the_specific_force(pilot):
     felt = pilot.next("SCALED_IMU")
     assert felt.zacc == pytest.approx(-1000, abs=100)
     assert abs(felt.xacc) < 100
 
 
-def test_a_fix_without_an_age_is_not_taken(pilot):
+def test_fix_without_an_age_is_not_taken(pilot):
     assert pilot.fix(*place(pilot), param2=math.nan) == NOT_NOW
 
 
-def test_with_gps_too_a_fix_is_taken_and_edgevpr_sends_none_then(pilot):
+def test_fix_is_taken_with_gps_too(pilot):
     assert pilot.fix(*moved(*place(pilot), 0.5, 0.0)) == ACCEPTED
 
 
@@ -104,7 +100,7 @@ def unused_gps(pilot):
     pilot.until(lambda: flags(pilot) & FUSES, "GPS in use again")
 
 
-def test_a_receiver_that_it_does_not_use_is_seen_in_its_flags_and_nothing_else(unused_gps):
+def test_flags_alone_show_a_receiver_that_is_not_used(unused_gps):
     """This is how edgevpr knows that it is to send."""
     assert unused_gps.next("GPS_RAW_INT").fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
 
@@ -122,7 +118,7 @@ def assert_fused_and_unanswered(pilot, make_message, fused):
     assert sum(message.get_type() == "COMMAND_ACK" for message in pilot.heard) == answered
 
 
-def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(unused_gps):
+def test_odometry_is_fused_by_another_flag_and_never_answered(unused_gps):
     pilot = unused_gps
     set_whole(pilot, "EKF2_EV_CTRL", 1)
     assert pilot.command(512, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) == ACCEPTED
@@ -132,11 +128,7 @@ def test_positions_of_odometry_are_fused_by_another_flag_and_never_answered(unus
     pilot.until(lambda: not flags(pilot) & FUSES_ANY, "an end of it")
 
 
-def test_positions_of_message_296_are_fused_and_never_answered(unused_gps):
+def test_message_296_is_fused_and_never_answered(unused_gps):
     if version_of(unused_gps) < (1, 18):
         pytest.skip("1.17.0 has no message 296")
     assert_fused_and_unanswered(unused_gps, messages.position_sensor, FUSES | FUSES_ANY)
-
-
-def test_the_command_has_the_number_that_edgevpr_sends():
-    assert FIX == messages.POSITION_FIX

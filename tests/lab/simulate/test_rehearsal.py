@@ -42,7 +42,7 @@ def orthophoto(tmp_path_factory):
         ({"heading_deg": 45, "roll_deg": -6, "pitch_deg": 7, "height_m": 60}, (-8, 5)),
     ],
 )
-def test_a_mark_appears_where_the_pinhole_camera_says(orthophoto, change, off_m):
+def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change, off_m):
     at = Position(*moved(HOME.lat_deg, HOME.lon_deg, *off_m))
     pose = replace(LEVEL, **change)
     picture = seen_from(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
@@ -61,7 +61,7 @@ def test_a_mark_appears_where_the_pinhole_camera_says(orthophoto, change, off_m)
     assert seen >= 3
 
 
-def test_a_picture_beyond_the_orthophoto_is_not_taken_and_one_of_the_horizon_refused(orthophoto):
+def test_seen_from_takes_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
     edge = Position(*moved(HOME.lat_deg, HOME.lon_deg, 300, 0))
     assert seen_from(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
@@ -76,7 +76,7 @@ def csv_of(tmp_path, text):
     return path
 
 
-def test_each_line_of_a_track_is_a_picture_as_it_says(tmp_path):
+def test_read_shots_has_a_picture_for_each_line(tmp_path):
     path = csv_of(
         tmp_path,
         "file,lat,lon,alt,height_m,roll_deg,pitch_deg,yaw_deg\n"
@@ -93,7 +93,7 @@ def test_each_line_of_a_track_is_a_picture_as_it_says(tmp_path):
     assert 0 < abs(swaying.roll_deg) <= 2
 
 
-def test_the_waypoints_of_a_mission_are_flown_one_after_the_other(tmp_path):
+def test_read_shots_follows_the_waypoints_of_a_mission(tmp_path):
     path = tmp_path / "mission.waypoints"
     rows = [(0, 0, 50.0, 11.9, 500), (1, 3, 50.001, 11.9, 60), (2, 3, 50.001, 11.902, 80)]
     lines = [f"{at}\t0\t{frame}\t16\t0\t0\t0\t0\t{lat}\t{lon}\t{alt}\t1" for at, frame, lat, lon, alt in rows]
@@ -109,7 +109,7 @@ def test_the_waypoints_of_a_mission_are_flown_one_after_the_other(tmp_path):
     assert distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg) == pytest.approx(10, abs=0.01)
 
 
-def test_a_track_that_cannot_be_flown_is_refused_in_a_sentence(tmp_path):
+def test_read_shots_refuses_a_track_without_path_or_height(tmp_path):
     for text, said in (
         ("file,lat,lon\na,50,11.9\n", "--height-m"),
         ("file,lat,lon,height_m\na,,,\n", "lat and lon"),
@@ -126,7 +126,7 @@ def test_a_track_that_cannot_be_flown_is_refused_in_a_sentence(tmp_path):
         read_shots(line, 80.0, 1.0)
 
 
-def test_a_flight_writes_what_was_true_and_is_the_same_each_time(tmp_path, orthophoto):
+def test_write_rehearsal_writes_the_truth_and_is_the_same_each_time(tmp_path, orthophoto):
     north = [moved(HOME.lat_deg, HOME.lon_deg, 0, 15.0 * step) for step in range(-2, 12)]
     shots = [GeoTag(position=Position(*at), height_m=70, t_utc_s=2.0 * n, heading_deg=0) for n, at in enumerate(north)]
     written = {}

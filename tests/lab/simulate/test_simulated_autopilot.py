@@ -33,7 +33,7 @@ def a_fix(**changes):
     return command
 
 
-def test_it_answers_counts_and_remembers():
+def test_run_autopilot_answers_and_counts():
     number = free_port()
     port = UdpPort(number)
     companion = Peer(port)
@@ -65,7 +65,7 @@ def test_it_answers_counts_and_remembers():
     assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
 
 
-def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
+def test_run_autopilot_flies_along_a_track_once_a_companion_is_there(tmp_path):
     csv = tmp_path / "positions.csv"
     rows = [
         "b.jpg,50.002,8.0,110,90,2026-02-14T00:30:00.4Z",
@@ -97,7 +97,7 @@ def test_it_flies_along_a_track_from_when_a_companion_is_heard(tmp_path):
 
 
 @pytest.mark.slow
-def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkeypatch):
+def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
     monkeypatch.setattr("edgevpr.mavlink.asking.LISTEN_S", 0.2)
     track = [TrueState(lat_deg=50.0 + t_s, lon_deg=8.0, alt_m=0.0, t_s=t_s) for t_s in (0.0, 0.1)]
     link = f"127.0.0.1:{free_port()}"
@@ -115,14 +115,14 @@ def test_questions_do_not_start_the_track_and_whatever_a_flight_says_does(monkey
         autopilot.finish()
 
 
-def test_it_says_how_fast_it_flies_along_the_track():
+def test_truth_at_has_the_velocity_along_the_track():
     points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001)
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
     velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
     assert velocities == pytest.approx([11.12j, 11.12j, 7.15 + 0j, 0j], abs=0.01), "north first"
 
 
-def test_between_two_points_of_a_track_it_turns_the_shorter_way_and_keeps_what_is_not_known():
+def test_truth_at_turns_the_shorter_way_and_keeps_what_is_unknown():
     one = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=2, heading_deg=350, height_m=80)
     other = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=-2, heading_deg=20, height_m=90, t_s=2)
     here = truth_at([one, other], 1.0)
@@ -131,7 +131,7 @@ def test_between_two_points_of_a_track_it_turns_the_shorter_way_and_keeps_what_i
     assert truth_at([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
 
 
-def test_it_loses_gps_on_its_way_in_a_wind_that_it_does_not_know():
+def test_gps_until_s_ends_gps_in_an_unknown_wind():
     ends = (0.0, 50.0), (60.0, 50.01)
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=8.0, alt_m=0.0) for t_s, lat_deg in ends]
     controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=20)
@@ -142,7 +142,7 @@ def test_it_loses_gps_on_its_way_in_a_wind_that_it_does_not_know():
     assert controller.brain.receivers.reports[0].fix_type == 1
     controller.advance(40.0)
     assert 60 < controller.error_m < 6 * 20
-    assert controller.hear(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
+    assert controller.receive(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
 
 
 @pytest.mark.parametrize(
@@ -169,20 +169,20 @@ def test_attitude_is_that_of_the_track_else_level(tmp_path, rows, attitude_deg, 
     assert (position.relative_alt, position.hdg) == (height_mm, pytest.approx(heading_cdeg, abs=1))
 
 
-def test_a_track_without_times_is_refused(tmp_path):
+def test_read_track_refuses_one_without_times(tmp_path):
     (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
     with pytest.raises(UsageError, match="lon and"):
         read_track(tmp_path / "p.csv")
 
 
 @pytest.mark.parametrize("link", ["tcp:127.0.0.1:{}", "serial:/dev/no-such-device:{}"])
-def test_a_link_that_cannot_be_opened_is_one_sentence(link):
+def test_run_autopilot_reports_a_link_that_cannot_be_opened(link):
     with pytest.raises(LinkError, match="opened"):
         run_autopilot(link.format(free_port(socket.SOCK_STREAM)))
 
 
 @pytest.mark.process
-def test_the_command_says_what_is_up_and_sets_parameters():
+def test_simulate_autopilot_sets_parameters_and_prints_its_summary():
     number = free_port()
     link = f"udpin:127.0.0.1:{number}"
     command = ["simulate", "autopilot", "--vehicle", "arducopter", "--param", "GPS2_TYPE=14", "--link", link, "--json"]
@@ -216,7 +216,7 @@ def test_the_command_says_what_is_up_and_sets_parameters():
         ("GPS2_TYPE", "write KEY=VALUE, e.g. GPS2_TYPE=14."),
     ],
 )
-def test_a_parameter_that_makes_no_sense_is_one_sentence(written, sentence, capsys):
+def test_simulate_autopilot_refuses_a_wrong_parameter_in_a_sentence(written, sentence, capsys):
     link = f"udpin:127.0.0.1:{free_port()}"
     assert main(["simulate", "autopilot", "--link", link, "--param", written]) == 2
     printed, said = capsys.readouterr()
@@ -225,5 +225,5 @@ def test_a_parameter_that_makes_no_sense_is_one_sentence(written, sentence, caps
     assert said.count("\n") == 1
 
 
-def test_the_command_line_knows_every_vehicle():
+def test_simulate_autopilot_offers_every_vehicle():
     assert set(_VEHICLES) == set(VEHICLES)
