@@ -53,7 +53,6 @@ class ArduPilot(Firmware):
         self._odometry: tuple[complex, float, float] | None = None  # vector from the origin, standard deviation, time
         self._used: PositionMeasurement | None = None
         self._good_since_s, self._aligned_after_s = math.inf, _ALIGNED_AFTER_S
-        self._frozen: LatLon | None = None  # the position that is reported after aiding
 
     def lose_gps(self) -> None:
         self.parameters.set("SIM_GPS1_ENABLE", 0)
@@ -61,7 +60,7 @@ class ArduPilot(Firmware):
 
     def _estimate(self, wind_m_s: complex, dt_s: float) -> None:
         if self._is_aiding and self.kind == "copter" and self.now_s - self._passed_s > _AIDING_LOST_S:
-            self._is_aiding, self._good_since_s, self._frozen = False, math.inf, self.point
+            self._is_aiding, self._good_since_s = False, math.inf
         measured, before = self._measure(), self._used
         self._used = measured
         self.estimator.predict(dt_s)
@@ -74,8 +73,6 @@ class ArduPilot(Firmware):
             self._drift(wind_m_s, dt_s, _UNNOTICED_SHARE)
         elif not self._is_aiding:
             self.estimator.velocity_error_m_s = -self.truth.velocity_m_s  # it takes itself for standing still
-            if self._frozen:
-                self._reset_to(self._frozen, self.estimator.sd_m)
 
     def flags(self) -> int:
         flags: int = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
