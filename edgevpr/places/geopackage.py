@@ -80,37 +80,6 @@ UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
 WHERE table_name = :table
 """
 
-# The spatial index of the standard (OGC 12-128r18, annex F.3): an R-tree, and triggers that follow every change of the
-# places. Other programs use it and keep it up to date as well.
-_NEW, _OLD = (f"({row}.geom NOTNULL AND NOT ST_IsEmpty({row}.geom))" for row in ("NEW", "OLD"))
-_SAME = "OLD.place_id = NEW.place_id"
-_BOX = "ST_MinX({0}geom), ST_MaxX({0}geom), ST_MinY({0}geom), ST_MaxY({0}geom)"
-_PUT = f"INSERT OR REPLACE INTO rtree_places_geom VALUES (NEW.place_id, {_BOX.format('NEW.')});"
-_DROP = "DELETE FROM rtree_places_geom WHERE id = OLD.place_id;"
-_TRIGGERS = (  # name, event, condition, and what is done to the tree
-    ("insert", "INSERT", _NEW, _PUT),
-    ("update6", "UPDATE OF geom", f"{_SAME} AND {_NEW} AND {_OLD}", _PUT),
-    ("update7", "UPDATE OF geom", f"{_SAME} AND {_NEW} AND NOT {_OLD}", _PUT),
-    ("update2", "UPDATE OF geom", f"{_SAME} AND NOT {_NEW}", _DROP),
-    ("update5", "UPDATE", f"NOT {_SAME} AND {_NEW}", _DROP + _PUT),
-    ("update4", "UPDATE", f"NOT {_SAME} AND NOT {_NEW}", _DROP),
-    ("delete", "DELETE", "OLD.geom NOTNULL", _DROP),
-)
-SPATIAL_INDEX = (
-    """CREATE TABLE IF NOT EXISTS gpkg_extensions (
-    table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
-    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name))""",
-    "INSERT INTO gpkg_extensions VALUES ('places', 'geom', 'gpkg_rtree_index', "
-    "'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
-    "CREATE VIRTUAL TABLE rtree_places_geom USING rtree(id, minx, maxx, miny, maxy)",
-    f"""INSERT INTO rtree_places_geom SELECT place_id, {_BOX.format("")} FROM places
-    WHERE geom NOT NULL AND NOT ST_IsEmpty(geom)""",
-    *(
-        f"CREATE TRIGGER rtree_places_geom_{name} AFTER {event} ON places WHEN {when} BEGIN {done} END"
-        for name, event, when, done in _TRIGGERS
-    ),
-)
-
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
 _FORM = (b"GP", 0, 1, 1, 1)  # all of these but the reference system and the coordinates

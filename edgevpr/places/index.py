@@ -251,6 +251,7 @@ class GrowingIndex:
         self._mean_of = self._in_file  # number of places that this mean was computed from
         self._slots = empty_index(technique.spec, capacity, self._mean)
         self._taken = 0
+        self._outlines = np.fromiter(place_map.outlines(), _OUTLINE)  # of all places in the file
         if self._in_file:
             free = self._slots.first(min(self._in_file, capacity))
             loaded = load_index(place_map, technique, len(free) * each, into=free, beside_bytes=beside_bytes)
@@ -269,9 +270,18 @@ class GrowingIndex:
         free = replace(self._slots.only(slice(self._taken, self._taken + 1)), mean=self._mean)
         self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique), default=0)
         self._in_file += 1
+        self._outlines = np.append(self._outlines, np.array([(place_id, *(point or (np.nan, np.nan)), 1)], _OUTLINE))
         # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
         if self._mean is not None and self._in_file >= 2 * self._mean_of:
             self._repack()
+
+    def nearest_m(self, position: Position) -> float:
+        """Return the distance in metres from `position` to the nearest readable place of the file, whether or not it is
+        in the index; infinity if there is none."""
+        lat_deg, lon_deg = self._outlines["lat_deg"], self._outlines["lon_deg"]
+        away_m = distance_m(position.lat_deg, position.lon_deg, lat_deg, lon_deg)
+        is_known = ~np.isnan(away_m) & ~np.isin(self._outlines["id"], list(self.place_map.left_out))
+        return float(np.min(away_m, initial=np.inf, where=is_known))
 
     def _repack(self) -> None:
         """Pack all places again with the new mean. A place that can no longer be read is dropped, since its row is

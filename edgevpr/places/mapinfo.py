@@ -1,13 +1,11 @@
-"""Queries about a whole map that read no descriptors: its summary, its identity, the distance to its nearest place."""
+"""Queries about a whole map that read no descriptors: its summary and its identity."""
 
 import hashlib
 import math
 from dataclasses import dataclass
 
 from edgevpr.core.contract import TechniqueSpec
-from edgevpr.core.geodesy import EARTH_RADIUS_M, distance_m
-from edgevpr.core.types import Position
-from edgevpr.places import geopackage, rows
+from edgevpr.places import rows
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import sentences
@@ -21,10 +19,6 @@ SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
 FROM places
 """
 _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
-_IN_BOX = """
-SELECT place_id, geom FROM rtree_places_geom JOIN places ON place_id = id
-WHERE maxy >= ? AND miny <= ? AND maxx >= ? AND minx <= ?
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,28 +94,3 @@ def identity_of(place_map: PlaceMap) -> MapIdentity:
         places += 1
     map_id = place_map.stored.get("map_id")
     return MapIdentity(map_id if isinstance(map_id, str) else None, places, digest.hexdigest())
-
-
-def index_positions(place_map: PlaceMap) -> None:
-    """Add an R-tree of the positions to the map file, unless it has one. Damaged positions are left out. Raises
-    MapError."""
-    with place_map.transaction():
-        if not place_map.db.execute("SELECT 1 FROM sqlite_master WHERE name = 'rtree_places_geom'").fetchone():
-            for statement in geopackage.SPATIAL_INDEX:
-                place_map.db.execute(statement)
-
-
-def nearest_m(place_map: PlaceMap, position: Position, within_m: float) -> float | None:
-    """Return the distance in metres from `position` to the nearest readable place of the file; None if it is greater
-    than `within_m`. Call `index_positions` before. Raises MapError if the file cannot be read."""
-    lat_deg, lon_deg = position.lat_deg, position.lon_deg
-    north_deg = math.degrees(within_m / EARTH_RADIUS_M)
-    east_deg = min(180.0, north_deg / max(math.cos(math.radians(min(abs(lat_deg) + north_deg, 90.0))), 1e-9))
-    nearest = math.inf
-    with sentences(place_map.path):
-        for turned_deg in (lon_deg - 360, lon_deg, lon_deg + 360):  # places on the other side of the date line
-            box = (lat_deg - north_deg, lat_deg + north_deg, turned_deg - east_deg, turned_deg + east_deg)
-            for place_id, geom in place_map.db.execute(_IN_BOX, box):
-                if place_id not in place_map.left_out and (point := geopackage.point_or_none(geom)):
-                    nearest = min(nearest, float(distance_m(lat_deg, lon_deg, *point)))
-    return nearest if nearest <= within_m else None

@@ -2,16 +2,13 @@
 
 There are two entropy maps, both in 0..1. Both take the histogram of the intensities inside a disc around each pixel (81
 pixels for radius 5), counting only pixels inside the image, and divide the result by 8 bits, the most that 256
-intensities can have. `good_blocks` mostly answers without computing a map.
+intensities can have.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache, partial, reduce
+from functools import lru_cache, reduce
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Singles
 
@@ -19,7 +16,6 @@ DISC_RADIUS_PX = 5
 SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a copy of this size
 # Sizes of the parts that are computed at once, so that the sums stay in cache.
 _STRIP_ROWS = 32
-_STRIP_CELLS = 32
 _STRIP_PIXELS = 256
 _STRIP_INTENSITIES = 16
 _ROUNDING = 1e-5  # more than float32 rounding can change the mean entropy of a block
@@ -31,10 +27,12 @@ _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 def filled_bins(grey: Bytes) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
     uint8 (H, W) to float32 (H, W) in 0..1."""
-    padded = _replicated(grey)
+    r = DISC_RADIUS_PX
+    # Copies of the border add no intensity to a disc: the pixel copied is nearer to its middle.
+    padded = cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
-        different = _different(padded[top : top + _STRIP_ROWS + 2 * DISC_RADIUS_PX])
+        different = _count_different(padded[top : top + _STRIP_ROWS + 2 * r])
         entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[different]
     return entropy
 
@@ -55,78 +53,31 @@ def block_means(per_pixel: Array, cell_px: int) -> Array:
 
 
 def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
-    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). The result equals
-    `block_means(entropy(grey), cell_px) >= threshold`, where `which` names the entropy: "filled_bins" or "shannon".
-    Cheap bounds decide nearly every block, and only the pixels under the others are computed exactly. `grey` is uint8
-    (H, W) with sides that are multiples of `cell_px`. Returns bool (H/cell_px - 1, W/cell_px - 1), False where `among`,
-    bool of this shape, is False (True: consider all)."""
-    bounds = _BOUNDS[which](grey, cell_px)
-    low = bounds.low
-    undecided = (bounds.blocks(low) < threshold + _ROUNDING) & (bounds.blocks(bounds.high) >= threshold - _ROUNDING)
+    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `which` names the
+    entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
+    (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
+
+    Of the Shannon entropy, cheap bounds decide nearly every block, and it is computed only at the pixels that the
+    others depend on. The result is that of the whole map."""
+    if which == "filled_bins":
+        return (block_means(filled_bins(grey), cell_px) >= threshold) & among
+    small = _shannon_copy(grey)
+    # The entropy of the last four bits is at most that of all; within 16 k values the others add at most log2 k.
+    entropy = _shannon_of(small & 15)
+    at_most = entropy + _LOG2_OVER_8[(_range(small) >> 4) + 1]
+    down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
+
+    def means(values: Array) -> Singles:
+        return np.asarray(down @ values @ across.T)
+
+    undecided = (means(entropy) < threshold + _ROUNDING) & (means(at_most) >= threshold - _ROUNDING)
     undecided &= among
     if undecided.any():
-        matters = (bounds.down.T @ undecided @ bounds.across > 0) & (low < bounds.high)
-        low[matters] = bounds.exact(matters)
-        if (np.abs(bounds.blocks(low)[undecided] - threshold) < _ROUNDING).any():
-            return (block_means(_MAPS[which](grey), cell_px) >= threshold) & among
-    return (bounds.blocks(low) >= threshold) & among
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Bounds:
-    """Bounds `low` and `high` of an entropy, float32 (h, w), at the points of a grid over the image. Values on this
-    grid are averaged over the blocks by `down` @ values @ `across`.T. `exact` computes the entropy itself at the True
-    points of a bool (h, w), one value each."""
-
-    low: Array
-    high: Array
-    down: Singles
-    across: Singles
-    exact: Callable[[Bools], Singles]
-
-    def blocks(self, values: Array) -> Singles:
-        means: Singles = self.down @ values @ self.across.T
-        return means
-
-
-def _bound_filled_bins(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound the mean of `filled_bins` over each cell, from the last six bits of the intensities, their *endings*."""
-    r = DISC_RADIUS_PX
-    padded = _replicated(grey)
-    at_least = np.empty(grey.shape, np.uint8)
-    for top in range(0, len(grey), _STRIP_ROWS):
-        endings = _over_disc(_bit(padded[top : top + _STRIP_ROWS + 2 * r]), np.bitwise_or)
-        at_least[top : top + _STRIP_ROWS] = np.bitwise_count(endings)
-    # n intensities have at most n endings; of those within 64 k values at most k share one.
-    at_most = cv2.multiply(at_least, (_range(grey) >> 6) + 1)  # saturates at 255
-
-    def exact(cells: Bools) -> Singles:
-        side = cell_px + 2 * r
-        patches = np.lib.stride_tricks.sliding_window_view(padded, (side, side))[::cell_px, ::cell_px][cells]
-        means = np.empty(len(patches), np.float32)
-        for start in range(0, len(patches), _STRIP_CELLS):
-            strip = slice(start, start + _STRIP_CELLS)
-            means[strip] = _LOG2_OVER_8[_different(patches[strip])].mean(axis=(1, 2))
-        return means
-
-    low, high = (_cell_means(cv2.LUT(number, _LOG2_OVER_8[:256]), cell_px) for number in (at_least, at_most))
-    down, across = (_pairs(side // cell_px) for side in grey.shape)
-    return _Bounds(low=low, high=high, down=down, across=across, exact=exact)
-
-
-def _bound_shannon(grey: Bytes, cell_px: int) -> _Bounds:
-    """Bound `shannon` at each pixel of its 100x100 copy, from the last four bits of the intensities, their
-    *endings*."""
-    small = _shannon_copy(grey)
-    # The entropy of the endings is at most that of all bits; within 16 k values the others add at most log2 k.
-    low = _shannon_of(small & 15)
-    high = low + _LOG2_OVER_8[(_range(small) >> 4) + 1]
-    down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
-    return _Bounds(low=low, high=high, down=down, across=across, exact=partial(_shannon_at, small))
-
-
-_MAPS = {"filled_bins": filled_bins, "shannon": shannon}
-_BOUNDS = {"filled_bins": _bound_filled_bins, "shannon": _bound_shannon}
+        matters = (down.T @ undecided @ across > 0) & (entropy < at_most)
+        entropy[matters] = _shannon_at(small, matters)
+        if (np.abs(means(entropy)[undecided] - threshold) < _ROUNDING).any():
+            return (block_means(shannon(grey), cell_px) >= threshold) & among
+    return (means(entropy) >= threshold) & among
 
 
 def _cell_means(per_pixel: Array, cell_px: int) -> Array:
@@ -140,18 +91,14 @@ def _shannon_copy(grey: Bytes) -> Array:
 
 
 @lru_cache(maxsize=4)
-def _pairs(cells: int) -> Array:
-    """Return the matrix float32 (cells - 1, cells) that averages each cell of a row and the cell after it."""
-    return (np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)) / 2
-
-
-@lru_cache(maxsize=4)
 def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
     """Return the matrix float32 (cells - 1, 100) that enlarges a row of the 100x100 copy to `side_px` pixels, and
     averages it over each pair of neighbouring cells of `cell_px` pixels."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
     back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
-    matrix: Singles = _pairs(side_px // cell_px) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
+    cells = side_px // cell_px
+    pairs = np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)
+    matrix: Singles = (pairs / 2) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
     return matrix
 
 
@@ -161,21 +108,9 @@ def _range(grey: Bytes) -> Array:
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
-def _replicated(grey: Bytes) -> Array:
-    """Pad with copies of the border. They add no intensity to a disc: the pixel copied is nearer to its middle."""
-    r = DISC_RADIUS_PX
-    return cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
-
-
-def _bit(grey: Bytes) -> NDArray[np.uint64]:
-    """Return for each pixel a set with one element, as a word: the bit of the last six bits of the intensity is set."""
-    sets: NDArray[np.uint64] = np.left_shift(np.uint64(1), grey & 63, dtype=np.uint64)
-    return sets
-
-
-def _different(padded: Bytes) -> Array:
+def _count_different(padded: Bytes) -> Array:
     """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in `_over_disc`."""
-    bit, word_of = _bit(padded), padded >> 6
+    bit, word_of = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
     unions = (_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
     return sizes

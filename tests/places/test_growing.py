@@ -186,3 +186,15 @@ def test_places_without_positions_are_thinned_along_their_order(capacity):
     assert len(kept) == capacity
     if capacity > 2:
         assert np.diff(kept).max() <= 8
+
+
+def test_nearest_m_measures_over_the_date_line_and_passes_over_places_left_out(empty_map):
+    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=10)
+    assert growing.nearest_m(Position(0.0, 0.0)) == np.inf
+    for place_id, lon_deg in enumerate((179.99999, 170.0), start=1):
+        frame = Frame(image=np.zeros((1, 1)), name="a", t_mono_s=0.0, position=Position(0.0, lon_deg))
+        empty_map.add(frame, descriptor(place_id))
+        growing.add(place_id, frame.position, descriptor(place_id).coarse)
+    assert growing.nearest_m(Position(0.0, -179.99999)) == pytest.approx(2.22, abs=0.01)
+    empty_map.left_out[1] = "gone"
+    assert growing.nearest_m(Position(0.0, 179.99999)) > 1e6

@@ -16,9 +16,7 @@ from full_disk import no_file_larger_than
 from map_writer import SPEC, descriptor, frame, make_map
 
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.types import Position
 from edgevpr.places.examine import examine
-from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
 from edgevpr.places.rows import readable
@@ -211,9 +209,14 @@ def test_one_bit_flipped_in_the_file_is_damage(map_path, part):
     assert "checksum" in broken.problem
 
 
-def test_a_place_that_was_moved_on_purpose_is_believed(map_path):
-    written(map_path, f"UPDATE places SET geom = x'{point_blob(51.0, 9.0).hex()}' WHERE place_id = 7")
-    with PlaceMap.open(map_path) as place_map:
-        assert {each.problem for each in examine(place_map)} == {None}
-        (place,) = place_map.places([7])
-        assert place.position == Position(51.0, 9.0, 106.0)
+def test_open_for_adding_serves_the_triggers_of_a_spatial_index(map_path):
+    written(
+        map_path,
+        "CREATE TABLE boxes (x DOUBLE, y DOUBLE)",
+        "CREATE TRIGGER indexed AFTER INSERT ON places WHEN NOT ST_IsEmpty(NEW.geom) BEGIN "
+        "INSERT INTO boxes VALUES (ST_MinX(NEW.geom), ST_MaxY(NEW.geom)); END",
+    )
+    with PlaceMap.open_for_adding(map_path) as place_map:
+        place_map.add(frame(41), descriptor(41))
+        place_map.add(frame(45), descriptor(45))  # without a position
+        assert place_map.db.execute("SELECT * FROM boxes").fetchall() == [(8.0, pytest.approx(50.0041))]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ranking import Ruler, rank
 
-from edgevpr.core.contract import Descriptor, FineMatch
+from edgevpr.core.contract import FineMatch
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
@@ -109,16 +109,6 @@ def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(r
     assert technique.compared == 3 + 5
     assert margin(ranking, index, 150.0) is not None
     assert named(ranking, index, place_map, 1)[0].place.source_image == "44"
-
-
-def test_a_descriptor_of_the_wrong_size_is_named(tmp_path):
-    spec = dataclasses.replace(Ruler.spec, fine=None)
-    with PlaceMap.create(tmp_path / "bad.gpkg", spec) as place_map:
-        place_map.add(Frame(image=np.zeros((1, 1)), name="a", t_mono_s=0.0), Descriptor(coarse=np.zeros(1, "<f4")))
-        place_map.db.execute("UPDATE places SET coarse = x'00'")
-        with pytest.raises(MapError, match="1 places"):
-            load_index(place_map, Ruler(), 1000)
-        assert place_map.left_out == {1: "its coarse part has a wrong size"}
 
 
 def within(index, *numbers):

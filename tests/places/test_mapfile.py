@@ -16,11 +16,10 @@ from map_writer import SPEC, descriptor, frame, make_map
 
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.types import Position
 from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import index_positions, info_of, nearest_m
+from edgevpr.places.mapinfo import info_of
 
 
 @pytest.fixture(scope="module")
@@ -213,51 +212,6 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
             for place in each.places():
                 assert place.source_image == f"{place.place_id - 1:05d}.jpg"
         assert len(repaired) == 9
-
-
-def at(lat_deg, lon_deg):
-    return dataclasses.replace(frame(1), position=Position(lat_deg, lon_deg))
-
-
-def test_the_nearest_place_is_found_whenever_it_was_added(map_path):
-    with PlaceMap.open_for_adding(map_path) as place_map:
-        index_positions(place_map)
-        index_positions(place_map)  # once is enough, twice does no harm
-        place_map.add(at(50.01, 8.0), descriptor(11))
-        for lat_deg in (50.0003, 50.01):
-            assert nearest_m(place_map, Position(lat_deg, 8.0), 1.0) == 0
-        assert nearest_m(place_map, Position(50.0003, 8.0001), 5.0) is None
-        assert nearest_m(place_map, Position(50.0003, 8.0001), 50.0) == pytest.approx(7.147, abs=0.01)
-        assert nearest_m(place_map, Position(50.0096, 8.0), 1000.0) == pytest.approx(44.48, abs=0.05)
-        assert nearest_m(place_map, Position(0.0, 0.0), 1000.0) is None
-
-
-def test_near_knows_neither_the_date_line_nor_the_poles(tmp_path):
-    with PlaceMap.create(tmp_path / "m.gpkg", SPEC) as place_map:
-        index_positions(place_map)
-        for number, where in enumerate([(0.0, 179.99999), (10.0, -179.99999), (89.99999, 10.0)]):
-            place_map.add(at(*where), descriptor(number))
-        assert nearest_m(place_map, Position(0.0, -179.99999), 10.0) == pytest.approx(2.22, abs=0.01)
-        assert nearest_m(place_map, Position(10.0, 179.99999), 10.0) == pytest.approx(2.19, abs=0.01)
-        assert nearest_m(place_map, Position(89.99999, -150.0), 10.0) is not None
-
-
-def test_the_spatial_index_follows_what_other_programs_change(map_path):
-    with PlaceMap.open_for_adding(map_path) as place_map:
-        index_positions(place_map)
-        changes = {
-            "moved": f"UPDATE places SET geom = x'{point_blob(60.0, 8.0).hex()}' WHERE place_id = 4",
-            "placed": f"UPDATE places SET geom = x'{point_blob(61.0, 8.0).hex()}' WHERE place_id = 1",
-            "lost": "UPDATE places SET geom = NULL WHERE place_id = 5",
-            "deleted": "DELETE FROM places WHERE place_id = 7",
-            "renumbered": "UPDATE places SET place_id = 100 WHERE place_id = 8",
-        }
-        for change in changes.values():
-            place_map.db.execute(change)
-        boxes = dict(place_map.db.execute("SELECT id, miny FROM rtree_places_geom"))
-        points = {place.place_id: place.position.lat_deg for place in place_map.places() if place.position}
-        assert boxes == pytest.approx(points, abs=1e-4)
-        assert {1, 4, 100} <= boxes.keys()
 
 
 @pytest.mark.parametrize(

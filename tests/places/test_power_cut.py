@@ -32,13 +32,6 @@ def killed(tmp_path_factory):
     return path
 
 
-def test_the_log_of_a_map_is_what_these_tests_take_it_for(killed):
-    log = killed.with_name("killed.gpkg-wal").read_bytes()
-    assert len(log) > HEADER + PLACES * FRAME
-    # By its own header: the process may have been killed within a page.
-    assert int.from_bytes(log[8:12], "big") + 24 == FRAME
-
-
 def cuts(length: int) -> Iterator[int]:
     """Every byte of the header, the bytes about every end of a page, and some in between."""
     yield from range(HEADER + 2)

@@ -112,15 +112,6 @@ def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
     assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_picture_supports_its_own_step_entirely():
-    regions = np.eye(100, dtype=np.float32)
-    asking = np.arange(100)
-    own = support(asking, regions, regions, asking, (0.0, 0.0))
-    assert (own.back, own.likeness, own.log_rank) == (1.0, 1.0, 0.0)
-    moved = support(asking, regions, regions, asking, (5.0, 0.0))
-    assert moved.back == 0.0
-
-
 SIDE = 31
 
 

@@ -1,14 +1,11 @@
-"""The short cuts of encoding give what the long way gives: strips, octants for angles, bounds for whole maps."""
+"""The short cuts of encoding give what the long way gives: octants for angles, bounds for whole maps."""
 
 import cv2
-import literal
 import numpy as np
 import pytest
 from pictures import textured
 
 from edgevpr.techniques import entropy, gradients
-
-ENTROPIES = ("filled_bins", "shannon")
 
 
 def _wall(seed: int) -> np.ndarray:
@@ -18,17 +15,6 @@ def _wall(seed: int) -> np.ndarray:
 
 def _noise(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (128, 128), dtype=np.uint8)
-
-
-def _stripes() -> np.ndarray:
-    """Two far levels whose last bits are alike: the endings alone see one."""
-    return np.where(np.arange(128) // 3 % 2, 64, 192).astype(np.uint8)[None].repeat(128, axis=0)
-
-
-def _every_ending(seed: int) -> np.ndarray:
-    """Every disc has all 64 values of the last six bits, and far more than 64 values."""
-    ending = np.add.outer(28 * np.arange(128), 63 * np.arange(128)) & 63
-    return (ending + 64 * np.random.default_rng(seed).integers(0, 4, ending.shape)).astype(np.uint8)
 
 
 def _patchwork(seed: int) -> np.ndarray:
@@ -45,40 +31,22 @@ PICTURES = {
     "almost flat": _wall(3),
     "noise": _noise(4),
     "ramp": np.add.outer(np.arange(128), np.arange(128)).astype(np.uint8),
-    "stripes": _stripes(),
-    "every ending": _every_ending(7),
     "patchwork": _patchwork(5),
     "blurred patchwork": cv2.GaussianBlur(_patchwork(6), (0, 0), 1.5),
 }
 
 
-def _assert_same_goodness(grey: np.ndarray, which: str, cell_px: int) -> None:
-    """At the usual thresholds, at the extremes, and at those that split the picture's own blocks, ties included."""
-    means = entropy.block_means(getattr(entropy, which)(grey), cell_px)
-    own = np.quantile(means, [0, 0.02, 0.25, 0.5, 0.75, 0.98, 1], method="nearest")
-    for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
-        good = entropy.good_blocks(grey, which, cell_px, threshold)
-        np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("which", ENTROPIES)
 @pytest.mark.parametrize("cell_px", [8, 16])
 @pytest.mark.parametrize("name", PICTURES)
-def test_good_blocks_are_those_of_the_whole_map(name, cell_px, which):
-    _assert_same_goodness(PICTURES[name], which, cell_px)
-
-
-@pytest.mark.parametrize("which", ENTROPIES)
-@pytest.mark.parametrize("name", PICTURES)
-def test_no_entropy_leaves_its_bounds_and_the_exact_one_is_exact(name, which):
+def test_good_blocks_are_those_of_the_whole_map(name, cell_px):
+    """At the usual thresholds, at the extremes, and at those that split the picture's own blocks, ties included."""
     grey = PICTURES[name]
-    bounds = entropy._BOUNDS[which](grey, 16)
-    means = entropy.block_means(getattr(entropy, which)(grey), 16)
-    assert (bounds.blocks(bounds.low) <= means + 1e-6).all()
-    assert (bounds.blocks(bounds.high) >= means - 1e-6).all()
-    exact = bounds.exact(np.ones(bounds.low.shape, bool)).reshape(bounds.low.shape)
-    np.testing.assert_allclose(bounds.blocks(exact), means, atol=1e-6)
+    means = entropy.block_means(entropy.shannon(grey), cell_px)
+    own = np.quantile(means, [0, 0.02, 0.25, 0.5, 0.75, 0.98, 1], method="nearest")
+    for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
+        good = entropy.good_blocks(grey, "shannon", cell_px, threshold)
+        np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
 
 
 def test_octants_vote_like_angles_in_every_direction():
@@ -90,15 +58,6 @@ def test_octants_vote_like_angles_in_every_direction():
     error = np.abs(votes - expected).max(axis=2) / np.hypot(dx, dy)
     assert error.max() < 5e-6
     assert votes.min() >= 0
-
-
-@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (8, False), (12, True)])
-@pytest.mark.parametrize(("height", "cell_px"), [(152, 8), (160, 80), (136, 68)])
-def test_cells_in_strips_are_those_of_the_equations(height, cell_px, bins, signed):
-    grey = textured(10, height, cell_px)
-    cells = gradients.oriented_cells(grey, cell_px, bins, signed)
-    expected = literal.cell_histograms(grey, cell_px, bins, signed)
-    np.testing.assert_allclose(cells, expected, atol=1e-4 * expected.max())
 
 
 @pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False)])

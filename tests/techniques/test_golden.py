@@ -31,7 +31,7 @@ def test_shannon_is_the_entropy_of_the_disc():
 
 @pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (5, True)])
 def test_cell_histograms_and_blocks(bins, signed):
-    image = textured(5, 64, 80)
+    image = textured(5, 136, 80)  # more than two strips of rows
     cells = oriented_cells(image, 8, bins, signed)
     expected = literal.cell_histograms(image, 8, bins, signed)
     np.testing.assert_allclose(cells, expected, atol=1e-3, rtol=1e-4)

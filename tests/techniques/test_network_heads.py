@@ -1,7 +1,5 @@
 """The techniques that take the feature map of a network, on the backbone that edgevpr ships."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from pictures import textured
@@ -22,7 +20,6 @@ SETTINGS = {
     "region_vlad": {"words": 12, "regions": 50},
     "cross_region_bow": {"words": 40, "regions": 60},
 }
-FORMS = ("float", "8bit", "1bit")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,39 +40,6 @@ def few_words(tmp_path_factory):
 
 def technique(name, **settings):
     return create(name, {**SETTINGS[name], **settings})
-
-
-@cache
-def places_and_queries(name):
-    """Descriptors of eight pictures, and of the same darker and noisier; they are the same in all forms."""
-    it, noise = technique(name), np.random.default_rng(0)
-    pictures = [textured(seed) for seed in range(8)]
-    seen = [0.8 * picture + noise.normal(0, 3, picture.shape) for picture in pictures]
-    queries = [it.encode(np.clip(each, 0, 255).astype(np.uint8)) for each in seen]
-    return [it.encode(picture) for picture in pictures], queries
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("name", SETTINGS)
-def test_a_picture_finds_itself_darker_and_noisier(name, form):
-    it = technique(name, form=form)
-    places, queries = places_and_queries(name)
-    assert it.encode(textured(7)).coarse.tobytes() == places[7].coarse.tobytes()
-    coarse = np.stack([place.coarse for place in places])
-    mean = coarse.astype(np.float32).mean(axis=0)
-    rows = it.pack(coarse, mean) if it.spec.packed else coarse
-    assert rows.shape[1:] == it.spec.row.shape
-    for at, query in enumerate(queries):
-        scores, hypotheses = it.coarse_scores(query, rows, mean)
-        assert hypotheses is None
-        assert scores.dtype == np.float32
-        assert 0 <= scores.min() <= scores.max() <= 1
-        if it.spec.fine:
-            assert at in np.argsort(-scores)[:3]
-            scores = [it.match(query, place.fine).score for place in places]
-            assert 0 <= min(scores) <= max(scores) <= 1
-        assert int(np.argmax(scores)) == at
 
 
 @pytest.mark.parametrize("name", SETTINGS)

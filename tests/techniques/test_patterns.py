@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
 
-from edgevpr.techniques import create
-from edgevpr.techniques.displacement import displacement
 from edgevpr.techniques.gradients import slow_patterns, waves
 
 
@@ -22,13 +19,3 @@ def test_patterns_have_length_one_and_stand_at_right_angles(bins):
     patterns = slow_patterns(bins).astype(float)
     assert patterns.shape[0] == 4 * bins
     np.testing.assert_allclose(patterns.T @ patterns, np.eye(patterns.shape[1]), atol=1e-6)
-
-
-def test_nearly_as_many_regions_agree_as_if_all_numbers_were_compared():
-    technique = create("cohog")
-    scene = textured(5, 544, 544)
-    query, place = (technique.encode(scene[at : at + 512, at : at + 512]) for at in (0, 32))
-    asking = np.flatnonzero(query.good)
-    best = (query.regions[asking] @ place.regions.T).argmax(axis=1)
-    in_full = displacement(asking, best, (31, 31), (1.0, 1.0, 0.75, 0.5)).score
-    assert technique.match(query, place.fine).score > 0.95 * in_full > 0.4

@@ -19,7 +19,6 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame, Place, Position, Vehicle
 from edgevpr.frames.level import View
 from edgevpr.places.index import GrowingIndex
-from edgevpr.places.mapinfo import nearest_m
 from edgevpr.places.retrieve import named
 from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid
@@ -125,10 +124,10 @@ class Learner:
         if event.says_nothing or not seen.quality >= _QUALITY_MIN:  # `not >=` refuses NaN as well
             raise _LeftOut("of low quality")
         # Ask the file, not the index: a place that was dropped from RAM must not be learnt again.
-        if nearest_m(self._map, position, self._spacing_m) is not None:
+        if self._growing.nearest_m(position) <= self._spacing_m:
             raise _LeftOut("near a place")
         _require_no_contradiction(event.followed, position)
-        if event.worth and event.worth.reason and nearest_m(self._map, position, self._gap_m) is not None:
+        if event.worth and event.worth.reason and self._growing.nearest_m(position) <= self._gap_m:
             raise _LeftOut("not memorable")
 
     def _tied(self, frame: Frame, event: Recognition) -> Frame:

@@ -13,7 +13,6 @@ from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
-from edgevpr.places.mapinfo import index_positions
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
 from edgevpr.places.tilemap import TileMap
@@ -113,7 +112,6 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = technique_of(place_map, config.technique, _wanted(config), board)
-        index_positions(place_map)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
         prior, follows = _in_flight(config, technique), config.match.follow

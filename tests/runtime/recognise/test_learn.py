@@ -13,7 +13,6 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import index_positions
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.follow import Followed
 from edgevpr.runtime.recognise.judge import AcceptRule
@@ -36,7 +35,6 @@ class Bench:
     def __init__(self, path, places_in_ram=100):
         self.clock = FakeClock()
         self.map = PlaceMap.create(path, TECHNIQUE.spec)
-        index_positions(self.map)
         self.growing = GrowingIndex(self.map, TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
         self.recogniser = Recogniser(
             Matcher(TECHNIQUE, self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
