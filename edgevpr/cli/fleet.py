@@ -1,6 +1,7 @@
 """`edgevpr fleet`: maps larger than an aircraft, a folder of tiles made by many workers."""
 
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,7 @@ def add(commands: Any) -> None:
     """Add the commands and their flags."""
     fleet = group(commands, "fleet", "make maps that are larger than an aircraft")
     build = command(fleet, "build", fleet_build, "map ground tile by tile, by many workers")
-    build.add_argument(
-        "out", metavar="MAPS", help="folder of the maps, one a tile, and of their index; it is gone on with"
-    )
+    build.add_argument("out", metavar="MAPS", help="folder of the maps and of their index; resume if it exists")
     build.add_argument(
         "--images",
         metavar="SOURCE",
@@ -28,15 +27,14 @@ def add(commands: Any) -> None:
         help="folders of photographs, and tables (.csv) of files or addresses (s3://...) with their positions",
     )
     add_orthophoto(build)
-    build.add_argument("--config", metavar="FILE", help="that of the flights: their camera, mask and salience")
+    build.add_argument("--config", metavar="FILE", help="configuration of the flights: camera, mask, salience")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
-    build.add_argument(
-        "--places-per-tile", type=count, metavar="N", default=_PLACES_PER_TILE, help="at most (default: %(default)s)"
-    )
-    build.add_argument("--scheduler", metavar="ADDRESS", help="of Dask, tcp://HOST:8786 (default: this computer works)")
-    build.add_argument("--workers", type=count, metavar="N", help="on this computer (default: one a core)")
-    build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
-    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure it is")
+    add_count = partial(build.add_argument, type=count, metavar="N")
+    add_count("--places-per-tile", default=_PLACES_PER_TILE, help="most places of a tile (default: %(default)s)")
+    add_count("--workers", help="workers on this computer (default: one a core)")
+    build.add_argument("--scheduler", metavar="ADDRESS", help="of Dask, tcp://HOST:8786 (default: this computer)")
+    build.add_argument("--no-refine", dest="refine", action="store_false", help="keep positions as recorded")
+    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not calibrate confidence")
     add_json(build)
 
 

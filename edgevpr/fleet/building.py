@@ -4,29 +4,30 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edgevpr import __version__
 from edgevpr.core.errors import MapBusyError, MapError, UsageError
 from edgevpr.core.quadkeys import (
     extent_around,
     in_extent,
     keys_at,
     keys_over,
+    maps_in,
     zoom_of_places,
     zoom_of_spacing,
 )
 from edgevpr.fleet import index
-from edgevpr.fleet.index import Tile, path_of
-from edgevpr.fleet.photos import Photo
+from edgevpr.fleet.index import Tile, tile_of
+from edgevpr.fleet.photos import Photos
 from edgevpr.fleet.worker import MARGIN_M, TECHNIQUE, DoneTile, FleetOrder, TileTask, build_tile
 from edgevpr.mapmaking.making import Cuttings
 from edgevpr.places import mapfiles
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
 from edgevpr.techniques import create
 
@@ -38,23 +39,23 @@ _log = logging.getLogger(__name__)
 _CONNECT_S = 10.0
 
 
-def tasks_of_photos(photos: Sequence[Photo], places_per_tile: int, zoom: int | None) -> tuple[list[TileTask], int]:
+def tasks_of_photos(photos: Photos, places_per_tile: int, zoom: int | None) -> tuple[list[TileTask], int]:
     """Divide photographs into tiles, of `zoom` (None: so that none has more than `places_per_tile`). Returns the tasks,
     and how many photographs have no position, and so no tile."""
-    placed = [photo for photo in photos if photo.tag.position]
-    if not placed:
+    points = {uri: tag.position for uri, tag in photos.items() if tag.position}
+    if not points:
         raise UsageError("No photograph has a position, and without it has no tile: give a positions.csv beside them.")
-    points = [photo.tag.position for photo in placed if photo.tag.position]
-    lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points]).T
+    lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points.values()]).T
     zoom = zoom_of_places(lat_deg, lon_deg, places_per_tile) if zoom is None else zoom
-    keys, northwards, tasks = keys_at(lat_deg, lon_deg, zoom), np.argsort(lat_deg), []
+    uris, northwards, tasks = list(points), np.argsort(lat_deg), []
+    keys = keys_at(lat_deg, lon_deg, zoom)
     for key in np.unique(keys).tolist():
         extent_deg = extent_around(key, MARGIN_M)
         near = northwards[slice(*np.searchsorted(lat_deg, extent_deg[::2], sorter=northwards))]
         near = np.sort(near[in_extent(extent_deg, lat_deg[near], lon_deg[near])])
-        inside = frozenset(placed[at].uri for at in near[keys[near] == key])
-        tasks.append(TileTask(key=key, photos=tuple(placed[at] for at in near), inside=inside))
-    return tasks, len(photos) - len(placed)
+        inside = frozenset(uris[at] for at in near[keys[near] == key])
+        tasks.append(TileTask(key=key, photos={uris[at]: photos[uris[at]] for at in near}, inside=inside))
+    return tasks, len(photos) - len(points)
 
 
 def tasks_of_orthophoto(cuttings: Cuttings, places_per_tile: int, zoom: int | None) -> list[TileTask]:
@@ -82,8 +83,8 @@ def build(
 
     order.out.mkdir(parents=True, exist_ok=True)
     with _alone(order.out), _client(scheduler, workers) as client:
-        tiles = index.tiles_in(order.out)
-        _require_alike(tiles.values(), order)
+        _require_alike(order)
+        tiles: dict[str, Tile] = {}
         futures = {client.submit(build_tile, task, order, pure=False): task.key for task in tasks}
         try:
             for future in shown(as_completed(futures), len(futures), "tiles"):
@@ -97,7 +98,8 @@ def build(
                     tiles[done.tile.key] = done.tile
                 yield done
         finally:
-            index.write(order.out, (tiles[key] for key in sorted(tiles)))
+            paths = maps_in(order.out)
+            index.write(order.out, (tiles[key] if key in tiles else tile_of(path) for key, path in paths.items()))
 
 
 @contextmanager
@@ -120,48 +122,32 @@ def _alone(folder: Path) -> Iterator[None]:
 @contextmanager
 def _client(scheduler: str | None, workers: int | None) -> Iterator["Client"]:
     """Connect to a scheduler, or start workers here. Raises UsageError if there is none, or none that can be used."""
-    from dask.distributed import Client, LocalCluster
+    from dask.distributed import Client
 
-    for name in ("distributed", "pyogrio"):  # they tell of each connection, and of lost ones with a traceback
+    for name in ("distributed", "pyogrio"):  # they log each connection, and lost ones with a traceback
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with ExitStack() as stack:
-        if scheduler is None:
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, silence_logs=logging.CRITICAL, dashboard_address=":0"
-            )
-            stack.enter_context(cluster)
-        try:
-            client = stack.enter_context(Client(scheduler or cluster, timeout=_CONNECT_S))
-        except (OSError, ValueError):
-            raise UsageError(
-                f"There is no Dask scheduler at {scheduler}: start one (`dask scheduler`), and give tcp://HOST:8786."
-            ) from None
-        try:
-            versions = set(client.run(_version).values())
-        except ImportError:
-            versions = {"none"}
-        if not versions:
+    own = {"n_workers": workers, "threads_per_worker": 1, "silence_logs": logging.CRITICAL, "dashboard_address": ":0"}
+    try:
+        connected = Client(scheduler, timeout=_CONNECT_S, **({} if scheduler else own))
+    except (OSError, ValueError):
+        raise UsageError(
+            f"There is no Dask scheduler at {scheduler}: start one (`dask scheduler`), and give tcp://HOST:8786."
+        ) from None
+    with connected as client:
+        if not client.ncores():
             raise UsageError(f"{scheduler} has no workers: start some, `dask worker {scheduler}`.")
-        if versions != {__version__}:
-            other = ", ".join(sorted(versions - {__version__}))
-            raise UsageError(f"A worker has edgevpr {other}, and {__version__} asks: install the same on all machines.")
         _log.info("%d workers, to be watched at %s", len(client.ncores()), client.dashboard_link)
         yield client
 
 
-def _version() -> str:
-    return __version__
-
-
-def _require_alike(tiles: Iterable[Tile], order: FleetOrder) -> None:
-    """Raise MapError if a tile that is there was mapped by another technique than the new ones will be."""
-    spec = create(TECHNIQUE, camera_setting(TECHNIQUE, order.camera)).spec
-    for tile in tiles:
-        if tile.technique != index.technique_text(spec):
-            raise MapError(
-                f"{path_of(order.out, tile.key)} is of {tile.technique}, and new tiles would be of "
-                f"{index.technique_text(spec)}: map into another folder."
-            )
+def _require_alike(order: FleetOrder) -> None:
+    """Raise MapError if a tile in the folder was mapped by another technique than the new ones will be."""
+    wanted = index.technique_text(create(TECHNIQUE, camera_setting(TECHNIQUE, order.camera)).spec)
+    for path in maps_in(order.out).values():
+        with PlaceMap.open(path) as place_map:
+            found = index.technique_text(place_map.spec)
+        if found != wanted:
+            raise MapError(f"{path} is of {found}, and new tiles would be of {wanted}: map into another folder.")
 
 
 def _sentence(error: BaseException) -> str:

@@ -1,20 +1,18 @@
 """The index of a folder of maps: one GeoPackage, with an outline of every tile, which QGIS shows, and what it holds.
 
-It is written anew as a whole, and whatever it says is in the tiles' own files too: it can be lost."""
+It is written anew as a whole. All that it says is in the tiles' own files too, so it can be lost."""
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyogrio
 import shapely
 
 from edgevpr.core.contract import TechniqueSpec
-from edgevpr.core.errors import MapError
-from edgevpr.core.quadkeys import extent_of_key, maps_in
+from edgevpr.core.quadkeys import extent_of_key
 from edgevpr.places.history import counts_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import info_of
@@ -69,20 +67,13 @@ def tile_of(path: Path) -> Tile:
         precision=calibration.precision if calibration else None,
         technique=technique_text(info.spec),
         file_bytes=info.file_bytes,
-        **asdict(counts),
+        **counts,
     )
 
 
 def technique_text(spec: TechniqueSpec) -> str:
     """Return the name and parameters of a technique as text."""
     return " ".join([spec.name, *(f"{name}={value}" for name, value in sorted(spec.parameters.items()))])
-
-
-def tiles_in(folder: Path) -> dict[str, Tile]:
-    """Return the tiles of a folder by their keys: those of the index, and those whose maps are there and that it lacks.
-    Raises MapError."""
-    found = _read(folder / INDEX)
-    return {key: found[key] if key in found else tile_of(path) for key, path in maps_in(folder).items()}
 
 
 def write(folder: Path, tiles: Iterable[Tile]) -> None:
@@ -104,20 +95,3 @@ def write(folder: Path, tiles: Iterable[Tile]) -> None:
         crs="EPSG:4326",
     )
     unfinished.replace(folder / INDEX)
-
-
-def _read(path: Path) -> Mapping[str, Tile]:
-    if not path.exists():
-        return {}
-    try:
-        meta, _, _, columns = pyogrio.raw.read(path, layer=_LAYER, read_geometry=False)
-        rows = [dict(zip(meta["fields"].tolist(), row, strict=True)) for row in zip(*columns, strict=True)]
-        return {row["key"]: Tile(**{name: _plain(value) for name, value in row.items()}) for row in rows}
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, TypeError, KeyError) as error:
-        raise MapError(f"{path} is no index of maps ({error}): remove it, and it is made anew.") from error
-
-
-def _plain(value: Any) -> Any:
-    """Return a value of a column as Python's own; None for NaN."""
-    value = value.item() if isinstance(value, np.generic) else value
-    return None if value != value else value

@@ -6,7 +6,7 @@ on every card."""
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -25,26 +25,20 @@ _HASH_DIGITS, _MOST_LETTERS = 12, 40  # of a name: that of a file has 255 bytes
 _SAME_M = 1.0  # between two positions of one photograph: written with fewer digits
 
 
-@dataclass(frozen=True, slots=True)
-class Photo:
-    """A photograph at a path or an address, and what is known of it (see `GeoTag`)."""
-
-    uri: str
-    tag: GeoTag
+Photos = Mapping[str, GeoTag]  # what is known of photographs, by their paths or addresses
 
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """Photographs in a folder: `named`, by the names that they have there and in a map, each with another content.
-    `contents` has a text for each, of its content and its tag. `unusable` has a sentence about each that cannot be
-    used, by its address."""
+    """Photographs in a folder. `uris`: where each came from, by the name that it has there and in a map. `contents`: a
+    text for each, of its content and its tag. `unusable`: a sentence about each other one, by its path or address."""
 
-    named: dict[str, Photo]
+    uris: dict[str, str]
     contents: list[str]
     unusable: dict[str, str]
 
 
-def photos_of(sources: Sequence[str]) -> list[Photo]:
+def photos_of(sources: Sequence[str]) -> Photos:
     """Return the photographs of folders and tables. One that is named twice counts once. Raises UsageError for a source
     that cannot be read, and for a photograph that has two positions."""
     found: dict[str, tuple[GeoTag, str]] = {}
@@ -53,7 +47,7 @@ def photos_of(sources: Sequence[str]) -> list[Photo]:
             before, of_source = found.setdefault(uri, (tag, source))
             if not _agree(before, tag):
                 raise UsageError(f"{uri} has one position in {of_source} and another in {source}: give one of them.")
-    return [Photo(uri, tag) for uri, (tag, _) in found.items()]
+    return {uri: tag for uri, (tag, _) in found.items()}
 
 
 def _agree(tag: GeoTag, other: GeoTag) -> bool:
@@ -88,39 +82,38 @@ def _name(uri: str, sha256: str) -> str:
     return "_".join([*(word[-_MOST_LETTERS:] for word in words), sha256[:_HASH_DIGITS]]) + Path(file).suffix
 
 
-def gather(photos: Iterable[Photo], folder: Path) -> Gathered:
+def gather(photos: Photos, folder: Path) -> Gathered:
     """Bring photographs into a folder, with a positions.csv of them. Of those of one content the first counts. Raises
     SourceError where a store cannot be reached, or does not give what it has."""
     found = Gathered({}, [], {})
-    first: dict[str, Photo] = {}  # by the hash of the content
-    for photo in photos:
-        unfinished, is_here = folder / ".unfinished", "://" not in photo.uri
+    first: dict[str, str] = {}  # where a content was found first, by its hash
+    for uri, tag in photos.items():
+        unfinished, is_here = folder / ".unfinished", "://" not in uri
         try:
-            sha256 = _copied(photo.uri, Path(os.devnull) if is_here else unfinished)
+            sha256 = _copied(uri, Path(os.devnull) if is_here else unfinished)
         except FileNotFoundError:
-            found.unusable[photo.uri] = f"{photo.uri} is not there: correct the table, or bring it back"
+            found.unusable[uri] = f"{uri} is not there: correct the table, or bring it back"
             continue
         except Exception as error:  # each store has errors of its own
+            problem = f"{uri} cannot be read ({' '.join(str(error).split()) or type(error).__name__})"
             if not is_here:  # the next photographs would fail, too: this is not to make a map with holes
-                raise SourceError(
-                    f"{photo.uri} cannot be read ({_one_line(error)}): run this again when it can."
-                ) from None
-            found.unusable[photo.uri] = f"{photo.uri} cannot be read ({_one_line(error)})"
+                raise SourceError(f"{problem}: run this again when it can.") from None
+            found.unusable[uri] = problem
             continue
-        same, name = first.setdefault(sha256, photo), _name(photo.uri, sha256)
-        if same is not photo:
-            if not _agree(same.tag, photo.tag):
-                found.unusable[photo.uri] = f"{photo.uri} is the picture {same.uri}, and has another position"
+        same, name = first.setdefault(sha256, uri), _name(uri, sha256)
+        if same != uri:
+            if not _agree(photos[same], tag):
+                found.unusable[uri] = f"{uri} is the picture {same}, and has another position"
         elif not is_image(name):
-            found.unusable[photo.uri] = f"{photo.uri} is no picture ({' '.join(EXTENSIONS)})"
+            found.unusable[uri] = f"{uri} is no picture ({' '.join(EXTENSIONS)})"
         else:
             if is_here:
-                (folder / name).symlink_to(photo.uri)
+                (folder / name).symlink_to(uri)
             else:
                 unfinished.rename(folder / name)
-            found.named[name] = photo
-            found.contents.append(f"{sha256} {photo.tag!r}")
-    write_positions(folder / "positions.csv", {name: photo.tag for name, photo in found.named.items()})
+            found.uris[name] = uri
+            found.contents.append(f"{sha256} {tag!r}")
+    write_positions(folder / "positions.csv", {name: photos[uri] for name, uri in found.uris.items()})
     return found
 
 
@@ -132,7 +125,3 @@ def _copied(uri: str, target: Path) -> str:
             sha256.update(chunk)
             copy.write(chunk)
     return sha256.hexdigest()
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

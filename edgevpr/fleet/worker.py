@@ -19,7 +19,7 @@ from edgevpr.core.config import Config
 from edgevpr.core.errors import EdgevprError, ImageError
 from edgevpr.core.quadkeys import keys_at
 from edgevpr.fleet.index import Tile, path_of, tile_of
-from edgevpr.fleet.photos import Photo, content_in, gather
+from edgevpr.fleet.photos import Photos, content_in, gather
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
 from edgevpr.mapmaking.passes import history_of
@@ -52,15 +52,15 @@ class TileTask:
 
     key: str
     cuttings: Cuttings | None = None
-    photos: tuple[Photo, ...] = ()
+    photos: Photos = field(default_factory=dict)
     inside: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoneTile:
-    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: nothing of it
-    can be mapped). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used.
-    `problem`: why it could not be mapped (None: it could)."""
+    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: it has no
+    place). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used. `problem`: why
+    it could not be mapped."""
 
     key: str
     tile: Tile | None = None
@@ -92,8 +92,8 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Inputs:
     """All that a tile is mapped from: the `pictures`, the hash of their content and of the settings, and sentences
-    about those of the tile that cannot be used. `is_named` says if a picture of an older map is one of them, by its
-    name, and `inside` which places lie in the tile, and not only near it. `uris`: addresses of photographs, by name."""
+    about those of the tile that cannot be used. `is_named` returns True for the name of one of them, and `inside` the
+    places that lie in the tile, and not only near it. `uris`: addresses of photographs, by name."""
 
     pictures: Cuttings | FlownPictures
     sha256: str
@@ -128,8 +128,8 @@ def _of_photos(order: FleetOrder, task: TileTask, folder: Path) -> _Inputs:
     """Bring the photographs of a tile into a folder. Raises NoPlaceError if none of the tile can be used."""
     folder.mkdir()
     needs_near = order.refine or order.calibrate
-    found = gather((photo for photo in task.photos if needs_near or photo.uri in task.inside), folder)
-    contents, uris = set(map(content_in, found.named)), {name: photo.uri for name, photo in found.named.items()}
+    found = gather({uri: tag for uri, tag in task.photos.items() if needs_near or uri in task.inside}, folder)
+    contents, uris = set(map(content_in, found.uris)), found.uris
     return _Inputs(
         pictures=FlownPictures(source=str(folder)),
         sha256=_hash_of(order, sorted(found.contents)),
@@ -146,16 +146,17 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     target, folder = path_of(order.out, task.key), scratch / "pictures"
     inputs = _of_orthophoto(order, task.key, task.cuttings) if task.cuttings else _of_photos(order, task, folder)
     unusable = inputs.unusable
+    done = DoneTile(key=task.key, unusable=tuple(unusable))
     if target.exists() and (there := tile_of(target)).inputs_sha256 == inputs.sha256:
-        return DoneTile(key=task.key, tile=there, unusable=tuple(unusable))
+        return replace(done, tile=there)
     if lost := _lost(target, inputs.is_named):
-        return DoneTile(key=task.key, problem=lost, unusable=tuple(unusable))
+        return replace(done, problem=lost)
     if task.photos and not task.inside.intersection(inputs.uris.values()):
-        return DoneTile(key=task.key, unusable=tuple(unusable))
+        return done
 
-    def say(error: ImageError) -> None:
+    def report_unusable(error: ImageError) -> None:
         name = next((name for name in inputs.uris if f"{folder / name}" in str(error)), None)
-        if name is None or inputs.uris[name] in task.inside:  # a neighbour tells of its own
+        if name is None or inputs.uris[name] in task.inside:  # the task of its own tile reports any other
             unusable.append(str(error).replace(f"{folder / name}", inputs.uris[name]) if name else str(error))
 
     path, whole = scratch / "inside.gpkg", scratch / "map.gpkg"
@@ -167,7 +168,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         refine=order.refine,
         calibrate=order.calibrate,
     )
-    make_map(ordered, order.config, say, lambda items, *_: items)
+    make_map(ordered, order.config, report_unusable, lambda items, *_: items)
     folders = {name: uri.rpartition("/")[0] for name, uri in inputs.uris.items()}
     history = history_of(whole, inputs.pictures, order.config, folders, inputs.inside) if folders else History()
 
@@ -176,7 +177,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         return [place.place_id for place in inside if place.source_image not in history.removed]
 
     if not select(whole, path, kept):
-        return DoneTile(key=task.key, unusable=tuple(unusable))
+        return replace(done, unusable=tuple(unusable))
     with PlaceMap.open_for_adding(path) as place_map:
         place_map.record_inputs(inputs.sha256)
         write_history(place_map, history)
@@ -186,7 +187,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         unfinished.replace(target)
     finally:
         unfinished.unlink(missing_ok=True)
-    return DoneTile(key=task.key, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
+    return replace(done, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
 
 
 def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:

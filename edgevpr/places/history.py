@@ -47,16 +47,6 @@ class History:
     changes: tuple[GroundChange, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryCounts:
-    """Numbers of flights compared, places that became part of another, places faded, and spots changed."""
-
-    passes: int = 0
-    merged: int = 0
-    faded: int = 0
-    changed: int = 0
-
-
 def write_history(place_map: PlaceMap, history: History) -> None:
     """Write the history of a map that is open for adding and has none yet; nothing, if no flights were compared. Raises
     MapError."""
@@ -79,13 +69,14 @@ def _row_of(change: GroundChange) -> tuple[bytes, str | None, str | None, float,
     return point_blob(at.lat_deg, at.lon_deg), *times, change.confidence, change.from_image, change.to_image
 
 
-def counts_of(place_map: PlaceMap) -> HistoryCounts:
-    """Count what the history of a map has; zeros for a map without. Raises MapError."""
+def counts_of(place_map: PlaceMap) -> dict[str, int]:
+    """Count the flights compared (`passes`), the places that became part of another (`merged`) or have `faded`, and the
+    spots `changed`; empty for a map without a history. Raises MapError."""
     if not _has_history(place_map):
-        return HistoryCounts()
+        return {}
     with sentences(place_map.path):
         passes, merged, removed, changed = place_map.db.execute(_COUNTS).fetchone()
-    return HistoryCounts(passes=passes, merged=merged, faded=removed - merged, changed=changed)
+    return {"passes": passes, "merged": merged, "faded": removed - merged, "changed": changed}
 
 
 def removed_from(place_map: PlaceMap) -> list[str]:

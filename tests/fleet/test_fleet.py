@@ -1,12 +1,12 @@
 """Maps made tile by tile: by a real scheduler and real workers, each a process of its own."""
 
 import json
+import logging
 import os
-import sqlite3
+import signal
 import subprocess
 import sys
-import time
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ index = pytest.importorskip("edgevpr.fleet.index")
 photos = pytest.importorskip("edgevpr.fleet.photos")
 worker = pytest.importorskip("edgevpr.fleet.worker")
 pyogrio = pytest.importorskip("pyogrio")
+distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.slow
 PER_TILE = 10
 
@@ -41,51 +42,18 @@ def unshown(items, total, label):
     return items
 
 
-class Cluster:
-    """A scheduler, and workers that can be killed."""
-
-    def __init__(self, folder):
-        folder.mkdir(exist_ok=True)
-        self.file, self.workers = folder / "scheduler.json", []
-        self.scheduler = self._start("dask_scheduler", "--port", "0", "--no-dashboard")
-
-    def _start(self, program, *words):
-        words = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", self.file, *words]
-        with open(self.file.with_suffix(".log"), "ab") as log:
-            return subprocess.Popen(list(map(str, words)), stdout=log, stderr=log)
-
-    def add_worker(self):
-        self.workers.append(self._start("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard"))
-        return self.workers[-1]
-
-    @property
-    def address(self):
-        for _ in range(300):
-            if self.file.exists() and self.file.read_text().strip():
-                return json.loads(self.file.read_text())["address"]
-            time.sleep(0.1)
-        raise TimeoutError(self.file.with_suffix(".log").read_text())
-
-    def wait_for_workers(self, count):
-        from dask.distributed import Client
-
-        with Client(self.address, timeout=30) as client:
-            client.wait_for_workers(count, timeout=60)
-
-    def stop(self):
-        for process in (*self.workers, self.scheduler):
-            process.kill()
-            process.wait()
+@contextmanager
+def started():
+    """A scheduler and two workers, each a process."""
+    silent = {"silence_logs": logging.CRITICAL, "dashboard_address": ":0"}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **silent) as cluster:
+        yield cluster
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory):
-    found = Cluster(tmp_path_factory.mktemp("dask"))
-    found.add_worker()
-    found.add_worker()
-    found.wait_for_workers(2)
-    yield found
-    found.stop()
+def cluster():
+    with started() as cluster:
+        yield cluster.scheduler_address
 
 
 def order(out, **more):
@@ -98,7 +66,7 @@ def cuttings(path):
 
 
 def mapped(cluster, out, tasks, **more):
-    return list(building.build(order(out, **more), tasks, cluster.address, None, unshown))
+    return list(building.build(order(out, **more), tasks, cluster, None, unshown))
 
 
 def places_of(folder):
@@ -133,12 +101,18 @@ def test_every_place_of_an_orthophoto_is_in_one_tile(tiled, orthophoto):
     assert len(found) > 4
 
 
+def index_column(folder, name):
+    """A column of the index of a folder, by the keys of its tiles."""
+    meta, _, _, columns = pyogrio.raw.read(folder / index.INDEX, layer="tiles", read_geometry=False)
+    rows = dict(zip(meta["fields"].tolist(), columns, strict=True))
+    return [value for _, value in sorted(zip(rows["key"], rows[name].tolist(), strict=True))]
+
+
 def test_the_index_shows_the_tiles_in_any_program(tiled):
     out, _, _ = tiled
     info = pyogrio.read_info(out / index.INDEX)
     assert (info["layer_name"], info["geometry_type"], info["crs"]) == ("tiles", "Polygon", "EPSG:4326")
-    found = index.tiles_in(out)
-    assert {key: tile.places for key, tile in found.items()} == {key: len(each) for key, each in places_of(out).items()}
+    assert index_column(out, "places") == [len(each) for each in places_of(out).values()]
     with rasterio.open(out.parents[1] / "raster0" / "o.tif") as raster:
         west, south, east, north = rasterio.warp.transform_bounds(raster.crs, "EPSG:4326", *raster.bounds)
     bounds = info["total_bounds"]
@@ -182,25 +156,19 @@ def cut_of(task):
 
 
 def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
-    cluster, out = Cluster(tmp_path), tmp_path / "maps"
-    try:
-        first = cluster.add_worker()
-        cluster.add_worker()
-        cluster.wait_for_workers(2)
-        tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
-        done = []
-        for each in building.build(order(out), tasks, cluster.address, None, unshown):
+    done, made, out = [], {}, tmp_path / "maps"
+    tasks = building.tasks_of_orthophoto(cuttings(orthophoto), PER_TILE, None)
+    with started() as cluster:
+        first = cluster.workers[0].process
+        for each in building.build(order(out), tasks, cluster.scheduler_address, None, unshown):
             done.append(each)
-            if sum(each.tile is not None for each in done) == 3 and first.poll() is None:
+            if sum(each.tile is not None for each in done) == 3 and not made:
                 made = {
                     index.path_of(out, each.key): index.path_of(out, each.key).stat().st_ino
                     for each in done
                     if each.tile
                 }
-                first.kill()
-                first.wait()
-    finally:
-        cluster.stop()
+                os.kill(first.pid, signal.SIGKILL)
     assert not [each.problem for each in done if each.problem]
     names = [name for each in places_of(out).values() for name in each]
     assert len(names) == len(set(names)) == sum(each.tile.places for each in done if each.tile)
@@ -288,7 +256,7 @@ def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
     write_positions(table, {f"file://{tmp_path}/a/1.png": elsewhere})
     (tmp_path / "here").mkdir()
     found = photos.gather(photos.photos_of([str(tmp_path / "a"), str(table)]), tmp_path / "here")
-    assert len(found.named) == 1
+    assert len(found.uris) == 1
     assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
 
 
@@ -298,21 +266,17 @@ def test_flights_over_the_same_ground_become_one_map_which_the_index_tells_of(cl
     for number, (day, last) in enumerate(zip(days, (same, same, other), strict=True)):
         overflown.fly(Path(day), [same, same, same, last], number, 1.7e9 + number * overflown.DAY_S)
     words = ["--camera", "nadir", "--fov-deg", str(overflown.FOV_DEG), "--no-refine", "--no-calibrate"]
-    build = ["fleet", "build", str(tmp_path / "maps"), *words, "--scheduler", cluster.address, "--images"]
+    build = ["fleet", "build", str(tmp_path / "maps"), *words, "--scheduler", cluster, "--images"]
     assert main([*build, *days]) == 0
     assert "7 places became part of others, 0 faded; changed spots: 1" in capsys.readouterr().out
-    tiles = index.tiles_in(tmp_path / "maps").values()
-    assert [sum(getattr(tile, name) for tile in tiles) for name in ("places", "merged", "changed")] == [5, 7, 1]
-    assert {tile.passes for tile in tiles} == {3}
-    (tmp_path / "maps" / "index.gpkg").unlink()
-    assert list(index.tiles_in(tmp_path / "maps").values()) == list(tiles)
-    index.write(tmp_path / "maps", tiles)
-    with closing(sqlite3.connect(tmp_path / "maps" / "index.gpkg")) as db:  # as versions before have written it
-        db.execute("ALTER TABLE tiles DROP COLUMN passes")
-        db.commit()
-    assert {tile.passes for tile in index.tiles_in(tmp_path / "maps").values()} == {0}
+    maps = tmp_path / "maps"
+    assert [sum(index_column(maps, name)) for name in ("places", "merged", "changed")] == [5, 7, 1]
+    assert set(index_column(maps, "passes")) == {3}
+    before = pyogrio.raw.read(maps / "index.gpkg")[3]
+    (maps / "index.gpkg").unlink()
     assert main([*build, *days, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["mapped_now"] == 0
+    assert str(pyogrio.raw.read(maps / "index.gpkg")[3]) == str(before)
     # A flight all of whose pictures are part of others' places is missed, too.
     kept = {name.split("_")[0] for names in places_of(tmp_path / "maps").values() for name in names}
     assert main([*build, *(day for day in days if Path(day).name in kept)]) == 1
@@ -321,7 +285,7 @@ def test_flights_over_the_same_ground_become_one_map_which_the_index_tells_of(cl
 
 def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
     out, tasks, _ = tiled
-    first = building.build(order(out), tasks, cluster.address, None, unshown)
+    first = building.build(order(out), tasks, cluster, None, unshown)
     next(first)
     with pytest.raises(MapBusyError, match="another run is mapping into it"):
         mapped(cluster, out, tasks)
@@ -332,7 +296,7 @@ def test_a_tile_of_another_technique_is_refused(tiled, cluster):
     out, tasks, _ = tiled
     ahead = replace(order(out), camera="forward")
     with pytest.raises(MapError, match=r"camera=nadir.*new tiles would be of.*camera=forward.*another folder"):
-        list(building.build(ahead, tasks, cluster.address, None, unshown))
+        list(building.build(ahead, tasks, cluster, None, unshown))
 
 
 def test_a_worker_of_another_version_maps_nothing(tiled, cluster, tmp_path):
@@ -344,9 +308,7 @@ def test_a_worker_of_another_version_maps_nothing(tiled, cluster, tmp_path):
 
 def test_photographs_on_both_sides_of_the_date_line_have_neighbours_across_it():
     at = [Position(0.5, 179.9999), Position(0.5, -179.9999)]
-    tasks, _ = building.tasks_of_photos(
-        [photos.Photo(f"/{n}.jpg", GeoTag(position=each)) for n, each in enumerate(at)], 10, 12
-    )
+    tasks, _ = building.tasks_of_photos({f"/{n}.jpg": GeoTag(position=each) for n, each in enumerate(at)}, 10, 12)
     assert [(len(task.photos), len(task.inside)) for task in tasks] == [(2, 1), (2, 1)]
 
 
