@@ -1,8 +1,5 @@
 """The connection to an open map file, the lock of the one program that may add places, and the check that the file has
-not been replaced.
-
-This module only queries SQLite; `mapfile.PlaceMap` builds on it and knows what the rows mean.
-"""
+not been replaced. `mapfile.PlaceMap` builds on it and knows what the rows mean."""
 
 import os
 import sqlite3
@@ -36,6 +33,7 @@ class MapConnection:
         self.path, self.stored = path, read_stored(path, db)
         self.spec = spec_of(path, self.stored)
         self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
+        self.left_out: dict[int, str] = {}  # see `mapfile.PlaceMap`
         self._wait_s = mapfiles.WAIT_S
         self._take(db)
         self._state = self._state_now()
@@ -109,10 +107,8 @@ class MapConnection:
 
     def require_unchanged(self) -> None:
         """Raise MapError if the file is gone, cannot be read, or has been replaced by another map since it was opened.
-
-        This is cheap: only when another program has touched the file is it opened again, and its map_id and technique
-        compared. The new connection then replaces `db`, since the old one may have cached pages of a replaced file.
-        """
+        Only when another program has touched the file is it opened again, and its map_id and technique compared: the
+        old connection may have cached pages of a replaced file."""
         with sentences(self.path):
             state = self._state_now()
             if state == self._state:

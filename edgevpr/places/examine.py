@@ -96,10 +96,9 @@ def merge(
     """Make the new map `out` of the `wanted` places of several maps; if that fails, leave no file. Returns for each map
     (places copied, places that were there already) as numbers, and True if one was calibrated: `out` is not.
 
-    A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). The
-    mask hash is copied if all have the same, and so is the lens; attributions are all copied. Raises MapError if the
-    techniques differ or a file cannot be read or written, and PlaceError if a place is damaged.
-    """
+    A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). Mask
+    hash and lens are copied if all have the same; attributions are all copied. Raises MapError if the techniques differ
+    or a file cannot be read or written, and PlaceError if a place is damaged."""
     with ExitStack() as stack:
         unfinished = stack.enter_context(mapfiles.whole_or_none(out))
         maps = [stack.enter_context(PlaceMap.open(path)) for path in paths]
@@ -151,12 +150,10 @@ def check(path: str | Path, watch: Watch = unwatched) -> MapCheck:
 
 
 def repair(path: str | Path, watch: Watch = unwatched) -> Path:
-    """Replace the map by a copy of its undamaged places; keep the original as `*.damaged` and return its path.
-
-    The places keep their ids, and all get checksums. Mask hash and calibration are copied if they can be read. Raises
-    MapError if no place can be read, if the original of an earlier repair exists, or if the copy cannot be written. The
-    map is then unchanged.
-    """
+    """Replace the map by a copy of its undamaged places, which keep their ids and get checksums; keep the original as
+    `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
+    leaves the map as it is, if no place can be read, if the original of an earlier repair exists, or if the copy cannot
+    be written."""
     path = mapfiles.existing(path)
     original = path.with_name(path.name + ".damaged")
     if original.exists():
@@ -189,24 +186,18 @@ def select(path: str | Path, out: Path, wanted: Wanted) -> int:
 
 
 def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:
-    """Copy the `count` best places of a map to the new file `out`: those of high quality that leave small gaps (see
-    `best_places`). Returns (number of places copied, number of readable places of the map).
-
-    The places keep their ids. Mask hash and calibration are copied; the calibration refers to places by id. Places that
-    cannot be read are not copied. Raises MapError if the map cannot be read, or if `out` exists or cannot be written;
-    no part of a file is then left.
-    """
+    """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
+    (see `best_places`). They keep their ids, to which the calibration, copied like the mask hash, refers. Returns
+    (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if `out` exists
+    or cannot be written; no part of a file is then left."""
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        total = len(place_map)
-        whole = (each for each in watch(examine(place_map), total, "reading") if not each.problem)
+        whole = (each for each in watch(examine(place_map), len(place_map), "reading") if not each.problem)
         places = [rows.place_of(each.place_id, each.content) for each in whole]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
-        kept = {places[number].place_id for number in best.tolist()}
-        chosen = (each for each in watch(examine(place_map), total, "copying") if each.place_id in kept)
-        _copy(place_map, unfinished, chosen)
-    return len(kept), len(places)
+        kept = [places[number].place_id for number in best.tolist()]
+        return _copy(place_map, unfinished, watch(examine(place_map, kept), len(kept), "copying")), len(places)
 
 
 def _worth_of(place: Place) -> float:

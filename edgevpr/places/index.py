@@ -30,13 +30,12 @@ CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `Plac
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
-    """The part of a map that is held in RAM to be scanned: arrays of N places, all contiguous. A place's number in
-    these arrays is its *slot*; slots follow the order in which the places were mapped.
+    """The part of a map that is held in RAM to be scanned: contiguous arrays of N places in the order mapped. A place's
+    number in these arrays is its *slot*.
 
     `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN for a place without a position.
     `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN if unknown. `rows` (N, *row shape) has the
-    coarse parts, packed if the technique packs them. `mean` is the mean coarse part used for packing, else None.
-    """
+    coarse parts, packed if the technique packs them, with the `mean` coarse part (else None)."""
 
     place_ids: Ints
     lat_deg: Doubles
@@ -92,14 +91,13 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
 def load_index(
     place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None, beside_bytes: int = 0
 ) -> PlaceIndex:
-    """Load the coarse parts of the descriptors in a map, packed by the technique, into the arrays of `into` (None: into
-    new ones). Return the index of the places that were loaded.
+    """Load the coarse parts of a map, packed by the technique, into the arrays of `into` (None: into new ones). Return
+    the index of the places that were loaded.
 
-    If `budget_bytes` is too small for all places, only the `best_places` are loaded. Per place, `beside_bytes` of the
-    budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are skipped
-    and noted in `PlaceMap.left_out`. Raises MapError if the map has no places, if none of them can be read, or if the
-    budget is too small for one place.
-    """
+    If `budget_bytes` is too small for all, only the `best_places` are loaded. Per place, `beside_bytes` of the budget
+    stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are noted in
+    `PlaceMap.left_out`. Raises MapError if there is no place that can be read, or if the budget is too small for
+    one."""
     spec = technique.spec
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
     if not places:
@@ -183,13 +181,11 @@ def _only(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
 
 def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
     """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
-
     `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
 
-    Places are dropped one at a time, always the one of least worth. The worth of a place is its quality times the
-    distance to the nearer of its two remaining neighbours along the track. So gaps stay small, and places of high
-    quality stay; age does not matter. The first and the last place are kept.
-    """
+    Places are dropped one at a time, always the one of least worth: its quality times the distance to the nearer of its
+    two remaining neighbours along the track. So gaps stay small, and places of high quality stay. The first and the
+    last are kept."""
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
@@ -231,18 +227,14 @@ def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int
 
 
 class GrowingIndex:
-    """The index of an open map, with free slots for more places.
-
-    `index` is a PlaceIndex of the present places, for retrieval; its arrays are views, valid until the next `add`. A
-    place for which there is no slot left is in the map file only, until the next start chooses the best again.
-    """
+    """The index of an open map, with free slots for more places. `index` is a PlaceIndex of the present places; its
+    arrays are views, valid until the next `add`. A place without a free slot is in the map file only."""
 
     def __init__(
         self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
     ) -> None:
         """Load the map, which may be empty, and allocate slots for `room` more places as far as the budget allows.
-        `beside_bytes`: see `load_index`. Raises MapError if the budget is too small for one place.
-        """
+        `beside_bytes`: see `load_index`. Raises MapError if the budget is too small for one place."""
         each = bytes_per_place(technique.spec) + beside_bytes
         self._in_file = len(place_map)
         capacity = _capacity(place_map, each, budget_bytes, self._in_file + room)
@@ -262,10 +254,10 @@ class GrowingIndex:
         return replace(self._slots.first(self._taken), mean=self._mean)
 
     def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
-        """Add a place that is already in the map file, with an id larger than all ids in the index (position and
-        heading None: unknown). If all places must be packed again with a new mean, they are read from the file, and
-        damaged ones are left out without an error. Raises MapError if the file cannot be read: the index may then have
-        fewer places, all packed with one mean."""
+        """Add a place that is already in the map file, with an id larger than all in the index (position and heading
+        None: unknown). If all places must be packed again with a new mean, they are read from the file, and damaged
+        ones are left out. Raises MapError if the file cannot be read: the index may then have fewer places, all packed
+        with one mean."""
         point = (position.lat_deg, position.lon_deg) if position else None
         free = replace(self._slots.only(slice(self._taken, self._taken + 1)), mean=self._mean)
         self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique), default=0)

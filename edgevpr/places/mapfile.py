@@ -30,13 +30,40 @@ _OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that m
 _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
 
 
+class _StoredText:
+    """A text in the table edgevpr_map; None if there is none, or if it cannot be read."""
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+
+    def __get__(self, place_map: "PlaceMap", owner: type) -> str | None:
+        with sentences(place_map.path):
+            try:
+                row = place_map.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (self._key,)).fetchone()
+                value = json.loads(row[0]) if row else None
+                return value if isinstance(value, str) else None
+            except (ValueError, TypeError, RecursionError):
+                return None
+            except sqlite3.Error as error:
+                if is_of_one_row(error):
+                    return None
+                raise
+
+
 class PlaceMap(MapConnection):
     """An open map. `left_out` maps the id of each place that could not be read so far to the reason in a few words, in
-    the order in which they were found."""
+    the order in which they were found.
 
-    def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
-        super().__init__(path, db, lock)
-        self.left_out: dict[int, str] = {}
+    `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the calibration by which
+    their pictures were straightened. `attribution`: owners of the orthophotos that places were cut from, in their own
+    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). `inputs_sha256`: hash of all that
+    a tile of a fleet's maps was made of. None: there is none, or it is unknown."""
+
+    mask_sha256 = _StoredText(mapspec.MASK)
+    lens = _StoredText(mapspec.LENS)
+    attribution = _StoredText(mapspec.ATTRIBUTION)
+    calibration = _StoredText(mapspec.CALIBRATION)
+    inputs_sha256 = _StoredText(mapspec.INPUTS)
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
@@ -79,56 +106,29 @@ class PlaceMap(MapConnection):
         self.db.execute(f"UPDATE places SET {columns} WHERE place_id = ?", (*row.values(), place_id))
         self._grow_extent(position.lat_deg, position.lon_deg)
 
-    @property
-    def mask_sha256(self) -> str | None:
-        """SHA-256 of the overlay mask that was used to make the places; None: no mask, or unknown."""
-        return self._text_beside(mapspec.MASK)
-
     def record_mask(self, sha256: str | None) -> None:
         """Store the SHA-256 of the overlay mask that is used to make the places (None: no mask). Raises MapError."""
-        self._record_beside(mapspec.MASK, sha256)
-
-    @property
-    def lens(self) -> str | None:
-        """Name of the calibration by which the pictures of the places were straightened; None: they were not, or
-        unknown."""
-        return self._text_beside(mapspec.LENS)
+        self._record_text(mapspec.MASK, sha256)
 
     def record_lens(self, path: str | None) -> None:
         """Store the name of the calibration by which the pictures of the places are straightened. None: they are not,
         and nothing is stored. Raises MapError."""
         if path is not None:
-            self._record_beside(mapspec.LENS, Path(path).name)
-
-    @property
-    def attribution(self) -> str | None:
-        """Owners of the orthophotos that places were cut from, in their own words; None: none is known."""
-        return self._text_beside(mapspec.ATTRIBUTION)
+            self._record_text(mapspec.LENS, Path(path).name)
 
     def add_attribution(self, text: str | None) -> None:
-        """Store an owner's words beside those that are there (None: nothing is stored). Raises MapError."""
+        """Store an owner's words with those that are there (None: nothing is stored). Raises MapError."""
         if text:
             words = [*(self.attribution or text).split(_OWNERS), *text.split(_OWNERS)]
-            self._record_beside(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
-
-    @property
-    def inputs_sha256(self) -> str | None:
-        """Hash of all that a tile of a fleet's maps was made of; None: it was not recorded."""
-        return self._text_beside(mapspec.INPUTS)
+            self._record_text(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
 
     def record_inputs(self, sha256: str) -> None:
         """Store the hash of all that the map was made of. Raises MapError."""
-        self._record_beside(mapspec.INPUTS, sha256)
-
-    @property
-    def calibration(self) -> str | None:
-        """The map's calibration of confidences (see `mapmaking.calibrate`), as the text stored in the file. None if the
-        map was not calibrated, or if the stored value is not a text."""
-        return self._text_beside(mapspec.CALIBRATION)
+        self._record_text(mapspec.INPUTS, sha256)
 
     def record_calibration(self, text: str | None) -> None:
         """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""
-        self._record_beside(mapspec.CALIBRATION, text)
+        self._record_text(mapspec.CALIBRATION, text)
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
@@ -215,21 +215,7 @@ class PlaceMap(MapConnection):
     def _grow_extent(self, lat_deg: float, lon_deg: float) -> None:
         self.db.execute(geopackage.GROW_EXTENT, {"table": "places", "lat": lat_deg, "lon": lon_deg})
 
-    def _text_beside(self, key: str) -> str | None:
-        """Return the text stored under `key` in the table edgevpr_map; None if there is none or it cannot be read."""
-        with sentences(self.path):
-            try:
-                row = self.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (key,)).fetchone()
-                value = json.loads(row[0]) if row else None
-                return value if isinstance(value, str) else None
-            except (ValueError, TypeError, RecursionError):
-                return None
-            except sqlite3.Error as error:
-                if is_of_one_row(error):
-                    return None
-                raise
-
-    def _record_beside(self, key: str, text: str | None) -> None:
+    def _record_text(self, key: str, text: str | None) -> None:
         with self.transaction():
             self.db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES (?, ?)", (key, json.dumps(text)))
 

@@ -1,16 +1,12 @@
 """Retrieval of the places that a query may show: a scan of the whole index, then full comparisons of the best places.
 
 A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number.
-A place that cannot be read is left out from then on. Its loss must never make a wrong match be accepted that would have
-been refused. So:
+A place that cannot be read is left out from then on. Its loss must never make a wrong match be accepted:
 
 * The query in which a place turns out to be unreadable is refused.
-* A place that was left out keeps its row in the index, and so its scan score. A later query that may show it (see
-  `Ranking.unread`) is refused, whichever place it matches.
-* A technique without a fine part needs only the row. A place that was left out then keeps its rank and score, and the
-  query is refused if that place is the best.
-* If most of the places compared with one query cannot be read, the file is at fault: the query is refused, and no
-  place is left out.
+* A place that was left out keeps its row. A query that may show it (see `Ranking.unread`) is refused.
+* Without a fine part the row is all: a place that was left out keeps its rank, and is refused if it is the best.
+* If most of the places compared with one query cannot be read, the file is at fault: no place is left out.
 """
 
 import math
@@ -39,9 +35,8 @@ _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 3  # hypotheses per place
 _ASKED_UNMOVED = 9  # places elsewhere, at most
 # Among so many places, where no heading is known, so many times the candidates are compared: wrong pairs of a place and
-# a rotation come before the right one more often. Of the sets from the air it finds .832 of the queries over 10,000
-# places, .858 over 5,000 and .883 over 2,000, where it was .802, .853 and .878. Twice as many find .838 over 10,000,
-# and over 1,000 places .893 instead of .898.
+# a rotation come before the right one more often. Of the sets from the air it finds 0.832 of the queries over 10,000
+# places, where it was 0.802. Twice as many find 0.838, and over 1,000 places 0.893 instead of 0.898.
 _LARGE, _OF_LARGE = 2000, 1.6
 _MANY = 3  # unreadable places in one query, from which on the file may be at fault
 # In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
@@ -51,10 +46,9 @@ _LIKELY = 3
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Knowledge about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one True,
-    is True for the places where the aircraft can be. `turned_deg` float (N,) is the expected rotation of the camera, in
-    degrees, since each place was mapped (see `FineMatch`). `height_ratio` is the camera's expected height above the
-    ground, divided by the height when mapping."""
+    """Knowledge about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one True:
+    the places where the aircraft can be. `turned_deg` float (N,): rotation of the camera, in degrees, since each place
+    was mapped. `height_ratio`: the camera's height above the ground, divided by that when mapping."""
 
     in_reach: Bools | None = None
     turned_deg: Doubles | None = None
@@ -78,12 +72,11 @@ class Query:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
     """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
-    (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score.
-    Places compared in part only (see `Technique.glance`) come after those compared in full.
-    `unread` int (U,): slots of places that cannot be read from the file, but that the query may show as well, because
-    the scan scored their row in the index (see `Scan`) at least as high as the best place's, or among the three best.
-    `tried`: share (0..1) of the rotations under which the query could match that were not ruled out.
-    """
+    (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score;
+    those compared in part only (see `Technique.glance`) come last. `unread` int (U,): slots of places that cannot be
+    read from the file, but that the query may show as well, because the scan scored their row (see `Scan`) at least as
+    high as the best place's, or among the three best. `tried`: share (0..1) of the rotations under which the query
+    could match that were not ruled out."""
 
     slots: Ints
     scores: Singles
@@ -105,62 +98,50 @@ class Ranking:
 def scan(query: Query) -> Scan:
     """Scan the index: compare the query with the rows of all places, which are in RAM."""
     technique, index, expected = query.technique, query.index, query.expected
-    hint: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
+    hints: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
-        hint |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
-    return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hint)
+        hints |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
+    return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hints)
 
 
 def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m: float = 0.0) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
-    Among 2,000 places and more, looking down with no heading known, 1.6 times as many are compared.
-    If `candidates` is None, or at least the number of places and more than the technique's own number, all places are
-    compared, under all hypotheses of the expected height if nothing else is expected: exact, but slow.
-    If all candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as
-    well, for the margin. Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the
-    score is that of the comparison times the mean of the scan score and 1: for a wrong place the two are nearly
-    independent. If `expected.in_reach` is known, the candidates are places in reach, and five out of reach are compared
-    as well, in case the expectation is false; and at least five elsewhere: a margin over fewer means little.
+    Among 2,000 places and more, looking down with no heading known, 1.6 times as many are compared. If `candidates` is
+    None, or at least the number of places and more than the technique's own number, all places are compared, under all
+    hypotheses of the expected height if nothing else is expected. If all candidates are within `apart_m` metres of the
+    best one, the best-scanned places elsewhere are compared as well, for the margin; if `expected.in_reach` is known,
+    also five out of reach, and at least five elsewhere.
 
-    Raises PlaceError if a place cannot be read; it is then left out. Raises MapError if the file cannot be read.
-    """
+    Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the score is that of the
+    comparison times the mean of the scan score and 1. Raises PlaceError if a place cannot be read; it is then left out.
+    Raises MapError if the file cannot be read."""
     spec, index, in_reach = query.technique.spec, query.index, query.expected.in_reach
-    looks = _Comparison(query, scanned, candidates)
-    readable = looks.readable
+    comparison = _Comparison(query, scanned, candidates)
+    readable = comparison.readable
     there = readable if in_reach is None else in_reach & readable
     count = candidates
-    if count is None or spec.fine is None or looks.is_exact:
+    if count is None or spec.fine is None or comparison.is_exact:
         count = len(index)
     elif query.expected.turned_deg is None:
         count = round(count * times_as_many(bool(spec.height_ratios), int(np.count_nonzero(there))))
-    chosen = looks.best(there, count, spec.in_full)
-    chosen += looks.best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
+    chosen = comparison.best(there, count, spec.in_full)
+    chosen += comparison.best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
     if not chosen:
         raise MapError(
-            f"{query.place_map.path}: no place of it can be read any more: restore a copy, or build it again."
+            f"{query.place_map.path}: no place of it can be read any more: restore a copy or build it again."
         )
-    looks.compare(chosen)
-    if len(looks.scores) < np.count_nonzero(readable):
-        compared = list(looks.scores)
-        best = max(compared, key=looks.scores.__getitem__)
+    comparison.compare(chosen)
+    if len(comparison.scores) < np.count_nonzero(readable):
+        compared = list(comparison.scores)
+        best = max(compared, key=comparison.scores.__getitem__)
         others = elsewhere(index, best, np.arange(len(index)), apart_m)
         rivals = np.count_nonzero(others[compared])
         if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others[compared] = False
-            looks.compare(looks.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals)))
-    slots, found = np.array(list(looks.scores), np.intp), np.array(list(looks.scores.values()), np.float32)
-    order = np.argsort(-found, kind="stable")
-    slots, found = slots[order], found[order]
-    last = sorted((each for each in looks.passed_over if each[1][0] not in looks.scores), key=lambda each: -each[0])
-    return Ranking(
-        slots=np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
-        scores=np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
-        compared=looks.matches,
-        unread=_unread(scanned[0], readable, slots[0]),
-        tried=_tried(scanned[1], slots, len(spec.height_ratios)),
-    )
+            comparison.compare(comparison.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals)))
+    return comparison.ranking()
 
 
 def times_as_many(tries_rotations: bool, places: int) -> float:
@@ -169,31 +150,30 @@ def times_as_many(tries_rotations: bool, places: int) -> float:
 
 
 class _Comparison:
-    """The comparisons of one query with places of its map. `scores` and `matches` have, by slot, the scores and matches
-    of the places compared in full (without a fine part: scan scores, and no matches); `passed_over` has the places
-    compared in part only. `readable` bool (N,) is False for places left out (all True without a fine part)."""
+    """The comparisons of one query with places of its map: by slot, the `scores` and `matches` of the places compared
+    in full (without a fine part: scan scores, and no matches), and those passed over after a comparison in part.
+    `readable` bool (N,) is False for places left out (all True without a fine part)."""
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
-        self._query, (self._scanned, by_hypothesis) = query, scanned
+        self._query, (self._scanned, self._every_hypothesis) = query, scanned
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
         self._tries_all = self.is_exact and expected.in_reach is None and expected.turned_deg is None
         is_any = self._tries_all and not technique.spec.height_ratios
-        self._by_hypothesis = None if is_any else by_hypothesis
+        self._by_hypothesis = None if is_any else self._every_hypothesis
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
         self.scores: dict[int, float] = {}
         self.matches: dict[int, FineMatch] = {}
-        self.passed_over: list[Glance] = []
+        self._passed_over: list[Glance] = []
 
     def best(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
         """Choose up to `count` places where `among` bool (N,) is True, by scan score. If they have together more than
         `in_full` hypotheses to try, keep only the `in_full` places with the best glance (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
-            of_slot = self._by_hypothesis
-            return [(at, np.flatnonzero(np.isfinite(of_slot[at])).tolist()) for at in np.flatnonzero(among).tolist()]
+            count = self._by_hypothesis.size
         chosen = best_scanned(self._scanned, self._by_hypothesis, among, count)
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
@@ -202,13 +182,13 @@ class _Comparison:
             score, likely = self._query.technique.glance(self._query.descriptor, fine, hypotheses)
             glances.append((self._with_scan(slot, score), (slot, likely)))
         glances.sort(key=lambda glance: -glance[0])
-        self.passed_over += glances[in_full:]
+        self._passed_over += glances[in_full:]
         return [choice for _, choice in glances[:in_full]]
 
     def next_best(self, among: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more places where `among` is True: those of `passed_over`, or if none of them is, those
+        """Choose up to `count` more places where `among` is True: those passed over, or if none of them is, those
         of the best scan scores."""
-        more = [choice for _, choice in self.passed_over if among[choice[0]]][:count]
+        more = [choice for _, choice in self._passed_over if among[choice[0]]][:count]
         return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
 
     def compare(self, chosen: list[Choice]) -> None:
@@ -220,6 +200,30 @@ class _Comparison:
             match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
             self.scores[slot] = self._with_scan(slot, match.score)
             self.matches[slot] = replace(match, score=self.scores[slot])
+
+    def ranking(self) -> Ranking:
+        """Return the ranking of the places compared so far."""
+        slots, found = np.array(list(self.scores), np.intp), np.array(list(self.scores.values()), np.float32)
+        order = np.argsort(-found, kind="stable")
+        slots, found = slots[order], found[order]
+        last = sorted((each for each in self._passed_over if each[1][0] not in self.scores), key=lambda each: -each[0])
+        unread: Ints = np.flatnonzero(~self.readable)
+        if len(unread):
+            likely = min(_LIKELY, len(self._scanned))
+            least = min(self._scanned[slots[0]], np.partition(self._scanned, -likely)[-likely])
+            unread = unread[self._scanned[unread] >= least]
+        tried = 1.0
+        if self._every_hypothesis is not None:
+            heights = max(len(self._query.technique.spec.height_ratios), 1)
+            of_slot = np.isfinite(self._every_hypothesis[slots]).mean(axis=1) * heights
+            tried = float(np.minimum(of_slot, 1.0).mean())
+        return Ranking(
+            slots=np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
+            scores=np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
+            compared=self.matches,
+            unread=unread,
+            tried=tried,
+        )
 
     def _with_scan(self, slot: int, score: float) -> float:
         return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
@@ -237,8 +241,17 @@ def _read(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list
             unreadable.append(error)
         else:
             yield slot, fine, hypotheses
-    if unreadable:
-        raise _left_out_now(place_map, unreadable, len(chosen))
+    if not unreadable:
+        return
+    first = unreadable[0]
+    if len(unreadable) >= _MANY and 2 * len(unreadable) > len(chosen):
+        raise MapError(
+            f"{place_map.path}: {len(unreadable)} of the {len(chosen)} places compared cannot be read (place "
+            f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
+        )
+    for lost in unreadable:
+        place_map.left_out.setdefault(lost.place_id, lost.problem)
+    raise first
 
 
 def unmoved_elsewhere(query: Query, best: int, apart_m: float) -> list[FineMatch]:
@@ -258,13 +271,14 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     for slot, match in other.compared.items():
         if slot not in compared or match.score > compared[slot].score:
             compared[slot] = match
-    least, last = min(match.score for match in compared.values()), dict[int, float]()
+    rest = dict[int, float]()
     for ranking in (one, other):
         for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
             if slot not in compared:
-                last[slot] = max(score, last.get(slot, score))
+                rest[slot] = max(score, rest.get(slot, score))
     scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
-    scores |= {slot: min(last[slot], least) for slot in sorted(last, key=lambda slot: -last[slot])}
+    least = min(scores.values())
+    scores |= {slot: min(rest[slot], least) for slot in sorted(rest, key=lambda slot: -rest[slot])}
     return Ranking(
         slots=np.array(list(scores), np.intp),
         scores=np.array(list(scores.values()), np.float32),
@@ -276,16 +290,15 @@ def together(one: Ranking, other: Ranking) -> Ranking:
 
 def elsewhere(index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = ()) -> Bools:
     """Return True for each of `slots` (K,) that is no neighbour of the slot `best`, bool (K,): it is more than
-    `neighbour_m` metres away or, if either has no position, more than two slots away. Places with an id in `same` count
-    as neighbours at any distance, since they show the same ground."""
+    `neighbour_m` metres away or, if either has no position, more than two slots away. Places with an id in `same` show
+    the same ground: they count as neighbours."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
     away = np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
     return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
-    """Return the margin: the best score minus the best score of a place elsewhere (see `elsewhere`, with `neighbour_m`
-    and `same`). None if no place elsewhere is ranked."""
+    """Return the best score minus the best score of a place elsewhere (see `elsewhere`); None if none is ranked."""
     others = ranking.slots[1:]
     runners_up = ranking.scores[1:][elsewhere(index, int(ranking.slots[0]), others, neighbour_m, same)]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
@@ -295,7 +308,7 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: ReadMap, first: int | 
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
 
     Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
-    was loaded: it is then unknown which position is right. The place is left out from then on.
+    was loaded. The place is left out from then on.
     """
     candidates = []
     for slot, score in zip(ranking.slots[:first].tolist(), ranking.scores[:first].tolist(), strict=True):
@@ -338,39 +351,8 @@ def _largest(scores: Singles, count: int) -> Ints:
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
-def _unread(scores: Singles, readable: Bools, best: int) -> Ints:
-    """Return the slots of the left-out places that the query may show (see `Ranking`). `best` is the best slot."""
-    slots: Ints = np.flatnonzero(~readable)
-    if len(slots):
-        likely = min(_LIKELY, len(scores))
-        slots = slots[scores[slots] >= min(scores[best], np.partition(scores, -likely)[-likely])]
-    return slots
-
-
-def _tried(by_hypothesis: Singles | None, slots: Ints, heights: int) -> float:
-    """Return the share of the rotations from one of the `heights` that were tried at `slots` (see `Ranking`)."""
-    if by_hypothesis is None:
-        return 1.0
-    tried = np.isfinite(by_hypothesis[slots]).mean(axis=1) * max(heights, 1)
-    return float(np.minimum(tried, 1.0).mean())
-
-
 def _require_there(place_map: ReadMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
     """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
         raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")
-
-
-def _left_out_now(place_map: ReadMap, unreadable: list[PlaceError], tried: int) -> MapError:
-    """Return the error to raise for `unreadable` ones of the places `tried`. If they are most, the error is about the
-    file; else they are entered in `left_out`, and the error is about the first."""
-    first = unreadable[0]
-    if len(unreadable) >= _MANY and 2 * len(unreadable) > tried:
-        return MapError(
-            f"{place_map.path}: {len(unreadable)} of the {tried} places compared cannot be read (place "
-            f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
-        )
-    for error in unreadable:
-        place_map.left_out.setdefault(error.place_id, error.problem)
-    return first

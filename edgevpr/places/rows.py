@@ -8,7 +8,6 @@ other programs write in many forms: a value that is not a time counts as unknown
 import math
 import sqlite3
 import struct
-import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -46,7 +45,6 @@ _RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a co
     "recorded_lat_deg": (-90, 90),
     "recorded_lon_deg": (-180, 180),
 }
-_AFTER = "SELECT place_id, {} FROM places WHERE place_id > ? ORDER BY place_id"
 _MOST_UNREADABLE = 100_000  # successive ids without a readable place, after which a scan ends
 
 # Values of some columns of a row as SQLite returns them; their types are not checked yet.
@@ -186,38 +184,33 @@ def readable(name: str) -> str:
 
 
 def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
-    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
-    Where reading fails, at a damaged page, the next place is read by its id. Raises sqlite3.Error if nothing can be
-    read."""
-    last, highest, unreadable = -(2**63), -1, 0
-    while unreadable < _MOST_UNREADABLE:
-        try:
-            for place_id, *row in db.execute(_AFTER.format(columns), (last,)):
-                if place_id <= last:
-                    raise sqlite3.DatabaseError("malformed: the table of places does not end")
-                last, unreadable = place_id, 0
-                yield place_id, tuple(row)
-            return
-        except sqlite3.Error as error:
-            highest = _highest_id(db, error) if highest < 0 else highest
-        before = max(last, 0)
-        # Python has stepped to the damaged row before it gives out the row before that: this one may be readable.
-        last, *found = _one_after(db, columns, max(before, _one_after(db, "place_id", before)[0] - 1))
-        if last > highest:
-            return
-        unreadable += not found
-        yield last, tuple(found) or None
-
-
-def _one_after(db: sqlite3.Connection, columns: str, last: int) -> Values:
-    """Return the id and the values of `columns` of the first place after the id `last`. If it cannot be read, return
-    only (`last` + 1,); if there is no more place, only the largest possible id."""
+    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read. From
+    a damaged page on, each place is read by its id. Raises sqlite3.Error if nothing can be read."""
+    last = -(2**63)
     try:
-        return db.execute(f"{_AFTER.format(columns)} LIMIT 1", (last,)).fetchone() or (sys.maxsize,)
+        for place_id, *row in db.execute(f"SELECT place_id, {columns} FROM places ORDER BY place_id"):
+            if place_id <= last:
+                raise sqlite3.DatabaseError("malformed: the table of places does not end")
+            last = place_id
+            yield place_id, tuple(row)
+        return
     except sqlite3.Error as error:
-        if not is_of_one_row(error):
-            raise
-        return (last + 1,)
+        highest = _highest_id(db, error)
+    missing = 0
+    for place_id in range(max(last, 0) + 1, highest + 1):
+        found: Values | None = None
+        try:
+            found = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
+            is_there = found is not None
+        except sqlite3.Error as error:
+            if not is_of_one_row(error):
+                raise
+            is_there = True
+        if is_there:
+            yield place_id, found
+        missing = 0 if found else missing + 1
+        if missing == _MOST_UNREADABLE:
+            return
 
 
 def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:

@@ -1,12 +1,10 @@
 """Matching of sequences: a place is recognised if the last queries match the places that were mapped before it.
 
 This is the trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6), applied to the scores of any
-technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed in places per
-query. It is assumed that places were mapped in the order of the flight, and that the aircraft passes them in the same
-direction, at 0.8 to 1.2 places per query. If it flies at another speed, or backwards, the search finds places that lag
-behind. To keep these from being accepted, trajectories at other speeds (-2.5 to 3 places per query) are scored as well:
-their scores are the *rivals*, and a place is accepted only if it scores higher than the rivals of places elsewhere.
-"""
+technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed of 0.8 to 1.2
+places per query: places must be mapped in the order of the flight. At another speed, or backwards, the search finds
+places that lag behind. So trajectories at other speeds (-2.5 to 3) are scored as well, and a place is accepted only if
+it scores higher than these *rivals* of all places elsewhere."""
 
 import zlib
 from collections import deque
@@ -50,9 +48,8 @@ class SequenceSearch:
 
     Call `follow` for each query. No place may be accepted before the number of queries, `frames`, has reached `length`.
     `rivals` float32 (N,) is for each place the best mean score of a trajectory that ends there at a speed outside 0.8
-    to 1.2: an accepted place must score higher than the rivals of all places elsewhere. A pause of more than five
-    seconds, and more than three times the interval before it, begins a new sequence.
-    """
+    to 1.2. A pause of more than five seconds, and more than three times the interval before it, begins a new
+    sequence."""
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -72,12 +69,9 @@ class SequenceSearch:
 
     def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
-        by the mean score of their best trajectory, with the matches of the newest query.
-
-        A place that was not compared gets the query's usual score, the median score of the compared places. With 0
-        instead, rivals would score too low, and a place that is always compared would seem better. Slots before the
-        first place of the map score 0.
-        """
+        by the mean score of their best trajectory, with the matches of the newest query. A place that was not compared
+        gets the median score of those that were (0 would score rivals too low); slots before the first place of the map
+        score 0."""
         if self._broken(index, t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
@@ -98,13 +92,12 @@ class SequenceSearch:
         return replace(ranking, slots=slots, scores=means[slots], compared=matches)
 
     def goes_on(self, near: Bools, min_score: float) -> bool:
-        """Return True if the newest queries alone still agree with the sequence.
+        """Return True if the newest queries alone still agree with the sequence, whose mean score stays high for a
+        while after a vehicle has left the mapped track.
 
-        `near` bool (N,) is True in the neighbourhood of the sequence's best place. After a vehicle has left the mapped
-        track, or the map, the mean score of the sequence stays high until enough old queries are dropped. So the best
-        place of the last three queries together must be in `near`. And for each of the last two, the best score in
-        `near` must be at least `min_score`, and so high that at most a tenth of all neighbourhoods would reach it.
-        """
+        `near` bool (N,) is True in the neighbourhood of the sequence's best place. The best place of the last three
+        queries together must be in `near`. And for each of the last two, the best score in `near` must be at least
+        `min_score`, and so high that at most a tenth of all neighbourhoods would reach it."""
         newest = list(self._rows)[:_NEWEST]
         together = best_means(newest, [trajectory[:_NEWEST] for trajectory in self._trajectories])
         if not near[together.argmax()]:
@@ -132,11 +125,9 @@ class SequenceSearch:
 
 
 def trajectories(length: int, velocities: Floats) -> list[list[int]]:
-    """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates.
-
-    Each is a list with one number for each query, the newest first: how many slots before the newest query's slot it
-    was, such as [0, 1, 2, ...] at a velocity of 1.
-    """
+    """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates: for
+    each query, the newest first, how many slots before the newest one's it was, such as [0, 1, 2, ...] at a velocity of
+    1."""
     # Round halves up, even if the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     unique: list[list[int]] = np.unique(back, axis=0).tolist()
@@ -145,9 +136,7 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
     """Return, for each slot, the best mean score of the trajectories that end there, float32 (N,). `rows` has the
-    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since. A trajectory
-    has, for each of these queries, by how many slots its place lies before the slot where it ends.
-    """
+    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since."""
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:
         total[:] = 0

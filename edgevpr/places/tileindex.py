@@ -3,7 +3,6 @@ that are searched together side by side."""
 
 from collections.abc import Collection
 
-from edgevpr.core.arrays import Array
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex, empty_index
 
@@ -39,7 +38,7 @@ class TileIndex:
         last = [tile for tile in self._held if tile in tiles]
         if tuple(last) not in {self.tiles[at : at + len(last)] for at in range(len(self._held))}:
             for tile in last:
-                self._to_end(tile)
+                self._move_to_end(tile)
         start = self._slice_of(last[0]).start if last else 0
         return self._slots.only(slice(start, start + sum(self._held[tile] for tile in last)))
 
@@ -53,32 +52,20 @@ class TileIndex:
 
     def drop(self, tile: int) -> None:
         """Free the slots of a tile: the places after it move to where it was."""
-        gone = self._slice_of(tile)
-        for array in self._slots.arrays.values():
-            _close(array, gone, self.capacity - self.free)
+        self._move_to_end(tile)
         del self._held[tile]
 
-    def _to_end(self, tile: int) -> None:
+    def _move_to_end(self, tile: int) -> None:
         """Move a tile's places behind those of all other tiles."""
         own, end = self._slice_of(tile), self.capacity - self.free
         for array in self._slots.arrays.values():
             kept = array[own].copy()
-            _close(array, own, end)
+            for start in range(own.stop, end, _MOVED_AT_ONCE):
+                moved = array[start : min(start + _MOVED_AT_ONCE, end)]
+                array[start - len(kept) : start - len(kept) + len(moved)] = moved
             array[end - len(kept) : end] = kept
         self._held[tile] = self._held.pop(tile)
 
     def _slice_of(self, tile: int) -> slice:
-        start = 0
-        for number, places in self._held.items():
-            if number == tile:
-                break
-            start += places
+        start = sum(self._held[before] for before in self.tiles[: self.tiles.index(tile)])
         return slice(start, start + self._held[tile])
-
-
-def _close(array: Array, gone: slice, end: int) -> None:
-    """Move the entries from the end of a slice to `end` down to where the slice begins."""
-    for start in range(gone.stop, end, _MOVED_AT_ONCE):
-        stop = min(start + _MOVED_AT_ONCE, end)
-        to = start - (gone.stop - gone.start)
-        array[to : to + stop - start] = array[start:stop]

@@ -20,7 +20,7 @@ from edgevpr.core.geodesy import offset_m, shorter_deg
 from edgevpr.core.quadkeys import extent_of_key, maps_in
 from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity
 from edgevpr.places.readmap import Footprints
@@ -44,7 +44,8 @@ class Loaded:
 
 class TileMap:
     """An open folder of tiles; see `readmap.ReadMap`. A tile's number is its place in `keys`. `places_of` int (T,) has
-    the places of each. Make it with `open`, and load at least one tile before it is searched.
+    the number of places of each, and `ram` is the index of those that are loaded. Make it with `open`, and load at
+    least one tile before it is searched.
 
     All of it is for one thread, but `load`, which may run beside it."""
 
@@ -54,7 +55,7 @@ class TileMap:
         self._extents_deg = np.array([extent_of_key(key) for key in keys])
         self._held: dict[int, Loaded] = {}
         self._wait_s = mapfiles.WAIT_S
-        self._index = TileIndex(spec, 0)
+        self.ram = TileIndex(spec, 0)
         self._technique: Technique | None = None
         self._opened: PlaceMap | None = None  # while it is loaded
 
@@ -79,31 +80,12 @@ class TileMap:
         if budget_bytes < each:
             raise MapError(f"{self.path}: a place takes {each} bytes in RAM: raise --budget-mb.")
         self._technique = technique
-        self._index = TileIndex(technique.spec, min(budget_bytes // each, len(self)))
-
-    @property
-    def capacity(self) -> int:
-        """The number of places for which there is room in RAM."""
-        return self._index.capacity
+        self.ram = TileIndex(technique.spec, min(budget_bytes // each, len(self)))
 
     @property
     def most_searched(self) -> int:
         """The most places that are searched at once, where tiles meet."""
         return _AT_A_CORNER * int(self.places_of.max())
-
-    @property
-    def held(self) -> tuple[int, ...]:
-        """The numbers of the tiles in RAM."""
-        return self._index.tiles
-
-    @property
-    def free(self) -> int:
-        """The number of places for which there is room beside the tiles in RAM."""
-        return self._index.free
-
-    def index(self, tiles: Collection[int]) -> PlaceIndex:
-        """Return the index of some of the tiles in RAM. It holds until the next call, or the next `drop`."""
-        return self._index.of(tiles)
 
     def load(self, tile: int) -> Loaded:
         """Read a tile into free slots: of more places than there are, the best. Raises MapError if it cannot be read,
@@ -116,7 +98,7 @@ class TileMap:
             place_map.db.execute(f"PRAGMA cache_size = -{_CACHE_KB}")
             place_map.require(self._technique.spec)
             place_map.wait_at_most(self._wait_s)
-            slots = self._index.beyond()
+            slots = self.ram.beyond()
             room_bytes = len(slots) * bytes_per_place(self._technique.spec)
             loaded = load_index(place_map, self._technique, room_bytes, into=slots)
             if loaded.place_ids.max() >= _OF_TILE:
@@ -135,14 +117,14 @@ class TileMap:
 
     def take(self, loaded: Loaded) -> None:
         """Search a tile that has been loaded from now on."""
-        self._index.add(loaded.tile, loaded.places)
+        self.ram.add(loaded.tile, loaded.places)
         self._held[loaded.tile] = loaded
         for own_id, problem in loaded.place_map.left_out.items():
             self.left_out.setdefault(loaded.tile * _OF_TILE + own_id, problem)
 
     def drop(self, tile: int) -> None:
         """Search a tile no more, and free its room. No tile may be loading meanwhile."""
-        self._index.drop(tile)
+        self.ram.drop(tile)
         self._held.pop(tile).place_map.close()
 
     def away_m(self, position: Position) -> Doubles:
@@ -195,7 +177,7 @@ class TileMap:
 
     def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield places as `PlaceMap.places` does; without numbers, those of the tiles in RAM."""
-        ids = self.index(self.held).place_ids.tolist() if place_ids is None else place_ids
+        ids = self.ram.of(self.ram.tiles).place_ids.tolist() if place_ids is None else place_ids
         for place_id in ids:
             with self._of(place_id) as (place_map, own_id):
                 (place,) = place_map.places([own_id])
@@ -218,7 +200,7 @@ class TileMap:
             return place_map.landmarks_of(own_id)
 
     def footprints(self) -> Footprints:
-        parts = zip(*(self._held[tile].footprints for tile in self.held), strict=True)
+        parts = zip(*(self._held[tile].footprints for tile in self.ram.tiles), strict=True)
         return Footprints(*map(np.concatenate, parts))
 
     def close(self) -> None:
@@ -227,7 +209,7 @@ class TileMap:
 
     @property
     def _first(self) -> PlaceMap:
-        return self._held[self.held[0]].place_map
+        return self._held[self.ram.tiles[0]].place_map
 
     @contextmanager
     def _of(self, place_id: int) -> Iterator[tuple[PlaceMap, int]]:

@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import best_scanned, elsewhere, margin, named
+from edgevpr.places.retrieve import Ranking, best_scanned, elsewhere, margin, named, together
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +66,10 @@ def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ru
     assert found[0].place.place_id in index.place_ids
 
 
-def test_a_budget_that_holds_no_place_is_refused(ruler_map):
+def test_a_budget_that_holds_no_place_and_an_empty_map_are_refused(ruler_map, tmp_path):
     technique, place_map = ruler_map
     with pytest.raises(MapError, match="budget"):
         load_index(place_map, technique, bytes_per_place(technique.spec) - 1)
-
-
-def test_an_empty_map_is_refused(tmp_path):
     with PlaceMap.create(tmp_path / "empty.gpkg", Ruler.spec) as place_map, pytest.raises(MapError, match="no place"):
         load_index(place_map, Ruler(), 10_000)
 
@@ -100,15 +97,6 @@ def test_margin_is_to_the_best_place_elsewhere(ruler):
     assert margin(ranking, index, 1e6) == pytest.approx(1 - 1 / 41), "only the place without a position is elsewhere"
     nowhere = rank(technique, technique.encode(60), place_map, index)
     assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
-
-
-def test_where_all_candidates_are_neighbours_places_elsewhere_are_compared_too(ruler):
-    technique, place_map, index = ruler
-    query = technique.encode(43)
-    ranking = rank(technique, query, place_map, index, candidates=3, apart_m=150.0)
-    assert technique.compared == 3 + 5
-    assert margin(ranking, index, 150.0) is not None
-    assert named(ranking, index, place_map, 1)[0].place.source_image == "44"
 
 
 def within(index, *numbers):
@@ -325,3 +313,33 @@ def test_only_hypotheses_of_the_places_asked_for_are_tried():
     assert not tried(by_hypothesis, 10, among)
     among[100:103] = True
     assert sorted(tried(by_hypothesis, 10, among)) == [100, 101, 102]
+
+
+def ranking(compared, rest=(), unread=()):
+    slots = [*compared, *(slot for slot, _ in rest)]
+    scores = [*compared.values(), *(score for _, score in rest)]
+    matches = {slot: FineMatch(score) for slot, score in compared.items()}
+    return Ranking(
+        slots=np.array(slots), scores=np.array(scores, np.float32), compared=matches, unread=np.array(unread, np.intp)
+    )
+
+
+def test_of_a_place_that_both_compared_the_better_match_counts():
+    one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
+    other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
+    both = together(one, other)
+    assert both.slots.tolist() == [7, 4, 2, 5, 9]
+    np.testing.assert_allclose(both.scores, [0.5, 0.3, 0.06, 0.06, 0.05], rtol=1e-6)
+    assert {slot: match.score for slot, match in both.compared.items()} == {4: 0.3, 7: 0.5, 2: 0.06}
+    assert both.unread.tolist() == [3]
+
+
+def test_a_rival_of_the_first_look_stays_a_rival():
+    both = together(ranking({1: 0.2, 8: 0.19}), ranking({1: 0.21, 6: 0.02}))
+    assert both.slots.tolist() == [1, 8, 6]
+
+
+def test_two_looks_have_tried_the_rotations_of_both():
+    known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
+    assert together(known, known).tried == 0.25
+    assert together(known, all_of_them).tried == 1.0

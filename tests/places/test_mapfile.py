@@ -19,7 +19,8 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
+from edgevpr.places.mapfiles import connect
+from edgevpr.places.mapinfo import identity_of, info_of
 
 
 @pytest.fixture(scope="module")
@@ -291,3 +292,34 @@ def test_one_map_of_several_names_the_owners_of_all(tmp_path):
     merge(list(map(str, paths)), tmp_path / "all.gpkg")
     with PlaceMap.open(tmp_path / "all.gpkg") as merged:
         assert merged.attribution == "Y; X"
+
+
+def identity(map_path):
+    with PlaceMap.open(map_path) as place_map:
+        return identity_of(place_map)
+
+
+def test_a_copy_is_the_same_map(map_path, tmp_path):
+    copy = shutil.copy(map_path, tmp_path / "copy.gpkg")
+    assert identity(map_path) == identity(copy)
+    assert identity(map_path).places == 10
+    assert len(identity(map_path).map_id) == 32
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE places SET quality = 0.5 WHERE place_id = 2",
+        "UPDATE places SET fine_crc32 = fine_crc32 + 1 WHERE place_id = 2",
+        "UPDATE places SET up_deg = 3.0 WHERE place_id = 2",
+        "UPDATE places SET source_image = 'other' WHERE place_id = 2",
+        "UPDATE places SET geom = (SELECT geom FROM places WHERE place_id = 3) WHERE place_id = 2",
+        "INSERT INTO edgevpr_map (key, value) VALUES ('calibration', '\"0\"')",
+        "UPDATE places SET place_id = 90 WHERE place_id = 10",
+    ],
+)
+def test_any_change_makes_it_another(map_path, change):
+    before = identity(map_path)
+    with contextlib.closing(connect(map_path, "rw")) as db:
+        db.execute(change)
+    assert identity(map_path).sha256 != before.sha256

@@ -41,10 +41,10 @@ class Tiles:
         self._map, self._recogniser, self._match, self._herald, self._tape = tile_map, recogniser, match, herald, tape
         self._thread = ThreadPoolExecutor(1, "tiles")
         self._loading: tuple[int, Future[tuple[Loaded, AcceptRule]]] | None = None
-        self._rules = dict.fromkeys(tile_map.held, recogniser.rule)
+        self._rules = dict.fromkeys(tile_map.ram.tiles, recogniser.rule)
         self._unusable: set[int] = set()
         self._searched_s = np.full(len(tile_map.keys), -np.inf)  # when each was searched last, while lost
-        self._searched: tuple[int, ...] = tile_map.held
+        self._searched: tuple[int, ...] = tile_map.ram.tiles
         self._area: Reach | None = None  # the last that was known
         self._found_s: float | None = None
         self._layers = layers_of(tile_map)
@@ -54,7 +54,7 @@ class Tiles:
         """Load, drop and search tiles by what an event says of the aircraft's position."""
         if event.frame is None:
             return
-        now_s, before = event.frame.t_mono_s, (self._searched, self._map.held)
+        now_s, before = event.frame.t_mono_s, (self._searched, self._map.ram.tiles)
         if event.ranking is not None:
             self._searched_s[list(self._searched)] = now_s
         area = self._known(event, now_s)
@@ -64,8 +64,8 @@ class Tiles:
             self._searched = self._near(area)
         else:
             self._look_elsewhere()
-            self._searched = tuple(sorted(self._map.held, key=lambda tile: self._searched_s[tile])[:1])
-        if (self._searched, self._map.held) != before:
+            self._searched = tuple(sorted(self._map.ram.tiles, key=lambda tile: self._searched_s[tile])[:1])
+        if (self._searched, self._map.ram.tiles) != before:
             self._search(held_before=before[1], is_lost=area is None)
 
     def close(self) -> None:
@@ -92,8 +92,8 @@ class Tiles:
             ahead = Position(*moved(area.position.lat_deg, area.position.lon_deg, east_m, north_m))
             away_m = np.minimum(away_m, self._map.away_m(ahead))
         side_m = self._map.side_m(int(away_m.argmin()))
-        away_m[list(self._map.held)] -= _HELD_NEARER * side_m
-        wanted, room = list[int](), self._map.capacity
+        away_m[list(self._map.ram.tiles)] -= _HELD_NEARER * side_m
+        wanted, room = list[int](), self._map.ram.capacity
         for tile in np.argsort(away_m, kind="stable").tolist():
             if tile in self._unusable:
                 continue
@@ -106,37 +106,37 @@ class Tiles:
     def _near(self, area: Reach) -> tuple[int, ...]:
         """Return the tiles in RAM in which the aircraft can be, or the nearest of them; those searched before stay a
         little longer."""
-        away_m, held = self._map.away_m(area.position), self._map.held
+        away_m, held = self._map.away_m(area.position), self._map.ram.tiles
         most_m = {tile: area.radius_m + _BESIDE_M * (2 if tile in self._searched else 1) for tile in held}
         near = tuple(tile for tile in held if away_m[tile] <= most_m[tile])
         return near or tuple(sorted(held, key=lambda tile: away_m[tile])[:1])
 
     def _places(self, tile: int) -> int:
-        return min(int(self._map.places_of[tile]), self._map.capacity)
+        return min(int(self._map.places_of[tile]), self._map.ram.capacity)
 
     def _go_to(self, wanted: list[int]) -> None:
         """Have the tiles `wanted` in RAM, and no others."""
         if self._loading or not wanted:
             return
-        to_load = next((tile for tile in wanted if tile not in self._map.held), None)
-        for tile in set(self._map.held) - set(wanted):
+        to_load = next((tile for tile in wanted if tile not in self._map.ram.tiles), None)
+        for tile in set(self._map.ram.tiles) - set(wanted):
             self._map.drop(tile)
         if to_load is not None:
             self._load(to_load)
 
     def _look_elsewhere(self) -> None:
         """Load the tile that was searched the longest ago, in place of one that was searched just now."""
-        others = [tile for tile in range(len(self._searched_s)) if tile not in {*self._map.held, *self._unusable}]
+        others = [tile for tile in range(len(self._searched_s)) if tile not in {*self._map.ram.tiles, *self._unusable}]
         if self._loading or not others:
             return
         away_m: Doubles = np.arange(float(len(self._searched_s)))
         if self._area:
             away_m = self._map.away_m(self._area.position)
         to_load = min(others, key=lambda tile: (self._searched_s[tile], away_m[tile]))
-        for tile in sorted(self._map.held, key=lambda tile: self._searched_s[tile]):
-            if self._map.free < self._places(to_load) and self._searched_s[tile] > self._searched_s[to_load]:
+        for tile in sorted(self._map.ram.tiles, key=lambda tile: self._searched_s[tile]):
+            if self._map.ram.free < self._places(to_load) and self._searched_s[tile] > self._searched_s[to_load]:
                 self._map.drop(tile)
-        if self._map.free >= self._places(to_load):
+        if self._map.ram.free >= self._places(to_load):
             self._load(to_load)
 
     def _load(self, tile: int) -> None:
@@ -164,7 +164,7 @@ class Tiles:
 
     def _search(self, held_before: tuple[int, ...], is_lost: bool) -> None:
         """Have the recogniser search the tiles that are to be searched."""
-        held = self._map.held
+        held = self._map.ram.tiles
         if held != held_before:
             if held:
                 self._layers = layers_of(self._map)
@@ -173,7 +173,7 @@ class Tiles:
         self._recogniser.take(
             Matcher(
                 self._recogniser.technique,
-                self._map.index(self._searched),
+                self._map.ram.of(self._searched),
                 rules[self._searched[0]] if self._searched else self._recogniser.rule,
                 layers=self._layers,
                 rule_of=lambda place_id: rules[tile_of_place(place_id)],
@@ -182,7 +182,7 @@ class Tiles:
         )
 
     def _note_held(self) -> None:
-        self._herald.note("tiles", held=[self._map.keys[tile] for tile in self._map.held])
+        self._herald.note("tiles", held=[self._map.keys[tile] for tile in self._map.ram.tiles])
 
 
 def tiles_of(recogniser: Recogniser, match: MatchConfig, herald: Herald, tape: Tape) -> Tiles | None:

@@ -64,7 +64,7 @@ def open_recogniser(
         if isinstance(place_map, TileMap):
             place_map.make_room(technique, budget_bytes)
             place_map.take(place_map.load(0))
-            index = place_map.index(place_map.held)
+            index = place_map.ram.of(place_map.ram.tiles)
         else:
             index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
@@ -89,7 +89,7 @@ def _require_flight(config: Config, is_flight: bool) -> None:
 def places_in_ram(recogniser: Recogniser) -> int:
     """Return the number of places in RAM; of tiles, the most that can be."""
     place_map = recogniser.place_map
-    return place_map.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
+    return place_map.ram.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
 
 
 def searched_places(recogniser: Recogniser) -> int:

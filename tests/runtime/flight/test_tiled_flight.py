@@ -104,7 +104,7 @@ class TiledFlight:
         def read():
             work()
             self.at = next(places)
-            self.held.append(self.map.held)
+            self.held.append(self.map.ram.tiles)
 
         self.lines = self.itself.fly(FakeSource(map(frame, way), self.clock, work=read))
         return of_kind(self.lines, "query")
@@ -125,7 +125,7 @@ def test_the_tiles_around_the_aircraft_are_in_ram_and_no_others(folder, tmp_path
     assert all(line["position"]["lat_deg"] == pytest.approx(50 + int(line["query"]) * STEP_DEG) for line in found)
     assert all(tile_at(flight.map, place) in held for place, held in list(zip(way, flight.held, strict=True))[4:])
     assert max(map(len, flight.held)) <= 5
-    assert flight.map.capacity == 6, "the budget is never exceeded: it is all that was allocated"
+    assert flight.map.ram.capacity == 6, "the budget is never exceeded: it is all that was allocated"
     assert len(of_kind(flight.lines, "tiles")) > 5
 
 
