@@ -77,13 +77,12 @@ _HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on
 class CoHog:
     """The technique CoHOG. `w1`: side of the scaled picture in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
     pixels (W2 = H2). `bins`: orientations (L). `gt`: least entropy of a good block, 0 to 1 (GT; below 0: the default
-    for `entropy`). `entropy` is "shannon" or "filled_bins" (see the module `entropy`). `matching` is "displacement" or
-    "thesis", see above.
+    for `entropy`). `entropy`: "shannon" or "filled_bins". `matching`: "displacement" or "thesis", see above; the map
+    does not record it.
 
     With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
     the same ground. A query is tried under hypotheses: five heights (with `matching` "thesis" one) in 24 rotations each
-    (see `views`). The map records all parameters but `matching`: both ways of matching read the same map.
-    """
+    (see `views`)."""
 
     w1: int = 512
     w2: int = 16
@@ -144,11 +143,10 @@ class CoHog:
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good. A dim
-        picture is stretched first (see `contrast`), and so its views are views of the stretched one.
+        picture is stretched first (see `contrast`).
 
         Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
-        float32 (blocks, 4 bins) and good bool (blocks,). The good regions are the rows of matrix A of thesis 6.2.3.
-        """
+        float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
         if self._is_nadir:
             image, mask = in_square(image, mask)
         grey, allowed = grey_square(image, self.w1), mask_square(mask, self.w1)
@@ -197,12 +195,10 @@ class CoHog:
         height_ratio: float | None = None,
         in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
-        """Score all places. With a forward camera `rows` are place codes uint8 (N, B), compared under shifts. With a
-        nadir camera they are layouts uint8 (N, 1120), compared from the one of five heights that is nearest to
-        `height_ratio` (None: 1). `turned_deg` (N,) is the expected rotation of the camera since each place was mapped:
-        only rotations within `spec.heading_within_deg` of it are tried (None or NaN: all). Only places `in_reach`, bool
-        (N,), are looked at closer (None: all). Returns scores float32 (N,) in 0..1 and, with a nadir camera, the score
-        of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
+        """Score all places; for the arguments see `Technique.coarse_scores`. With a forward camera `rows` are place
+        codes uint8 (N, B), compared under shifts. With a nadir camera they are layouts uint8 (N, 1120), compared from
+        the one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
+        camera, the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
         if not self._is_nadir:
             views = self._views_of(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
@@ -228,9 +224,9 @@ class CoHog:
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
         regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
-        query is tried under `hypotheses`, numbers as in `views.hypothesis` (None: all). The one with the highest score
-        counts, and `aligned` refines its shift, rotation and height. Last, the less the structures of query and place
-        agree (see `overlay`), the less is the score."""
+        query is tried under `hypotheses` (None: all); the one with the highest score counts, and `aligned` refines its
+        shift, rotation and height. Last, the less the structures of both agree (see `overlay`), the less is the
+        score."""
         reference = self._reference(fine)
         if self._is_nadir:
             best, match, nearest = self._likest(query, reference, hypotheses)
@@ -299,9 +295,8 @@ class CoHog:
     def glance(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score of `match`, to find the places that are worth a full comparison: with a forward camera
-        from a quarter of the good regions, with a nadir camera from the vote and the layouts. Returns the estimated
-        score, and with a nadir camera a list with the best of `hypotheses` (None: there are none)."""
+        """Estimate the score of `match`: with a forward camera from a quarter of the good regions, with a nadir camera
+        from the vote and the layouts. See `Technique.glance`."""
         reference = self._reference(fine)
         if self._is_nadir:
             best, match, _ = self._likest(query, reference, hypotheses)

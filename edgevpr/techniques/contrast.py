@@ -1,10 +1,9 @@
 """Contrast of pictures taken in little light or in fog, for `cohog`.
 
-The entropy of dim ground is that of a blank wall: few grey levels are left. Such a picture is *stretched* to more of
-them, and smoothed before, since the sensor's noise grows with it. A picture with contrast enough is not touched, nor
-one with next to none: stretched noise must not pass for ground. All is rounded alike on every processor (see
-`gradients`): means of whole grey levels are exact, and products and sums are computed one by one.
-"""
+The entropy of dim ground is that of a blank wall. Such a picture is *stretched* to more grey levels, and smoothed
+before, since the sensor's noise grows with it; one with contrast enough, or with next to none, is not touched: noise
+must not pass for ground. All is rounded alike on every processor (see `gradients`): means of whole grey levels are
+exact, and products and sums are computed one by one."""
 
 import math
 
@@ -31,10 +30,9 @@ def stretched(
     of the picture as it came.
 
     Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
-    of allowed pixels. `grey` is float32 (side, side), 0 to 255; the same array is returned where its contrast is enough
-    or too low to be that of ground. `allowed` is bool (side, side) (None: all). `pixel_px` is the width and height, in
-    pixels of the square, of a pixel of the picture as it came.
-    """
+    of pixels that are `allowed`, bool (side, side) (None: all). `grey` is float32 (side, side), 0 to 255; the same
+    array is returned where its contrast is enough or too low. `pixel_px`: width and height, in pixels of the square, of
+    a pixel of the picture as it came."""
     low, high = _ends(grey, allowed)
     found = high - low
     of_noise = _NOISE * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_ALONG / len(grey)

@@ -1,9 +1,7 @@
 """Entropy of an image around each pixel, and the blocks of high entropy: the good blocks of CoHOG (thesis 6.2.1).
 
-There are two entropy maps, both in 0..1. Both take the histogram of the intensities inside a disc around each pixel (81
-pixels for radius 5), counting only pixels inside the image, and divide the result by 8 bits, the most that 256
-intensities can have.
-"""
+Both entropy maps take the histogram of the intensities inside a disc around each pixel (81 pixels for radius 5),
+counting only pixels inside the image, and divide by 8 bits, the most that 256 intensities can have."""
 
 from functools import lru_cache, reduce
 
@@ -108,7 +106,7 @@ def _range(grey: Bytes) -> Array:
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
-def _count_different(padded: Bytes) -> Array:
+def _count_different(padded: Array) -> Array:
     """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in `_over_disc`."""
     bit, word_of = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
     unions = (_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))

@@ -116,15 +116,14 @@ def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) 
 
 
 def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Compute the same sums as `_vote_by_angle` for 8 orientations over 360 degrees, but faster: without angles,
-    branches or scattered sums.
+    """Compute the same sums as `_vote_by_angle` for 8 orientations over 360 degrees, without angles, branches or
+    scattered sums.
 
-    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from the diagonal of the quadrant, whose
-    orientation gets m - |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g <
-    0. With v = sqrt(2) m sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is
-    summed over the cells once as it is, and once with its sign bits flipped by those of dx, dy or both. Sums and
-    differences of these sums are the orientations.
-    """
+    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
+    |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
+    sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
+    once as it is, and once with its signs flipped by those of dx, dy or both; sums and differences of these are the
+    orientations."""
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
@@ -192,11 +191,10 @@ def unit_rows(rows: Singles) -> Singles:
 
 @lru_cache
 def slow_patterns(bins: int) -> Singles:
-    """Return the patterns of low ("slow") frequency, which hold most of the information of a block of 2x2 cells of
-    `bins` orientations: float32 (4 * bins, patterns), one per column, orthonormal. A pattern is a wave over the cells
-    (mean, left against right, top against bottom, diagonal against diagonal) times a wave over the orientations. Of the
-    32 patterns of 8 orientations these are the 20 with the most power on the tuning sets: comparing blocks is faster,
-    and recall does not fall."""
+    """Return the patterns of low ("slow") frequency of a block of 2x2 cells of `bins` orientations: float32 (4 * bins,
+    patterns), one per column, orthonormal. A pattern is a wave over the cells (mean, left against right, top against
+    bottom, diagonal against diagonal) times a wave over the orientations. Of the 32 patterns of 8 orientations these
+    are the 20 with the most power on the tuning sets; recall does not fall."""
     frequency = _frequencies(bins)
     return np.vstack(
         [

@@ -1,9 +1,9 @@
-"""Techniques that describe a picture by one vector of a network. Either the network gives the vector by itself, or a
-*head*, such as a pooling, makes it from the feature map. A card whose network gives a descriptor is a technique by
-itself, under the card's name. The techniques of the thesis take parameters: `model` names the card of the network to
-use, `form` is what a number of the vector takes in RAM (see `vectors`), and `threads` is the number of threads of the
-network. A map does not depend on `form` and `threads`.
-"""
+"""Techniques that describe a picture by one vector of a network: its descriptor, or what a *head*, such as a pooling,
+makes of its feature map. A card whose network gives a descriptor is a technique of its name.
+
+The techniques of the thesis take parameters: `model` names the card of the network, `form` is "float", "8bit" or "1bit"
+(see `vectors`), and `threads` is the number of threads of the network. A map depends on neither `form` nor
+`threads`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,9 +33,8 @@ Head = Callable[[Singles], Singles]  # from an output of a network to a vector, 
 
 
 class NetworkVector(VectorTechnique):
-    """A technique whose vector is made by the function `head` of one output of a network (None: it is the output
-    itself). The head raises ModelError for a feature map that is too small. `spec`: further arguments of
-    `VectorTechnique`."""
+    """A technique whose vector `head` makes of one output of a network (None: it is the output itself). The head raises
+    ModelError for a feature map that is too small. `spec`: further arguments of `VectorTechnique`."""
 
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
         self._backbone, self._head = backbone, head or np.asarray
@@ -48,13 +47,9 @@ class NetworkVector(VectorTechnique):
 
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make `calc`: the output `descriptor` of the network with the card `model`, a convolutional autoencoder that
-    learned to give the HOG of a picture from a changed copy of it, compared by cosine. `form` is "float", "8bit" or
-    "1bit".
-
-    Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from a grey,
-    histogram-equalised picture of 160x120. The card of the network says how the picture is prepared.
-    """
+    """Make `calc`: the descriptor of an autoencoder that learned to give the HOG of a picture from a changed copy of
+    it, compared by cosine (Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from
+    a grey, histogram-equalised picture of 160x120)."""
     return NetworkVector(
         "calc", open_backbone(model, "descriptor", threads), None, parameters={"model": model}, form=form
     )
@@ -67,9 +62,7 @@ def alexnet(
     from `seed`, compared by cosine.
 
     Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, in the form of thesis
-    4.2.1: `conv3` of AlexNet, projected; 1064 dimensions as in the public code of the thesis's author. The form `1bit`
-    is the locality-sensitive hash of the paper's section IV-D.
-    """
+    4.2.1: `conv3` of AlexNet. The form `1bit` is the locality-sensitive hash of the paper's section IV-D."""
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
     backbone = open_backbone(model, "features", threads)
@@ -78,20 +71,18 @@ def alexnet(
 
 
 def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `amosnet`: the largest activations over a pyramid of grids of 1x1 to `levels` x `levels` cells, compared by
-    L1 difference.
+    """Make `amosnet`: the largest activations over a pyramid of grids of 1x1 to `levels` x `levels` cells, divided by
+    their sum, compared by L1 difference.
 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
-    `conv5` of a network trained from scratch on the places of SPED (give its card as `model`), with spatial pyramid
-    pooling. The vector is divided by its sum, so that the L1 difference compares how the activations are distributed:
-    that finds more places on the tuning sets.
-    """
+    `conv5` of a network trained from scratch on the places of SPED (its card is `model`), with spatial pyramid pooling.
+    Divided by the sum, more places of the tuning sets are found."""
     return _pyramid("amosnet", model, form, threads, levels)
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `hybridnet`: `amosnet` with other weights (Chen et al., ICRA 2017; thesis 4.2.1), whose top five
-    convolutional layers were started from CaffeNet instead of from scratch. Give their card as `model`."""
+    """Make `hybridnet`: `amosnet` with other weights, started from CaffeNet (Chen et al., ICRA 2017; thesis 4.2.1).
+    Give their card as `model`."""
     return _pyramid("hybridnet", model, form, threads, levels)
 
 
@@ -102,9 +93,8 @@ def netvlad(
     The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1, not whitened. The paper trains words and network together, but starts from words learned afterwards
-    (section 3.1), which is what models/recipes/train_words.py makes.
-    """
+    thesis 4.2.1, not whitened. Words are learned afterwards, as those that the paper's training starts from (section
+    3.1)."""
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
@@ -125,9 +115,7 @@ def region_vlad(
     learned visual words, compared by cosine; zeros for a picture without any region.
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
-    Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words. Regions have length
-    1, and so has each word's part of the vector; its signed square root, as in the authors' code, finds fewer places.
-    """
+    Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words."""
     backbone = region_backbone("region_vlad", model, threads, regions)
     learned, sha256 = load_words(model, "regions", words)
 
@@ -140,8 +128,7 @@ def region_vlad(
 
 def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
-    network covers them. No match is accepted until the configuration sets a minimum margin: that of wrong matches is
-    unknown."""
+    network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)
     sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
@@ -168,11 +155,7 @@ def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> Net
 def pyramid(features: Singles, levels: int) -> Singles:
     """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C * sum of
     n^2,), the largest activation of each channel in each cell of one grid of n x n after the other, n = 1 to `levels`.
-    Raises ModelError for a feature map smaller than a grid.
-
-    The levels 1 to 4 (30 cells) are those of the public benchmark code of the thesis's author for AMOSNet and HybridNet
-    (Chen et al. 2017), which leaves out the row and column between two cells. Here no activation is left out.
-    """
+    Raises ModelError for a feature map smaller than a grid."""
     _, height, width = features.shape
     if levels > min(height, width):
         raise ModelError(
@@ -191,14 +174,11 @@ def pyramid(features: Singles, levels: int) -> Singles:
 
 def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
     """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), which keeps
-    angles, and lengths on average. The same `seed` always gives the same projection. Raises ModelError if `length` is
-    larger than `size`.
+    angles, and lengths on average. Raises ModelError if `length` is larger than `size`.
 
-    For the 43 008 activations of CALC and 1064 dimensions a matrix of Gaussian values takes 183 MB. Here its rows are
-    the cyclic shifts of *one* Gaussian vector, applied after a random sign for each activation (Hinrichs and Vybíral
-    2011): angles are kept as well, and the product is a correlation, computed by the Fourier transform in a twentieth
-    of the time.
-    """
+    The rows of its matrix are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
+    activation (Hinrichs and Vybíral 2011): the product is a correlation, computed by the Fourier transform. For 43 008
+    activations and 1064 dimensions the matrix would take 183 MB."""
     if length > size:
         raise ModelError(
             f"A feature map of {size} values cannot be projected to {length} dimensions: ask for at most {size}."
@@ -214,9 +194,9 @@ def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles]
 
 
 def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
-    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. The same seed must
-    give the same numbers for as long as a map is used, which NumPy promises for the raw numbers of PCG64 only (NEP 19):
-    first two for each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
+    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. They must be the
+    same for as long as a map is used, which NumPy promises for the raw numbers of PCG64 only (NEP 19): first two for
+    each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
     pairs = -(-size // 2)
     raw = np.random.PCG64(seed).random_raw(2 * pairs + size)
     uniform = ((raw[: 2 * pairs] >> np.uint64(11)) + 0.5) * 2.0**-53  # never 0

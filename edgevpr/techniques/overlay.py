@@ -1,11 +1,10 @@
-"""The last look of `cohog`: the query is laid over a place as its match says.
+"""The last step of `cohog`: the query is laid over a place as its match says.
 
-If the match is right, the structures of both pictures coincide, those of changed ground as well. The *structure* of a
-picture is the patterns of its regions less what those around have in common. The *agreement* of two structures is their
-correlation over what independent ones would scatter by. With a camera that looks ahead, the agreement at the shift that
-was voted for counts. With one that looks straight down, the query's picture is first turned, scaled and shifted, and it
-counts how far the agreement stands out from that at other shifts: a road agrees nearly as well if pushed along it.
-"""
+If the match is right, the structures of both pictures coincide, also of changed ground. The *structure* of a picture is
+the patterns of its regions less what those around have in common. The *agreement* of two structures is their
+correlation over what independent ones would scatter by. With a camera that looks ahead, it is taken at the shift that
+was voted for. With one that looks straight down, the query's picture is first turned, scaled and shifted, and it counts
+how far the agreement exceeds that at other shifts: a road agrees nearly as well if pushed along it."""
 
 import math
 

@@ -1,10 +1,9 @@
 """The coarse stage of `cohog` for a camera that looks ahead: a place is 144 bytes, found even if the camera has moved.
 
-The block-normalised HOG is averaged over 12x12 cells (its *grid*), and the map's mean grid is subtracted. The L
-orientations of each cell are written as a Fourier series of L numbers, since neighbouring orientations rise and fall
-together, and only the signs of these numbers are kept, one bit each. A query is compared under every shift of its grid.
-Each such *hypothesis* is a row of a matrix, the places of the map are another matrix; one product compares them all.
-"""
+The block-normalised HOG is averaged over 12x12 cells (its *grid*), less the map's mean grid. The L orientations of each
+cell are written as a Fourier series, since neighbouring ones rise and fall together, and only the signs of its numbers
+are kept. A query is compared under every shift of its grid, a *hypothesis*: hypotheses and places are two matrices,
+compared by one product."""
 
 from functools import lru_cache
 
@@ -30,11 +29,11 @@ SHIFTS = np.stack([_DX[_ENOUGH], _DY[_ENOUGH]], axis=1).astype(np.int8)
 
 
 def grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
-    """Make the grid of a picture from its blocks float32 (n, n, 4 L): from the middle square, at least 12 wide, of
-    those `seen`, bool (n, n), so that it holds no border of the picture. A block has L numbers, one per orientation,
-    for each of its 2x2 cells. These four are averaged, then the blocks `counted`, bool (n, n), in each of 12x12 larger
-    cells. Each cell has length 1, so that contrast and haze do not count. Returns the grid float32 (12, 12, L), and
-    bool (12, 12), True where at least half of the cell is counted."""
+    """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells: from
+    the middle square, at least 12 wide, of those `seen`, bool (n, n), so that it holds no border of the picture. The
+    blocks `counted`, bool (n, n), are averaged in each of 12x12 larger cells, which has length 1, so that contrast and
+    haze do not count. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of the cell is
+    counted."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
     middle, at = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _sources(n)
     per_block, counts = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), counted[middle, middle].ravel()
@@ -68,10 +67,8 @@ def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
 
 def scan(asked: Singles, codes: Bytes) -> Singles:
     """Compare every hypothesis, `asked` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
-    score of each place, float32 (N,).
-
-    A score is the number of equal bits less that of different ones, over all bits: 1 is the same picture, 0 is chance.
-    """
+    score of each place, float32 (N,): the share of equal bits less that of different ones (1: the same picture, 0:
+    chance)."""
     by_bit = asked.T
     best = np.empty(len(codes), np.float32)
     at_once = max(1, _BITS_AT_ONCE // asked.shape[1])

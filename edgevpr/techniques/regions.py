@@ -1,12 +1,9 @@
-"""Techniques that match regions of a feature map: `rmac` takes squares, `cross_region_bow` takes active areas.
+"""Techniques that match regions of a feature map: `rmac` takes squares, `cross_region_bow` takes active areas. Both
+scan the map by one vector per picture, then compare the best places region by region.
 
-Both scan the map by one vector per picture, then compare the best places region by region. Cross-Region-BoW (Chen,
-Maffra, Sa and Chli, IROS 2017) and Region-VLAD (Khaliq et al., T-RO 2019; see `network`) find regions in the same way.
-In each channel, activations above zero that touch one another, corners included, make a region. Its energy is their
-mean. The regions of the highest energy over all channels are kept. Each is described by the sum of all channels'
-activations in the box around it, as in the public code of Region-VLAD, scaled to length 1: otherwise both techniques
-find fewer places on the data sets used for tuning.
-"""
+Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: in each channel, activations above zero
+that touch one another, corners included. Those of the highest mean (*energy*) over all channels are kept, each
+described by the sum of all channels' activations in the box around it, of length 1."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,10 +27,10 @@ _RMAC_SCALES = 3
 
 
 class RegionTechnique(VectorTechnique):
-    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` is a
-    function that turns a feature map, float32 (C, H, W), into the vector float32 (D,) and the regions float32 (N, C),
-    each of length 1 (rows of zeros if fewer than N are found). `quality` is a function that computes the picture's
-    quality, 0 to 1, from bool (N,), True for each region found."""
+    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` turns a
+    feature map, float32 (C, H, W), into the vector float32 (D,) and the regions float32 (N, C), each of length 1 (rows
+    of zeros if fewer than N are found). `quality` turns bool (N,), True for each region found, into the quality, 0 to
+    1."""
 
     candidates = 40
 
@@ -63,14 +60,13 @@ class RegionTechnique(VectorTechnique):
 
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
-    """Make `rmac`: each square region of a feature map is described by its largest activations, at three scales.
-    `model` is the card of the network, `form` the form of the vector in RAM, `threads` the network's number of threads.
+    """Make `rmac`: each square region of a feature map is described by its largest activations, at three scales. For
+    the parameters see `network`.
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
     the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without a check of
-    geometry. The coarse part is the sum of the squares' vectors. The quality is the share of squares with any
-    activation.
-    """
+    geometry. The coarse part is the sum of the squares' vectors, the quality the share of squares with any
+    activation."""
     backbone = open_backbone(model, "features", threads)
     squares = square_regions(*backbone.shape[1:])
 
@@ -90,9 +86,8 @@ def cross_region_bow(
     `words` visual words.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
-    IROS 2017, in the form of thesis 4.2.1. The paper finds regions in `conv5_3` of VGG-16 and describes them from
-    `conv5_2`; here one feature map is used for both.
-    """
+    IROS 2017, in the form of thesis 4.2.1, with one feature map where the paper finds regions in `conv5_3` of VGG-16
+    and describes them from `conv5_2`."""
     backbone = region_backbone("cross_region_bow", model, threads, regions)
     learned, sha256 = load_words(model, "bow", words)
 
@@ -117,10 +112,9 @@ def region_backbone(technique: str, model: str, threads: int, regions: int) -> B
 
 
 def square_regions(height: int, width: int) -> list[Square]:
-    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2). At scale l they
-    are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one. m is the
-    number that brings the overlap of two neighbours at the first scale closest to 40 %. Raises ModelError for a feature
-    map less than 2 wide."""
+    """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2): at scale l they
+    are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one, with the m
+    that brings the overlap at the first scale closest to 40 %. Raises ModelError for a feature map less than 2 wide."""
     short, long = min(height, width), max(height, width)
     if 2 * short // (_RMAC_SCALES + 1) < 1:
         raise ModelError(
@@ -141,8 +135,8 @@ def square_regions(height: int, width: int) -> list[Square]:
 
 
 def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
-    """Return the largest activation of each channel in each of R squares, of length 1: (C, H, W) to float32 (R, C). The
-    signed square root is taken first, the power normalisation of the thesis (4.2); the paper whitens by PCA."""
+    """Return the largest activation of each channel in each of R squares, as signed square root (the power
+    normalisation of thesis 4.2), of length 1: (C, H, W) to float32 (R, C)."""
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
     return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
 
@@ -153,8 +147,8 @@ def _starts(length: int, side: int, count: int) -> list[int]:
 
 def find_regions(features: Singles, count: int) -> Ints:
     """Find the `count` regions of the highest energy in a feature map float32 (C, H, W), or all if there are fewer.
-    Returns boxes int (N, 4) in its cells, highest energy first: (top, left, bottom, right), bottom and right excluded.
-    Regions of equal energy are ordered by channel, from the top, then from the left."""
+    Returns boxes int (N, 4) in its cells: (top, left, bottom, right), bottom and right excluded, highest energy first;
+    of equals, by channel, from the top, then from the left."""
     channels, height, width = features.shape
     # All channels in one tall picture, an empty row between them: one search instead of one per channel.
     tall = np.zeros((channels, height + 1, width), np.float32)
@@ -170,8 +164,8 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe(features: Singles, boxes: Ints) -> Singles:
-    """Describe regions of a feature map `features` (C, H, W): sum the activations in each of `boxes`, int (N, 4) (top,
-    left, bottom, right; see `find_regions`), by channel, and L2-normalise the sums. Returns float32 (N, C)."""
+    """Describe the regions of a feature map (C, H, W) in `boxes`, int (N, 4) (see `find_regions`), by the sums of
+    activations by channel, of length 1: float32 (N, C)."""
     channels, height, width = features.shape
     sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
     sums[1:, 1:] = features.transpose(1, 2, 0)
@@ -186,8 +180,8 @@ def describe(features: Singles, boxes: Ints) -> Singles:
 
 def mutual_score(query: Singles, place: Singles) -> float:
     """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
-    the mutual pairs, of which each is the other's best match, over the larger number of regions (by which the papers do
-    not divide). Negative cosines count 0; all-zero rows are not regions."""
+    the pairs of which each is the other's best match, over the larger number of regions (by which the papers do not
+    divide). Negative cosines count 0; all-zero rows are not regions."""
     regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not regions_of_query or not regions_of_place:
         return 0.0

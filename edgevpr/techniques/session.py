@@ -1,6 +1,6 @@
-"""Running a network, from a picture to its outputs, for techniques, detectors and the commands for models. It is the
-only module that uses onnxruntime in flight, and imports it only with the first network. A model file is not trusted: it
-is run once before it may fly, and every result is checked."""
+"""Running a network, from a picture to its outputs. It is the only module that uses onnxruntime in flight, and imports
+it only with the first network. A model file is not trusted: it is run once before it may fly, and every result is
+checked."""
 
 import os
 from functools import cache
@@ -157,8 +157,7 @@ def _in_one_line(error: Exception) -> str:
 
 def prepare(image: Array, rule: InputRule) -> Singles:
     """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
-    width). Histogram equalisation is that of CALC: the histogram of Y of BGR as YUV is equalised before the picture is
-    made grey and smaller."""
+    width). Histogram equalisation is that of CALC: of Y of the picture as YUV, before it is made grey and smaller."""
     if rule.equalise and image.ndim == 2:
         image = cv2.equalizeHist(image)
     elif rule.equalise:
@@ -195,8 +194,8 @@ def shares(image: Array, rule: InputRule) -> tuple[float, float]:
 
 
 def without_masked(image: Image, mask: Mask | None) -> Array:
-    """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none). A
-    network needs a whole picture, and a uniform patch adds the least to it."""
+    """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none): a
+    uniform patch adds the least to what a network gives."""
     if mask is None or mask.all():
         return image
     filled = image.copy()

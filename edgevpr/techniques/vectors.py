@@ -1,10 +1,8 @@
-"""Base of the techniques that describe a picture by one vector (also those in `network` and `regions`): the three forms
-of a vector in RAM, and the comparison of vectors. `hog` here needs no network.
+"""Base of the techniques that describe a picture by one vector: the three forms of a vector in RAM, and the comparison
+of vectors. `hog` needs no network.
 
-The map file keeps each vector in half precision, and so does the form `float`. `8bit` and `1bit` are one byte or one
-bit per number, after the mean of all vectors of the map is subtracted: the mean does not help to tell places apart, and
-takes most of the range of a byte.
-"""
+The map file and the form `float` keep half precision. `8bit` and `1bit` are one byte or one bit per number, after the
+mean of all vectors of the map, which tells no places apart, is subtracted."""
 
 from typing import Any
 
@@ -29,15 +27,13 @@ _CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a se
 
 
 class VectorTechnique:
-    """Base class of the techniques that describe a picture by one vector, and compare it with the vectors of all places
-    in RAM; a subclass implements `vector`. `form` says how the vectors are kept in RAM, see above.
+    """Base class of the techniques that compare one vector with those of all places in RAM; a subclass implements
+    `vector`. `form` says how the vectors are kept in RAM, see above.
 
     All scores are 0 to 1. With `similarity` "cosine", the score in the form `float` is the cosine (0 if negative), and
-    in `8bit` it is (1 + cosine) / 2 of the vectors from which the map's mean is subtracted. With "l1" it is 1 / (1 +
-    distance). In `1bit` it is always the share of equal bits. `margins` are the minimum margins of an accepted match in
-    the forms `float`, `8bit` and `1bit`, known for the shipped weights. With another `model` no match is accepted until
-    the configuration sets a minimum margin.
-    """
+    in `8bit` (1 + cosine) / 2 of the vectors less the map's mean. With "l1" it is 1 / (1 + distance). In `1bit` it is
+    the share of equal bits. `margins` are the minimum margins of an accepted match in the three forms, known for the
+    shipped weights: with another `model` none is accepted until the configuration sets one."""
 
     candidates = 1  # there is no fine part to compare
     min_score = 0.0
@@ -98,8 +94,8 @@ class VectorTechnique:
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
         """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from the vectors `coarse`, float16 (N,
-        D), and the map's mean (D,). A row of `8bit` is D int8 numbers, then two float32 as bytes: the step by which the
-        numbers are multiplied, and the vector's length."""
+        D), and the map's mean (D,). A row of `8bit` is D int8 numbers, then as bytes two float32: their step, and the
+        vector's length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for start in range(0, len(coarse), self._at_once):
             block = slice(start, start + self._at_once)
@@ -117,7 +113,7 @@ class VectorTechnique:
 
     def coarse_scores(self, query: Descriptor, rows: Array, mean: Singles | None = None) -> tuple[Singles, None]:
         """Compare a query with all places, `rows` (N, *row shape): scores float32 (N,), all 0 for a query of zeros, and
-        None, since there are no hypotheses. `mean` is the map's (D,), which the form `float` does not need."""
+        None (no hypotheses). `mean` (D,) is the map's."""
         vector = query.coarse.astype(np.float32)
         if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
             return np.zeros(len(rows), np.float32), None
@@ -165,9 +161,9 @@ class VectorTechnique:
 
 
 class Hog(VectorTechnique):
-    """`hog`: one histogram-of-oriented-gradients vector for the whole image, of length 1, compared by cosine (286 KB
-    per place by default). Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey (`w1`), cells of 8x8 pixels
-    (`cell`), blocks of 2x2 cells with a stride of one cell, 9 orientations (`bins`) over 180 degrees."""
+    """`hog`: one histogram-of-oriented-gradients vector for the whole image, compared by cosine (286 KB per place by
+    default). Dalal and Triggs 2005, in the form of thesis 4.2.1: 512x512 grey (`w1`), cells of 8x8 pixels (`cell`),
+    blocks of 2x2 cells, stride one cell, 9 orientations (`bins`) over 180 degrees."""
 
     def __init__(self, w1: int = 512, cell: int = 8, bins: int = 9, form: str = "float") -> None:
         if not (cell >= 2 and w1 % cell == 0 and 2 * cell <= w1 <= 4096 and 2 <= bins <= 64):

@@ -1,6 +1,5 @@
-"""Learned visual words, and the vectors made with them: VLAD, which sums, word by word, the differences between a
-picture's local descriptors and their words (Jégou et al., CVPR 2010), and the bag of words. `train_words.py` in
-models/recipes/ writes the file of the words; the techniques in `network` and `regions` load it."""
+"""Learned visual words, and the vectors made with them: VLAD (Jégou et al., CVPR 2010) and the bag of words.
+`train_words.py` in models/recipes/ writes the file of the words."""
 
 import hashlib
 import io
@@ -20,8 +19,7 @@ _TINY = 1e-12
 def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
     """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
     Returns them, float32 (K, D), and the hash of network and words together, which a map stores. Raises ModelError,
-    which ends with the command that makes the file, if it is missing or damaged, or if the words were learned on
-    another network (see `Card.fingerprint`)."""
+    with the command that makes the file, if it is missing, damaged, or of another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
     recipe = "python models/recipes/train_words.py"
     command = f"make them with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
@@ -61,9 +59,9 @@ def local_descriptors(features: Singles) -> Singles:
 
 def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
     """Compute VLAD of the descriptors `local` (N, D) about `words` (K, D): float32 (K * D,). The part of word k is the
-    sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1). The weight a_k is 1 for the word
-    nearest to x and 0 for the others (`sharpness` None), or that of `soft_weights`. Each part is scaled to length 1
-    (Arandjelović and Zisserman 2013), then the whole."""
+    sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1), scaled to length 1 (Arandjelović
+    and Zisserman 2013), as is the whole. The weight a_k is 1 for the word nearest to x and 0 for the others
+    (`sharpness` None), or that of `soft_weights`."""
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)
         weights[np.arange(len(local)), nearest(local, words)] = 1
@@ -83,8 +81,8 @@ def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
 
 
 def sharpness_of(words: Singles) -> float:
-    """Compute a sharpness for `soft_weights`: a descriptor equal to a word then gives it, on average, 100 times the
-    weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors, not of the words."""
+    """Compute the sharpness for `soft_weights` with which a descriptor equal to a word gives it, on average, 100 times
+    the weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors."""
     squares = np.einsum("kd,kd->k", words, words)
     apart = squares[:, None] + squares - 2 * words @ words.T
     np.fill_diagonal(apart, np.inf)
@@ -93,8 +91,7 @@ def sharpness_of(words: Singles) -> float:
 
 def bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
-    L2-normalised: float32 (K,). Counts find fewer places: many channels mark the same part of a picture. An inverse
-    document frequency would weigh words by a map that is still being made."""
+    L2-normalised: float32 (K,). Counts find fewer places: many channels mark the same part of a picture."""
     present = np.zeros(len(words), np.float32)
     present[nearest(local, words)] = 1
     return unit(present)

@@ -36,13 +36,6 @@ def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
     assert displacement(asking, best, (7, 7), counts).score == pytest.approx(count_by_hand(asking, best, 7, counts))
 
 
-def test_a_step_at_the_edge_of_what_is_possible_is_found():
-    asking, best = np.full(5, 48), np.zeros(5, int)  # from the last region to the first
-    found = displacement(asking, best, (7, 7), (1.0, 1.0, 0.75, 0.5))
-    assert found.score == 1.0
-    assert found.shift_cells == (-6.0, -6.0)
-
-
 def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
     asking = np.arange(900)[np.arange(900) % 30 < 25]
     moved = np.where(np.arange(len(asking)) % 4, 1, 2)  # three of four moved by one cell, one by two

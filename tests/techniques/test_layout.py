@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.core.errors import UsageError
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
 from edgevpr.techniques.layout import COARSE, FINE, NBYTES
@@ -31,32 +30,11 @@ def town():
     return technique, np.stack([technique.encode(view(seed)).coarse for seed in range(PLACES)])
 
 
-def spot(side, top, left, seed=0):
-    """Patterns (144, 20) of a square of good regions, and their numbers."""
-    patterns = np.random.default_rng(seed).normal(size=(144, 20))
-    numbers = np.add.outer(np.arange(top, top + 12) * side, np.arange(left, left + 12)).ravel()
-    return patterns / np.linalg.norm(patterns, axis=1, keepdims=True), numbers
-
-
 def unpacked(row):
     """The fields of a stored place, in levels of -7 to 7."""
     levels = np.stack([row & 15, row >> 4], axis=1).ravel().astype(int) - 8
     coarse, fine = np.split(levels, [COARSE.numbers])
     return coarse.reshape(-1, 8, 8), fine.reshape(-1, 12, 12)
-
-
-def test_the_field_moves_with_the_picture():
-    here = layout.field(COARSE, *spot(32, 4, 8), (32, 32))  # cells of four regions
-    assert np.abs(here).max() > 0.1
-    moved = layout.field(COARSE, *spot(32, 12, 12), (32, 32))
-    np.testing.assert_allclose(moved, np.roll(here, (2, 1), axis=(1, 2)), atol=1e-6)
-
-
-def test_a_picture_of_more_ground_has_the_same_field_in_its_middle():
-    here = layout.field(COARSE, *spot(32, 4, 8), (32, 32))
-    more = layout.field(COARSE, *spot(48, 12, 16), (48, 32))
-    assert more.shape == (8, 12, 12)
-    np.testing.assert_allclose(more[:, 2:-2, 2:-2], here, atol=1e-6)
 
 
 def test_a_place_is_stored_in_levels_of_its_largest_numbers():
@@ -146,11 +124,6 @@ def test_a_picture_without_a_good_region_has_no_layout_and_is_like_no_place(town
     assert scores.argmax() == 0
     assert scores[2] == 0
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * 3
-
-
-def test_looking_down_takes_the_orientations_that_layouts_are_made_of():
-    with pytest.raises(UsageError, match="uses 8 bins"):
-        CoHog(camera="nadir", bins=12)
 
 
 def possible(by_hypothesis):

@@ -47,16 +47,7 @@ def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
     return placecode.SHIFTS[np.argmax(asked @ (np.unpackbits(code) * 2.0 - 1))].tolist()
 
 
-def test_the_same_picture_agrees_in_every_bit(town):
-    grounds, mean, codes = town
-    asked = _ask(_view(grounds[3]), mean)
-    scores = placecode.scan(asked, codes)
-    assert scores.argmax() == 3
-    assert scores[3] == pytest.approx(1)
-    assert _best_shift(asked, codes[3]) == [0, 0]
-
-
-@pytest.mark.parametrize(("right", "down"), [(2, 0), (0, -3), (-2, 1), (1, 3)])
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (2, 0), (0, -3), (-2, 1), (1, 3)])
 def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
     grounds, mean, codes = town
     asked = _ask(_view(grounds[5], round(_CELL_PX * right), round(_CELL_PX * down)), mean)

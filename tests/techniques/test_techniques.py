@@ -59,6 +59,7 @@ def test_masked_pixels_do_not_speak():
         ("cohog", {"entropy": "renyi"}, "filled_bins or shannon"),
         ("cohog", {"matching": "magic"}, "displacement or thesis"),
         ("cohog", {"camera": "sideways"}, "forward or nadir"),
+        ("cohog", {"camera": "nadir", "bins": 12}, "uses 8 bins"),
         ("hog", {"cell": 0}, "multiple of cell"),
     ],
 )
