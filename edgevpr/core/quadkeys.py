@@ -46,10 +46,9 @@ def extent_of_key(key: str) -> Extent:
     """Return the bounding box of a tile: (south, west, north, east) in degrees."""
     column = sum((int(digit) & 1) << level for level, digit in enumerate(reversed(key)))
     row = sum((int(digit) >> 1) << level for level, digit in enumerate(reversed(key)))
-    (north, south), (west, east) = (
-        _lats(row, len(key)),
-        (360 * (column + each) / 2 ** len(key) - 180 for each in (0, 1)),
-    )
+    across = 2 ** len(key)
+    west, east = (360 * (column + each) / across - 180 for each in (0, 1))
+    north, south = (math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (row + each) / across)))) for each in (0, 1))
     return south, west, north, east
 
 
@@ -115,9 +114,3 @@ def _numbers(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> tuple[Ints, Ints]
     down = 0.5 - np.arcsinh(np.tan(np.radians(lat_deg))) / (2 * np.pi)
     row = np.clip(np.floor(down * across).astype(int), 0, across - 1)
     return column, row
-
-
-def _lats(row: int, zoom: int) -> tuple[float, float]:
-    """Return the latitudes of the northern and southern edge of a row of tiles, in degrees."""
-    north, south = (math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (row + each) / 2**zoom)))) for each in (0, 1))
-    return north, south

@@ -26,18 +26,17 @@ from edgevpr.places.readmap import ReadMap
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
-# The result of scanning all rows of the index: a score per place, float32 (N,), and the score of each hypothesis,
-# float32 (N, H), -inf if it is ruled out (None: there are no hypotheses).
+# Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: there is none).
 Scan = tuple[Singles, Singles | None]
 
 _NEIGHBOURS_WITHOUT_POSITION = 2
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 3  # hypotheses per place
 _ASKED_UNMOVED = 9  # places elsewhere, at most
-# Among so many places, where no heading is known, so many times the candidates are compared: wrong pairs of a place and
-# a rotation come before the right one more often. Of the sets from the air it finds 0.832 of the queries over 10,000
-# places, where it was 0.802. Twice as many find 0.838, and over 1,000 places 0.893 instead of 0.898.
-_LARGE, _OF_LARGE = 2000, 1.6
+# Among so many places, where no heading is known, so many times the candidates are compared: of the sets from the air
+# this finds 0.832 of the queries over 10,000 places, where it was 0.802. Twice as many find fewer of 1,000 places.
+_LARGE = 2000
+_OF_LARGE = 1.6
 _MANY = 3  # unreadable places in one query, from which on the file may be at fault
 # In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
 # one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
@@ -107,12 +106,11 @@ def scan(query: Query) -> Scan:
 def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m: float = 0.0) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
-    If these are more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full.
-    Among 2,000 places and more, looking down with no heading known, 1.6 times as many are compared. If `candidates` is
-    None, or at least the number of places and more than the technique's own number, all places are compared, under all
-    hypotheses of the expected height if nothing else is expected. If all candidates are within `apart_m` metres of the
-    best one, the best-scanned places elsewhere are compared as well, for the margin; if `expected.in_reach` is known,
-    also five out of reach, and at least five elsewhere.
+    Of more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full. Among
+    2,000 places and more, looking down with no heading known, 1.6 times as many are compared. If `candidates` is None,
+    or at least the number of places and more than the technique's own number, all places are compared. If all
+    candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as well, for
+    the margin; if `expected.in_reach` is known, also five out of reach, and at least five elsewhere.
 
     Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the score is that of the
     comparison times the mean of the scan score and 1. Raises PlaceError if a place cannot be read; it is then left out.
@@ -160,8 +158,7 @@ class _Comparison:
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
         self._tries_all = self.is_exact and expected.in_reach is None and expected.turned_deg is None
-        is_any = self._tries_all and not technique.spec.height_ratios
-        self._by_hypothesis = None if is_any else self._every_hypothesis
+        self._by_hypothesis = None if self._tries_all and not technique.spec.height_ratios else self._every_hypothesis
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
@@ -258,8 +255,7 @@ def unmoved_elsewhere(query: Query, best: int, apart_m: float) -> list[FineMatch
     """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
     been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare` does."""
     index, left_out = query.index, list(query.place_map.left_out)
-    others = elsewhere(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
-    slots = np.flatnonzero(others)
+    slots = np.flatnonzero(elsewhere(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out))
     some = slots[:: -(-len(slots) // _ASKED_UNMOVED) or 1].tolist()
     return [query.technique.unmoved(query.descriptor, fine) for _, fine, _ in _read(query, [(at, None) for at in some])]
 
@@ -306,10 +302,8 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collec
 
 def named(ranking: Ranking, index: PlaceIndex, place_map: ReadMap, first: int | None = None) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
-
     Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
-    was loaded. The place is left out from then on.
-    """
+    was loaded. The place is left out from then on."""
     candidates = []
     for slot, score in zip(ranking.slots[:first].tolist(), ranking.scores[:first].tolist(), strict=True):
         place_id = int(index.place_ids[slot])
@@ -328,11 +322,9 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: ReadMap, first: int | 
 
 def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
     """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
-    (None: all), in the order of the map file, in which a memory card reads them fastest.
-
-    With `by_hypothesis` float32 (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen
-    instead. One place gets three hypotheses at most, or more if there are too few places.
-    """
+    (None: all), in the order of the map file, in which a memory card reads them fastest. With `by_hypothesis` float32
+    (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, three of a place at
+    most, or more if there are too few places."""
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_largest(scores[slots], count))].tolist()]

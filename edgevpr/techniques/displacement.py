@@ -1,10 +1,9 @@
 """The displacement vote of `cohog`: regions that show the same place have all moved by the same shift.
 
 Every good region of the query finds its most similar region of the place, the *reference*. The shift between the two,
-in cells, is its vote. If the place is the same, the votes pile up on one shift; if it is another place, they scatter.
-The regions of a picture of another kind (a test card) may all resemble the same few of the place, so the different
-regions that the agreeing votes lead to are counted as well. Regions are numbered row by row.
-"""
+in cells, is its vote. If the place is the same, the votes pile up on one shift. The regions of a picture of another
+kind (a test card) may all resemble the same few of the place, so the different regions that the agreeing votes lead to
+are counted as well. Regions are numbered row by row."""
 
 import math
 from dataclasses import replace
@@ -164,13 +163,12 @@ def _weights(counts: tuple[float, ...]) -> Singles:
 def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
     region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
-    grid. Only pairs that agree on the shift of the `match` are used. The vote knows the shift in whole cells only, and
-    regions far from the middle miss, so the fit is repeated, each time with the regions that agree with the last one.
+    grid. The fit is repeated, each time with the pairs that agree with the last one, at first with the shift of the
+    `match`.
 
     Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
     from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
-    it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis.
-    """
+    it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
     # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)
     turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))

@@ -3,11 +3,9 @@
 The patterns of a picture's good regions (see `slow_patterns`) are averaged in the cells of a square grid, less what the
 cells around have in common. A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift
 by whole cells under which enough of the place is covered. The score is the correlation of the two fields where they
-overlap, divided by what two independent fields of that strength would scatter by.
-
-All places are compared by a coarse grid, under every second rotation, and only the pairs of a place and a rotation that
-come out best by a fine one. A place keeps both in RAM, in 4 bits a number.
-"""
+overlap, over what two independent fields of that strength would scatter by. All places are compared by a coarse grid,
+under every second rotation, and only the best pairs of a place and a rotation by a fine one. A place keeps both in RAM,
+in 4 bits a number."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -95,10 +93,10 @@ def of_place(patterns: Array, good: Bools, side: int) -> Bytes:
 
 def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
     """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
-    `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two beside it
-    are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,) tells which places may be
-    compared by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse
-    grid, less 1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
+    `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two next to it
+    are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,): places that may be compared
+    by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse grid, less
+    1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
     if likely is not None and (step := np.count_nonzero(~likely) // _RIVALS) > 1:
         some = likely.copy()
@@ -132,8 +130,7 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
 
 def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     """Return the score (see `scan`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n, n), if
-    the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side; or by up to a cell beside,
-    whichever is best."""
+    the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell off."""
     n = place.shape[1]
     dx, dy = (round(each * n) for each in shift)
     padded = _bordered(query, n)

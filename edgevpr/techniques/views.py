@@ -1,11 +1,9 @@
 """Views of a query: its picture as it would look from other heights and under other headings, for `cohog`.
 
-A nadir query (of a camera that looks straight down) is compared with a place under several *hypotheses*: a height ratio
-(the camera's height above the ground over that when the place was mapped) and a rotation of the camera since then, in
-steps of 15 degrees. A view undoes both. Factors make the shares of agreeing votes comparable, since few regions agree
-by chance more easily than many: they follow from foreign pictures under each view, between the tuning sets from the
-air.
-"""
+A query of a camera that looks straight down is compared with a place under several *hypotheses*: a height ratio (the
+camera's height above the ground over that when the place was mapped) and a rotation of the camera since then, in steps
+of 15 degrees. A view undoes both. Few regions agree by chance more easily than many: factors, from foreign pictures of
+the tuning sets from the air, make the shares of agreeing votes comparable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,8 +61,8 @@ def scale_of(cells: int, ratio: float) -> float:
 class Views:
     """The views of one query, each made when it is first asked for. `square` is the unchanged view: its blocks float32
     (n, n, 4 bins), and bool (n, n), True for good blocks. `encode` makes such a pair of another view, with cells of
-    `cell_px` pixels. Only views within a quarter turn are encoded: the others have the same cells, turned. `seen` bool
-    (n, n) is True for blocks of the unchanged view that lie on allowed pixels only."""
+    `cell_px` pixels. Views beyond a quarter turn have the same cells, turned. `seen` bool (n, n) is True for blocks of
+    the unchanged view that lie on allowed pixels only."""
 
     def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen

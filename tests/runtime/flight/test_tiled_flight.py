@@ -21,8 +21,7 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import select
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.tileindex import TileIndex
-from edgevpr.places.tilemap import TileMap
+from edgevpr.places.tilemap import TileIndex, TileMap
 from edgevpr.power.boards import load_board
 from edgevpr.review.compare import compare
 from edgevpr.review.replay import replay
