@@ -26,9 +26,9 @@ from edgevpr.core.text import progress
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
-from edgevpr.lab.evaluate.asking import MatchOptions, known_of
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import compare, evaluate
+from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, known_of
+from edgevpr.lab.evaluate.metrics import compare
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import file_sha256

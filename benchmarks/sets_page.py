@@ -8,8 +8,7 @@ import base
 
 from edgevpr.core.text import markdown
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.evaluate import TechniqueResult, from_json
-from edgevpr.lab.evaluate.metrics import Quality
+from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult, from_json
 
 CURVES = "curves.png"
 _PANELS_A_ROW = 3

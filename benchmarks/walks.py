@@ -14,7 +14,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import all_frames, mapped
+from edgevpr.lab.evaluate.evaluate import mapped, read_frames
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
@@ -45,7 +45,7 @@ def meter() -> QueryMeter:
 
 def frames_of(folder: Path) -> Iterator[Frame]:
     """Yield the pictures of a folder, with their positions."""
-    return all_frames(open_source(str(folder), live=False))
+    return read_frames(open_source(str(folder), live=False))
 
 
 def frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:

@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--query", metavar="SOURCE", help=video)
     parser.add_argument("--ref", metavar="SOURCE", help="the same, of the places to be found")
     parser.add_argument("--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (all)")
-    parser.add_argument("--ground-truth", metavar="FILE", help="CSV, GT.npz, ground_truth_new.npy (else: what is near)")
+    parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (else: what is near)")
     parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
     parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="measure stored similarities (.npy)")
@@ -91,7 +91,8 @@ def _measure_many(args: Namespace) -> int:
 
 def _measure_techniques(args: Namespace) -> int:
     """Measure techniques on one set, and print the results."""
-    from edgevpr.lab.evaluate.evaluate import compare, evaluate
+    from edgevpr.lab.evaluate.evaluate import evaluate
+    from edgevpr.lab.evaluate.metrics import compare
     from edgevpr.runtime.recognise.opening import gate_of
     from edgevpr.techniques import create
 
@@ -120,16 +121,16 @@ def _measure_techniques(args: Namespace) -> int:
 
 
 def _measure_similarities(args: Namespace) -> int:
-    from edgevpr.lab.evaluate.dataset import names_in
-    from edgevpr.lab.evaluate.similarity import measure, read_similarities, truth_of
+    from edgevpr.lab.evaluate.dataset import list_names, read_truth
+    from edgevpr.lab.evaluate.similarity import add_unscored, measure, read_similarities
 
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
-    queries, references = (names_in(folder) if folder else None for folder in (args.query, args.ref))
-    results = []
-    for file in args.similarity:
-        scores = read_similarities(file)
-        results.append(measure(Path(file).stem, scores, *truth_of(args.ground_truth, scores, queries, references)))
+    truth = read_truth(args.ground_truth)
+    if args.query:
+        truth = add_unscored(truth, list_names(args.query))
+    references = list_names(args.ref) if args.ref else None
+    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
     _show("similarities", results, args.json)
     return 0
 
@@ -142,28 +143,32 @@ def _show(what: str, results: "Sequence[Quality]", as_json: bool) -> None:
 
 def _plan(args: Namespace) -> "EvaluationPlan":
     """Return the plan of sets and rows, from the file --sets or from the other flags."""
-    from edgevpr.lab.evaluate.plan import SetPlan, of_flags, read_plan
+    from edgevpr.lab.evaluate.plan import EvaluationPlan, SetPlan, read_plan
 
     if args.sets:
         if args.data or args.query or args.ref or args.rate_hz:
             raise UsageError("--sets names all sets: leave --data, --query, --ref and --rate-hz out.")
         if args.known:
-            raise UsageError("--sets says of each row what is known (`known: heading,height`): leave --known out.")
+            raise UsageError("--sets has `known: heading,height` in its rows: leave --known out.")
         return read_plan(args.sets)
     if not (args.data or (args.query and args.ref)):
         raise UsageError(
             "Name the data sets with --data or --query and --ref, or a file of sets and rows with --sets; or stored "
             "similarities with --similarity."
         )
-    common = SetPlan(
-        query=args.query,
-        ref=args.ref,
-        ground_truth=args.ground_truth,
-        within_m=args.within_m,
-        within_deg=args.within_deg,
-        rate_hz=args.rate_hz,
-    )
-    return of_flags(args.data or (), _rows(args), common)
+    if args.data and args.ground_truth:
+        raise UsageError("--ground-truth goes with --query and --ref: a folder of --data has its own.")
+    common = {"within_m": args.within_m, "within_deg": args.within_deg, "rate_hz": args.rate_hz}
+    sets = {}
+    if args.query and args.ref:
+        query, ref = (Path(side).resolve() for side in (args.query, args.ref))
+        sets[f"{query.name} on {ref.name}"] = SetPlan(
+            query=str(query), ref=str(ref), ground_truth=args.ground_truth, **common
+        )
+    for folder in args.data or ():
+        path = Path(folder).resolve()
+        sets[path.name if path.name not in sets else str(path)] = SetPlan(folder=str(path), **common)
+    return EvaluationPlan(sets, _rows(args))
 
 
 def _rows(args: Namespace) -> "dict[str, RowPlan]":

@@ -1,5 +1,11 @@
 """A data set: a folder of queries, a folder of references (the images to map), and a ground truth, which names the
-right references of each query. `evaluate` measures techniques on it; `layouts` reads other forms of data sets."""
+right references of each query. `open_folder` recognises the layouts in which data sets are published by their files:
+
+* query/, ref/ and ground_truth.csv: edgevpr's own.
+* database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
+  GSV-Cities and others in that form). References near the query are right (`Nearness`).
+* query/ and ref/ with positions (positions.csv or EXIF): references near the query are right.
+"""
 
 import csv
 import io
@@ -7,31 +13,32 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
+from edgevpr.core.geodesy import offset_m, shorter_deg
 from edgevpr.core.text import decoded_name
 from edgevpr.frames.images import list_images
+from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.source import tags_of
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """Ground truth of one query: file names of the references that are `right` (none: the query is not scored), and of
-    those `ignored`, where a match counts as neither right nor wrong."""
-
-    right: frozenset[str] = frozenset()
-    ignored: frozenset[str] = frozenset()
-
-
-NOT_SCORED = Judged()
-GroundTruth = dict[str, Judged]  # by the file name of each query, in the order of the file
+_LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
+# By the file name of each query, in the order of the file: the file names of the references that are right (none: the
+# query is not scored), and of those ignored, where a match counts as neither right nor wrong.
+Judged = tuple[frozenset[str], frozenset[str]]
+GroundTruth = dict[str, Judged]
+NOT_SCORED: Judged = (frozenset(), frozenset())
+Tags = dict[Path, GeoTag]  # of the pictures of a folder
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
     """A query that is scored: the `path` of its image, and the file names of the references that are `right` and of
-    those `ignored`, as in `Judged`."""
+    those `ignored`, where a match counts as neither right nor wrong."""
 
     path: Path
     right: frozenset[str]
@@ -48,32 +55,40 @@ class Dataset:
     references: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nearness:
+    """Rule by which a reference is right for a query: it was taken within `within_m` metres of it, and the headings
+    differ by at most `within_deg` degrees (None: whatever the headings)."""
+
+    within_m: float = bounded(0.01, 1_000_000, default=25.0)
+    within_deg: float | None = bounded(0.1, 180, default=None)
+
+
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
     """Read a data set and check it against its folders. Images of queries that `ground_truth` lacks are left out.
 
     Raises UsageError with file, name and what to do, and SourceError for a folder without images.
     """
-    return joined(query_dir, ref_dir, read_truth(ground_truth), ground_truth)
+    return make_dataset(query_dir, ref_dir, read_truth(ground_truth), ground_truth)
 
 
-def joined(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path) -> Dataset:
+def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path) -> Dataset:
     """Make a data set of two folders of images and the ground truth that was read from `origin`. Raises UsageError for
     a name that is not in its folder, and where no query is scored."""
     paths = {decoded_name(path.name): path for path in list_images(query_dir)}
-    references = names_in(ref_dir)
-    known = frozenset(references)
-    for name, judged in truth.items():
+    references = list_names(ref_dir)
+    for name, (right, ignored) in truth.items():
         if name not in paths:
             raise UsageError(f"{origin}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
-        if judged.right and (unknown := sorted((judged.right | judged.ignored) - known)):
+        if right and (unknown := sorted((right | ignored).difference(references))):
             raise UsageError(f"{origin}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
-    queries = tuple(ScoredQuery(paths[name], each.right, each.ignored) for name, each in truth.items() if each.right)
+    queries = tuple(ScoredQuery(paths[name], *judged) for name, judged in truth.items() if judged[0])
     if not queries:
         raise UsageError(f"{origin} scores no query: it needs a row with ref_files (and status `ok`).")
     return Dataset(queries, Path(ref_dir), references)
 
 
-def names_in(folder: str | Path) -> tuple[str, ...]:
+def list_names(folder: str | Path) -> tuple[str, ...]:
     """Return the names of all images in a folder, in counting order (2.png before 10.png)."""
     return tuple(decoded_name(path.name) for path in list_images(folder))
 
@@ -91,7 +106,7 @@ def read_truth(path: str | Path) -> GroundTruth:
         is_scored = row.get("status", "ok") == "ok"
         if is_scored and not right:
             raise UsageError(f"{where}: the query `{name}` has no ref_files: name one, or give it another status.")
-        truth[name] = Judged(right, loose - right) if is_scored else NOT_SCORED
+        truth[name] = (right, loose - right) if is_scored else NOT_SCORED
     return truth
 
 
@@ -113,3 +128,77 @@ def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{path} is not a CSV file in UTF-8 ({error}): save it as one.") from error
+
+
+def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
+    """Read the data set in `folder`, in any layout above. Raises UsageError for an unknown layout or parts that do not
+    fit together, and SourceError for a folder without images."""
+    folder = Path(folder)
+    query, ref = folder / "query", folder / "ref"
+    if (truth := folder / "ground_truth.csv").is_file():
+        return load_dataset(query, ref, truth)
+    for outer in (folder, folder / "test", folder / "images" / "test"):
+        if (outer / "database").is_dir() and (outer / "queries").is_dir():
+            return _read_utm_names(outer / "queries", outer / "database", rule)
+    if query.is_dir() and ref.is_dir():
+        return match_positions(query, ref, rule)
+    raise UsageError(f"{folder} is no folder of a data set that is known: it needs {_LAYOUTS}.")
+
+
+def match_positions(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
+    """Make a data set of two folders of images with positions; pictures without one are left out. Raises UsageError
+    where there are no positions, or none are near."""
+    queries, references = (
+        {path: tag for path, tag in tags_of(d).items() if tag.position} for d in (query_dir, ref_dir)
+    )
+    if not queries or not references:
+        raise UsageError(
+            "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
+        )
+    query_deg, reference_deg = (
+        np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags.values() if tag.position])
+        for tags in (queries, references)
+    )
+    query_m, reference_m = (
+        np.transpose(offset_m(*reference_deg[0], *at_deg.T)) for at_deg in (query_deg, reference_deg)
+    )
+    return make_dataset(query_dir, ref_dir, _find_near(queries, query_m, references, reference_m, rule), query_dir)
+
+
+def _read_utm_names(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
+    queries, references = ({path: GeoTag() for path in list_images(folder)} for folder in (query_dir, ref_dir))
+    query_m, reference_m = (np.array([_utm_m(path) for path in tags]) for tags in (queries, references))
+    truth = _find_near(queries, query_m, references, reference_m, Nearness(within_m=rule.within_m))
+    return make_dataset(query_dir, ref_dir, truth, query_dir)
+
+
+def _utm_m(path: Path) -> tuple[float, float]:
+    try:
+        _, east, north, *_ = path.name.split("@")
+        return float(east), float(north)
+    except ValueError:
+        raise UsageError(
+            f"{path}: its name does not say @EASTING@NORTHING@ in metres: rename it, or leave it out."
+        ) from None
+
+
+def _find_near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Doubles, rule: Nearness) -> GroundTruth:
+    """Return the ground truth of the queries that have a right reference by `rule`. `query_m` and `reference_m`, (N,
+    2), are metres east and north of a common origin. Raises UsageError if no query has a right reference."""
+    truth: GroundTruth = {}
+    for (path, tag), position_m in zip(queries.items(), query_m, strict=True):
+        near = np.hypot(*(reference_m - position_m).T) <= rule.within_m
+        if rule.within_deg is not None:
+            near &= [_heading_difference_deg(tag, other) <= rule.within_deg for other in references.values()]
+        if near.any():
+            names = (decoded_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
+            truth[decoded_name(path.name)] = frozenset(names), frozenset()
+    if not truth:
+        raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
+    return truth
+
+
+def _heading_difference_deg(one: GeoTag, other: GeoTag) -> float:
+    if one.heading_deg is None or other.heading_deg is None:
+        raise UsageError("--within-deg needs the heading of every picture (yaw_deg in positions.csv): leave it out.")
+    return abs(shorter_deg(one.heading_deg - other.heading_deg))

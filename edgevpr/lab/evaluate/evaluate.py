@@ -1,76 +1,99 @@
-"""Measurement of one technique on a data set: map the references, ask every query, sum up quality and costs.
+"""Measurement of one technique on a data set: map the references, ask every query as in a flight, judge each answer by
+ground truth, and sum up quality and costs.
 
-Map file, index, retrieval and meter are those of a flight. `edgevpr eval` and `many` use this module. Numbers in
-parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*).
+`edgevpr eval` and `many` use this module. Numbers in parentheses are sections and equations of the thesis (Mubariz
+Zaffar, *Visual Place Recognition for Autonomous Robots*).
 """
 
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import load_config
-from edgevpr.core.contract import Technique
-from edgevpr.core.errors import UsageError
-from edgevpr.core.types import NO_COST, Frame
-from edgevpr.frames.source import Source, open_source
+from edgevpr.core.config import bounded, load_config
+from edgevpr.core.contract import Technique, TechniqueSpec
+from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.types import NO_COST, Frame, StageCost
+from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.positions import GeoTag
+from edgevpr.frames.source import Source, open_source, tags_of
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.asking import MatchOptions, Progress, QueryAnswer, Walk, answers, known_of
-from edgevpr.lab.evaluate.dataset import Dataset
+from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.sequence import length_of
+from edgevpr.places.retrieve import elsewhere
+from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import pack_ah, parse_pack, queries_ah, stage_energy_j
-from edgevpr.power.meter import QueryMeter
+from edgevpr.power.equations import parse_pack, queries_ah
+from edgevpr.power.meter import QueryMeter, query_cost
 from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
-from edgevpr.runtime.recognise.hints import told_parts
+from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.hints import Told, lacking, told_parts
+from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, labelled
 from edgevpr.techniques.card import weights_of
 
+# Yields the items, of that number, and shows it with a label.
+Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
+_NO_TAG = GeoTag()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TechniqueResult(metrics.Quality):
-    """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
-
-    `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of `QueryAnswer`;
-    a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all references,
-    `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1 (5.1).
-    `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as `profile` says them. Charges are for all
-    queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how many
-    queries were matched together. `known`: that of `MatchOptions`. `weights`: origin of the network's weights (None: no
-    network). `pcu`: filled in by `compare`, since it depends on all techniques compared.
+class MatchOptions:
+    """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
+    flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
+    are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
+    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, see `hints.Told`).
     """
 
-    parameters: dict[str, int | float | str]
-    accepted: int
-    accepted_wrong: int
-    accepted_elsewhere: int
-    t_encode_s: float
-    t_match_s: float
-    t_match_per_ref_s: float
-    descriptor_bytes: int
-    fine_bytes: int
-    u_encode: float
-    u_match: float
-    ah_total: float
-    ah_assumes: str
-    sequence: int = 1
+    candidates: int | None = bounded(1, 1_000_000, default=None)
+    sequence: int | None = bounded(1, 100, default=None)
+    exact: bool = False
+    follow: bool = False
     known: str | None = None
-    discarded: int = 0
-    weights: str | None = None
-    pcu: float | None = None
 
 
-def quietly(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryAnswer:
+    """The judged answer to one query. `found` is the name of the best reference that is not ignored (None: there is
+    none) and `score` its score; `first_right` is the rank of the first right reference, from 0 (infinite: none).
+
+    `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_elsewhere`: and it
+    is no neighbour of a right or ignored reference (`places.retrieve.elsewhere`). `discarded`: the salience gate
+    dropped the query as not memorable. `encoding` and `matching` are the costs of the two stages.
+    """
+
+    query: str
+    found: str | None
+    score: float
+    first_right: float
+    accepted: bool
+    accepted_wrong: bool
+    accepted_elsewhere: bool
+    discarded: bool
+    encoding: StageCost
+    matching: StageCost
+
+    @property
+    def is_right(self) -> bool:
+        """True where the best match is right."""
+        return self.first_right == 0
+
+
+def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+    """Return `items`: the `Progress` that shows nothing."""
     return items
 
 
@@ -78,10 +101,10 @@ def evaluate(
     technique_name: str,
     dataset: Dataset,
     parameters: dict[str, Any] | None = None,
-    options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
-    progress: Progress[Any] = quietly,
+    options: MatchOptions = MatchOptions(),
+    progress: Progress = iterate_silently,
     gate: Gate | None = None,
-) -> TechniqueResult:
+) -> metrics.TechniqueResult:
     """Map the references of `dataset` in a temporary file, ask every query, and score the answers. `parameters` are
     those of the technique (None: its defaults). `gate` discards queries that are not memorable (None: none are); the
     map has all references, as in the thesis (3.3).
@@ -90,30 +113,23 @@ def evaluate(
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
     technique = create(technique_name, parameters)
-    return summary(technique, len(dataset.references), answered(technique, dataset, options, progress, gate), options)
+    return summarise(technique, dataset, answer_queries(technique, dataset, options, progress, gate), options)
 
 
-def answered(
+def answer_queries(
     technique: Technique,
     dataset: Dataset,
     options: MatchOptions,
-    progress: Progress[Any] = quietly,
+    progress: Progress,
     gate: Gate | None = None,
 ) -> list[QueryAnswer]:
     """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers. Raises
     UsageError where no query has what `options.known` asks for."""
-    prior, tags = known_of(options.known, dataset, technique.spec, options.sequence)
-    source, meter = open_source(str(dataset.ref_dir), live=False), own_meter()
-    frames = progress(all_frames(source), source.total, f"{technique.spec.name}: references")
-    with mapped(frames, technique, meter, dataset.ref_dir, progress) as (place_map, index):
-        walk = Walk(technique, place_map, index, meter, options=options, gate=gate, prior=prior)
-        walk.warm_up(dataset.queries[0].path)
-        return list(answers(walk, dataset, progress, tags))
-
-
-def own_meter() -> QueryMeter:
-    """Return a meter that measures the stages of a query on this machine."""
-    return meter_of(load_config(None), load_board("this"))
+    known_of(options.known, dataset, technique.spec, options.sequence)  # raises before the map is made
+    source, meter = open_source(str(dataset.ref_dir), live=False), meter_of(load_config(None), load_board("this"))
+    frames = progress(read_frames(source), source.total, f"{technique.spec.name}: references")
+    with mapped(frames, technique, meter, dataset.ref_dir, progress) as opened:
+        return ask_queries(technique, opened, meter, dataset, options, gate, progress)
 
 
 @contextmanager
@@ -122,113 +138,180 @@ def mapped(
     technique: Technique,
     meter: QueryMeter,
     images: Path | None = None,
-    progress: Progress[Any] = quietly,
+    progress: Progress = iterate_silently,
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Context manager: make a temporary map as `make_map` does; gives the map, open to read, and an index with all its
-    places."""
-    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
-        path = Path(folder) / "references.gpkg"
-        make_map(path, frames, technique, images, meter, progress)
-        with opened(path, technique) as both:
-            yield both
+    """Context manager: map `frames` in a temporary file, then refine and calibrate the map as `map build` does; gives
+    the map, open to read, and an index with all its places. `images` is the folder that the frames come from (None: the
+    map is not calibrated)."""
 
-
-def make_map(
-    path: Path,
-    frames: Iterable[Frame],
-    technique: Technique,
-    images: Path | None,
-    meter: QueryMeter | None = None,
-    progress: Progress[Any] = quietly,
-) -> None:
-    """Map `frames` in the new file `path`, then refine and calibrate the map as `map build` does. `images` is the
-    folder that the frames come from (None: the map is not calibrated); `meter` None: that of `own_meter`."""
-    meter = meter or own_meter()
-
-    def shown(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+    def show(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
         return progress(items, total, f"{technique.spec.name}: {label}")
 
-    with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, technique, place_map, meter)
-        with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
-            refine_map(place_map, technique, images, shown)
-        if images:
-            with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
-                calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), shown)
+    with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
+        path = Path(folder) / "references.gpkg"
+        with PlaceMap.create(path, technique.spec) as place_map:
+            build_map(frames, technique, place_map, meter)
+            with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
+                refine_map(place_map, technique, images, show)
+            if images:
+                with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
+                    calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), show)
+        with PlaceMap.open(path) as place_map:
+            yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
 
 
-@contextmanager
-def opened(path: Path, technique: Technique) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
-    """Context manager: open the map file `path` to read; gives the map, and an index with all its places."""
-    with PlaceMap.open(path) as place_map:
-        yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-
-
-def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
-    """Return the results with the PCU (see `metrics.pcu`) filled in. It depends on the slowest encoder among them."""
-    results = list(results)
-    slowest_s = max((result.t_encode_s for result in results), default=0.0)
-    return [
-        replace(each, pcu=metrics.pcu(each.precision_at_100_recall, each.t_encode_s, slowest_s)) for each in results
-    ]
-
-
-def from_json(row: dict[str, Any]) -> TechniqueResult:
-    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
-    return TechniqueResult(**{each.name: row[each.name] for each in fields(TechniqueResult) if each.name in row})
-
-
-def all_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a folder or video. Raises ImageError for the first that cannot be used: figures without some
-    images would mislead."""
-    while not source.ended:
-        if frame := source.read(timeout_s=1.0):
-            yield frame
-
-
-def summary(
-    technique: Technique,
-    references: int,
-    answers: Sequence[QueryAnswer],
-    options: MatchOptions = MatchOptions(),  # noqa: B008  it is frozen
-) -> TechniqueResult:
+def summarise(
+    technique: Technique, dataset: Dataset, answers: Sequence[QueryAnswer], options: MatchOptions
+) -> metrics.TechniqueResult:
     """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
-    `options`. `references` is the number of references."""
-    queries = len(answers)
-    scores = np.array([answer.score for answer in answers])
-    ranks = np.array([answer.first_right for answer in answers])
-    config = load_config(None)
-    board, pack, efficiency = load_board("this"), parse_pack(config.battery.pack), config.battery.regulator_efficiency
-    encoding = sum((answer.encoding for answer in answers), start=NO_COST)
-    matching = sum((answer.matching for answer in answers), start=NO_COST)
-    t_encode_s, t_match_s = encoding.wall_s / queries, matching.wall_s / queries
-    u_encode, u_match = encoding.utilisation(board.cores), matching.utilisation(board.cores)
-    query_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
-    query_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
-
-    return TechniqueResult(
+    `options`."""
+    queries, references = len(answers), len(dataset.references)
+    sequence = length_of(technique.spec, options.sequence)
+    config, board = load_config(None), load_board("this")
+    efficiency = config.battery.regulator_efficiency
+    encoding, matching = (
+        sum(costs, start=NO_COST) * (1 / queries)
+        for costs in ([answer.encoding for answer in answers], [answer.matching for answer in answers])
+    )
+    cost = query_cost(encoding, matching, board, parse_pack(config.battery.pack), efficiency, rss_mb=0.0)
+    return metrics.TechniqueResult(
         technique=labelled(technique.spec.name, technique.spec.form),
         weights=weights_of(technique.spec),
         parameters=technique.spec.parameters,
         queries=queries,
         references=references,
-        **metrics.figures(scores, ranks),
-        accepted=sum(answer.accepted for answer in answers),
-        accepted_wrong=sum(answer.accepted_wrong for answer in answers),
-        accepted_elsewhere=sum(answer.accepted_elsewhere for answer in answers),
-        discarded=sum(answer.discarded for answer in answers),
-        t_encode_s=t_encode_s,
-        t_match_s=t_match_s,
-        t_match_per_ref_s=t_match_s / references,
-        descriptor_bytes=ram_bytes(technique.spec, length_of(technique.spec, options.sequence)),
+        **metrics.figures(
+            np.array([answer.score for answer in answers]), np.array([answer.first_right for answer in answers])
+        ),
+        **{
+            name: sum(getattr(answer, name) for answer in answers)
+            for name in ("accepted", "accepted_wrong", "accepted_elsewhere", "discarded")
+        },
+        t_encode_s=cost.t_encode_s,
+        t_match_s=cost.t_match_s,
+        t_match_per_ref_s=cost.t_match_s / references,
+        descriptor_bytes=ram_bytes(technique.spec, sequence),
         fine_bytes=disk_bytes(technique.spec),
-        u_encode=u_encode,
-        u_match=u_match,
-        ah_total=queries_ah(queries, pack_ah(query_j, pack, efficiency)),
-        sequence=length_of(technique.spec, options.sequence),
+        u_encode=cost.u_encode,
+        u_match=cost.u_match,
+        ah_total=queries_ah(queries, cost.used_mah / 1000),
+        sequence=sequence,
         known=options.known and ",".join(told_parts(options.known)),
         ah_assumes=(
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
         ),
     )
+
+
+def known_of(
+    text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
+) -> tuple[Told | None, dict[Path, GeoTag]]:
+    """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),
+    and the tags of the queries by path. The height of the map is the median of those of its pictures. `sequence` is
+    that of `MatchOptions`. Raises UsageError if no query has what is asked for, and for a text that cannot be read."""
+    if not (parts := told_parts(text)):
+        return None, {}
+    queries, places = tags_of(dataset.queries[0].path.parent), tags_of(dataset.ref_dir)
+    if why := lacking(parts, queries.values(), places.values(), length_of(spec, sequence)):
+        raise UsageError(why)
+    query_heights_m, map_heights_m = (
+        [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]
+        for tags in (queries, places)
+    )
+    map_height_m = float(np.median(map_heights_m)) if query_heights_m and map_heights_m else None
+    return Told(parts, spec.heading_within_deg, map_height_m), queries
+
+
+def ask_queries(
+    technique: Technique,
+    opened: tuple[PlaceMap, PlaceIndex],
+    meter: QueryMeter,
+    dataset: Dataset,
+    options: MatchOptions,
+    gate: Gate | None,
+    progress: Progress,
+) -> list[QueryAnswer]:
+    """Ask all queries of `dataset` on an open map with its index, and return one judged answer for each that is scored.
+    Raises UsageError where no query has what `options.known` asks for, and ModelError for a query that fails."""
+    place_map, index = opened
+    prior, tags = known_of(options.known, dataset, technique.spec, options.sequence)
+    together = length_of(technique.spec, options.sequence)
+    rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
+    follows = options.follow and together == 1 and rule.sure is not None
+
+    def open_recogniser(length: int, follows: bool) -> Recogniser:
+        return Recogniser(
+            Matcher(technique, index, rule, search_of(length)),
+            place_map,
+            meter,
+            WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
+            preparation=Preparation(gate=gate),
+            prior=prior,
+            follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
+        )
+
+    scored = {query.path.name: query for query in dataset.queries}
+    paths = [query.path for query in dataset.queries]
+    # One query is not counted: the first pays for lazy imports and a cold disk.
+    _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
+    if gate:
+        gate.forget()
+    if together > 1 or follows:  # those that are not scored are part of a sequence as well
+        paths = list_images(paths[0].parent)
+    recogniser, answers = open_recogniser(together, follows), []
+    for path in progress(paths, len(paths), f"{technique.spec.name}: queries"):
+        event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
+        if query := scored.get(path.name):
+            answers.append(_judge(event, query, dataset.references, index))
+    return answers
+
+
+def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
+    """Recognise the image `path`, of which `tag` is known. Raises ModelError if that fails: figures without some
+    queries would mislead."""
+    event = recogniser.step(
+        Frame(
+            image=read_image(path),
+            name=path.name,
+            t_mono_s=0.0,  # without gaps in time
+            position=tag.position,
+            heading_deg=tag.heading_deg,
+            height_m=tag.height_m,
+        )
+    )
+    if event.failed:
+        raise ModelError(event.reason)
+    return event
+
+
+def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
+    """Judge the recognition of `query`. `references` are the names of all places, in the order of mapping, which is
+    that of the slots of the index."""
+    discarded = event.worth is not None and event.worth.reason is not None
+    ranking = None if discarded else event.ranking
+    slots = ranking.slots if ranking else np.empty(0, np.intp)
+    right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))
+    counted = np.flatnonzero(~ignored[slots])
+    wrong = event.accepted and not (right | ignored)[slots[0]]
+    away = wrong and elsewhere(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
+    return QueryAnswer(
+        query=query.path.name,
+        found=references[slots[counted[0]]] if len(counted) else None,
+        score=float(ranking.scores[counted[0]]) if ranking and len(counted) else 0.0,
+        first_right=metrics.first_right(slots[counted], right),
+        accepted=event.accepted,
+        accepted_wrong=bool(wrong),
+        accepted_elsewhere=bool(away),
+        discarded=discarded,
+        encoding=event.steps.encoding,
+        matching=event.steps.match,
+    )
+
+
+def read_frames(source: Source) -> Iterator[Frame]:
+    """Yield all frames of a folder or video. Raises ImageError for the first that cannot be used: figures without some
+    images would mislead."""
+    while not source.ended:
+        if frame := source.read(timeout_s=1.0):
+            yield frame

@@ -1,4 +1,5 @@
-"""Quality figures of an evaluation (thesis 2.7 and 6.3.1), as pure functions of the best match of every query.
+"""Results of an evaluation, and their quality figures (thesis 2.7 and 6.3.1), as pure functions of the best match of
+every query.
 
 `scores` is float (N,): the score of each query's best match. `correct` is bool (N,): whether that match is right. A
 match is accepted when its score is at least the threshold; false negatives are right matches below the threshold. So
@@ -6,7 +7,8 @@ each threshold gives a precision and a recall, and these are the curve. Numbers 
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -40,10 +42,37 @@ class Quality:
     precision_recall: tuple[tuple[float, float], ...]
 
 
-def counting(ranked: np.ndarray, ignored: np.ndarray) -> np.ndarray:
-    """Return the positions in `ranked`, int (K,), of the references that are not `ignored`. `ranked` are numbers of
-    references, best first. `ignored`, bool (references,), is True where a match counts as neither right nor wrong."""
-    return np.flatnonzero(~ignored[ranked])
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TechniqueResult(Quality):
+    """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
+
+    `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of
+    `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all
+    references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1
+    (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as in `profile`. Charges are for all
+    queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how many
+    queries were matched together. `known`: that of `evaluate.MatchOptions`. `weights`: origin of the network's weights
+    (None: no network). `pcu`: filled in by `compare`, since it depends on all techniques compared.
+    """
+
+    parameters: dict[str, int | float | str]
+    accepted: int
+    accepted_wrong: int
+    accepted_elsewhere: int
+    t_encode_s: float
+    t_match_s: float
+    t_match_per_ref_s: float
+    descriptor_bytes: int
+    fine_bytes: int
+    u_encode: float
+    u_match: float
+    ah_total: float
+    ah_assumes: str
+    sequence: int = 1
+    known: str | None = None
+    discarded: int = 0
+    weights: str | None = None
+    pcu: float | None = None
 
 
 def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
@@ -146,3 +175,17 @@ def interval(hits: np.ndarray) -> Interval | None:
         (hits.astype(float),), np.mean, n_resamples=RESAMPLES, method="percentile", random_state=SEED
     )
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
+    """Return the results with the PCU (see `pcu`) filled in. It depends on the slowest encoder among them."""
+    results = list(results)
+    slowest_s = max((result.t_encode_s for result in results), default=0.0)
+    return [
+        replace(result, pcu=pcu(result.precision_at_100_recall, result.t_encode_s, slowest_s)) for result in results
+    ]
+
+
+def from_json(row: dict[str, Any]) -> TechniqueResult:
+    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
+    return TechniqueResult(**{field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row})

@@ -1,9 +1,7 @@
 """Plan of an evaluation: every row (a technique with its settings) is measured on every data set. A plan is read from
 the sections `sets` and `rows` of a YAML file, or made from flags of `edgevpr eval`; `many` carries it out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +9,9 @@ from edgevpr.core.config import bounded, build, key
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.text import meant
 from edgevpr.core.yamlfile import read_yaml
-from edgevpr.lab.evaluate.asking import MatchOptions, Progress
-from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.layouts import Nearness, of_positions, open_folder
-from edgevpr.lab.evaluate.numbered import KINDS, load_numbered
-from edgevpr.lab.evaluate.videos import pictures_of
+from edgevpr.lab.evaluate.dataset import Dataset, Nearness, load_dataset, match_positions, open_folder
+from edgevpr.lab.evaluate.evaluate import MatchOptions, Progress
+from edgevpr.lab.evaluate.videos import extract_pictures
 from edgevpr.runtime.preflight.pick import camera_setting
 
 
@@ -33,16 +29,16 @@ class SetPlan(Nearness):
     camera: str | None = key(choices=("nadir", "forward"), default=None)
     rate_hz: float | None = bounded(0.001, 1000, default=None)
 
-    def open(self, videos: Path, progress: Progress[Any]) -> Dataset:
+    def open(self, videos: Path, progress: Progress) -> Dataset:
         """Read the data set; pictures of a video are kept in the folder `videos`. Raises UsageError and SourceError as
-        `open_folder` does, and EdgevprError as `pictures_of` does."""
+        `open_folder` does, and EdgevprError as `extract_pictures` does."""
         if self.folder:
             return open_folder(self.folder, self)
+        sides = self.query or "", self.ref or ""
         if self.ground_truth:
-            load = load_numbered if Path(self.ground_truth).suffix in KINDS else load_dataset
-            return load(self.query or "", self.ref or "", self.ground_truth)
-        pictures = partial(pictures_of, kept=videos, rate_hz=self.rate_hz, progress=progress)
-        return of_positions(self.query or "", self.ref or "", self, pictures)
+            return load_dataset(*sides, self.ground_truth)
+        query, ref = (extract_pictures(Path(side), videos, self.rate_hz, progress) for side in sides)
+        return match_positions(query, ref, self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,35 +75,18 @@ def read_plan(path: str | Path) -> EvaluationPlan:
         unknown = str(next(iter(content)))[:80]
         raise ConfigError(f"{where}: unknown section `{unknown}` ({meant(unknown, sections, 'known: sets, rows')}).")
     for name, section in sections.items():
-        if not isinstance(section, dict) or not section or not all(isinstance(each, dict) for each in section.values()):
+        if not isinstance(section, dict) or not section or not all(isinstance(keys, dict) for keys in section.values()):
             raise ConfigError(f"{where}: `{name}` needs at least one name, and below each name its keys, indented.")
-    sets = {str(name): build(SetPlan, each, where, f"sets.{name}.") for name, each in sections["sets"].items()}
-    rows = {str(name): build(RowPlan, each, where, f"rows.{name}.") for name, each in sections["rows"].items()}
-    for name, each in sets.items():
-        if bool(each.folder) == any((each.query, each.ref, each.ground_truth)) or bool(each.query) != bool(each.ref):
+    sets = {str(name): build(SetPlan, keys, where, f"sets.{name}.") for name, keys in sections["sets"].items()}
+    rows = {str(name): build(RowPlan, keys, where, f"rows.{name}.") for name, keys in sections["rows"].items()}
+    for name, plan in sets.items():
+        if bool(plan.folder) == any((plan.query, plan.ref, plan.ground_truth)) or bool(plan.query) != bool(plan.ref):
             raise ConfigError(
                 f"{where}: the set `{name}` needs either `folder`, which has its own ground truth, or `query` and "
                 "`ref`, beside which `ground_truth` may stand."
             )
         folder, query, ref, truth = (
-            given and str(base / given) for given in (each.folder, each.query, each.ref, each.ground_truth)
+            path and str(base / path) for path in (plan.folder, plan.query, plan.ref, plan.ground_truth)
         )
-        sets[name] = replace(each, folder=folder, query=query, ref=ref, ground_truth=truth)
+        sets[name] = replace(plan, folder=folder, query=query, ref=ref, ground_truth=truth)
     return EvaluationPlan(sets, rows)
-
-
-def of_flags(folders: Sequence[str], chosen: dict[str, RowPlan], common: SetPlan) -> EvaluationPlan:
-    """Make the plan of the command line: each of `folders` is a data set, and the rows `chosen` (techniques with their
-    settings) are measured on all. `common` has the settings of all sets; its `query` and `ref`, if given, are one more
-    set, named by both folders. Raises ConfigError if `common` has a ground truth although there are `folders`."""
-    sets: dict[str, SetPlan] = {}
-    if common.query and common.ref:
-        query, ref = (str(Path(each).resolve()) for each in (common.query, common.ref))
-        sets[f"{Path(query).name} on {Path(ref).name}"] = replace(common, query=query, ref=ref)
-    if folders and common.ground_truth:
-        raise ConfigError("--ground-truth goes with --query and --ref: a folder of --data has its own.")
-    for folder in folders:
-        path = Path(folder).resolve()
-        name = path.name if path.name not in sets else str(path)
-        sets[name] = replace(common, folder=str(path), query=None, ref=None)
-    return EvaluationPlan(sets, chosen)

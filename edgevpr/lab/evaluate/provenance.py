@@ -13,7 +13,7 @@ from typing import Any
 
 import edgevpr
 
-_LIBRARIES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
+_PACKAGES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
 
 
 def today() -> str:
@@ -25,7 +25,7 @@ def today() -> str:
 def versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
     found: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
-    for name, package in _LIBRARIES.items():
+    for name, package in _PACKAGES.items():
         try:
             found[name] = version(package)
         except PackageNotFoundError:
@@ -48,12 +48,12 @@ def cpu_model() -> str:
     return platform.machine()
 
 
-def key_of(*parts: Any) -> str:
-    """Return a key of `parts`, any values that JSON or `str` can write: their SHA-256 in hex."""
+def hash_parts(*parts: Any) -> str:
+    """Return the SHA-256 in hex of `parts`, any values that JSON or `str` can write."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def stamp(path: Path) -> tuple[str, int, int]:
+def stamp_file(path: Path) -> tuple[str, int, int]:
     """Return (name, size in bytes, time of writing in ns) of a file. If one of them differs, the file has changed."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns

@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from edgevpr.core.text import aligned
-from edgevpr.lab.evaluate.evaluate import TechniqueResult
-from edgevpr.lab.evaluate.metrics import Interval, Quality
+from edgevpr.lab.evaluate.metrics import Interval, Quality, TechniqueResult
 
-Column = tuple[str, Callable[[Any], str]]  # a heading, and the cell below it of a result
+Column = tuple[str, Callable[[Any], str]]  # a heading, and the text of a result's cell
 
 
 def share_text(share: float | Interval | None) -> str:
@@ -67,43 +66,39 @@ def costs(result: TechniqueResult) -> list[str]:
 
 
 def results_text(results: Sequence[Quality]) -> str:
-    """Make the text that `edgevpr eval` prints for a data set: tables, then the assumptions of their figures. Results
-    of techniques come from `evaluate.compare`; those of stored similarities have no costs."""
-    first = results[0]
-    techniques = [each for each in results if isinstance(each, TechniqueResult)]
-    tables = [_RECALLS, (*_CURVE, *_DECIDED), _COSTS] if techniques else [_RECALLS, _CURVE]
-    known = "the queries resampled" if first.recall_at_1_interval else "not computed: it needs SciPy"
-    lines = [
-        *(_table(results, columns) for columns in tables),
-        f"{first.queries} queries scored against {first.references} references.",
-        f"95 %: what other queries of the same kind would give, {known}. AUC: equation 2.3; from 0: scikit-learn's.",
-        *(_assumed(techniques) if techniques else ()),
-    ]
-    return "\n".join(lines)
+    """Return the text that `edgevpr eval` prints for a data set: tables, then the notes on them. Results of techniques
+    come from `metrics.compare`; those of stored similarities have no costs."""
+    has_costs = isinstance(results[0], TechniqueResult)
+    tables = [_RECALLS, (*_CURVE, *_DECIDED), _COSTS] if has_costs else [_RECALLS, _CURVE]
+    texts = []
+    for columns in tables:
+        rows = [[result.technique, *(text_of(result) for _, text_of in columns)] for result in results]
+        texts.append("\n".join(aligned([["technique", *(heading for heading, _ in columns)], *rows])) + "\n")
+    return "\n".join([*texts, *list_notes(results)])
 
 
-def _assumed(results: Sequence[TechniqueResult]) -> Iterator[str]:
-    """Yield the sentences below the tables."""
-    if sequences := [f"{each.technique} of {each.sequence}" for each in results if each.sequence > 1]:
-        yield f"Matched in sequences of queries: {', '.join(sequences)}."
-    for each in results:
-        if each.known:
-            yield f"Known of each query of {each.technique}: {each.known}."
-        if each.discarded:
-            of_the_others = each.recall_at_1 * each.queries / max(each.queries - each.discarded, 1)
+def list_notes(results: Sequence[Quality]) -> Iterator[str]:
+    """Yield the sentences below the tables of a data set."""
+    known = "the queries resampled" if results[0].recall_at_1_interval else "not computed: it needs SciPy"
+    yield f"{results[0].queries} queries scored against {results[0].references} references."
+    yield f"95 %: what other queries of the same kind would give, {known}. AUC: equation 2.3; from 0: scikit-learn's."
+    techniques = [result for result in results if isinstance(result, TechniqueResult)]
+    if not techniques:
+        return
+    for result in techniques:
+        if result.sequence > 1:
+            yield f"{result.technique} matched sequences of {result.sequence} queries."
+        if result.known:
+            yield f"Known of each query of {result.technique}: {result.known}."
+        if result.discarded:
+            remaining = result.recall_at_1 * result.queries / max(result.queries - result.discarded, 1)
             yield (
-                f"{each.technique}: {each.discarded} queries were not memorable, and count as missed; recall@1 of the "
-                f"others is {of_the_others:.3f}."
+                f"{result.technique}: {result.discarded} queries were not memorable, and count as missed; recall@1 of "
+                f"the others is {remaining:.3f}."
             )
     yield "Times: means over the queries. accepted: would have moved the aircraft, by the technique's own rule."
-    slowest_ms = 1000 * max(each.t_encode_s for each in results)
+    slowest_ms = 1000 * max(result.t_encode_s for result in techniques)
     yield f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {slowest_ms:.1f} ms."
-    yield f"mAh: {results[0].ah_assumes}."
-    for weights in dict.fromkeys(each.weights for each in results if each.weights):
+    yield f"mAh: {techniques[0].ah_assumes}."
+    for weights in dict.fromkeys(result.weights for result in techniques if result.weights):
         yield f"Weights of {weights}."
-
-
-def _table(results: Sequence[Quality], columns: Sequence[Column]) -> str:
-    """Return a table with a row for each result."""
-    rows = [[each.technique, *(text_of(each) for _, text_of in columns)] for each in results]
-    return "\n".join(aligned([["technique", *(heading for heading, _ in columns)], *rows])) + "\n"

@@ -1,11 +1,12 @@
-"""Reading a data set, and the sentence for every way in which its CSV can be wrong."""
+"""Data sets of every layout that is known, and what is wrong in others."""
 
 import cv2
 import numpy as np
 import pytest
 
 from edgevpr.core.errors import UsageError
-from edgevpr.lab.evaluate.dataset import load_dataset
+from edgevpr.core.geodesy import moved
+from edgevpr.lab.evaluate.dataset import Nearness, load_dataset, open_folder
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def load(folder, truth):
     return load_dataset(folder / "query", folder / "ref", folder / "truth.csv")
 
 
-def test_right_and_ignored_references_of_scored_queries(folder):
+def test_load_dataset_reads_right_and_ignored_references_of_scored_queries(folder):
     dataset = load(
         folder,
         "query_file,overlap,ref_files,ref_files_loose,status\n"
@@ -39,14 +40,9 @@ def test_right_and_ignored_references_of_scored_queries(folder):
     assert (second.path.name, second.right, second.ignored) == ("a.png", {"c.png"}, set())
 
 
-def test_a_query_that_the_csv_does_not_name_is_not_scored(folder):
-    dataset = load(folder, "query_file,ref_files\nb.png,b.png\n")
-    assert [query.path.name for query in dataset.queries] == ["b.png"]
-
-
-def test_a_file_from_a_spreadsheet_with_byte_order_mark_and_blanks_is_read(folder):
+def test_load_dataset_reads_a_file_of_a_spreadsheet_that_leaves_queries_out(folder):
     dataset = load(folder, b"\xef\xbb\xbfquery_file,ref_files\r\n b.png , b.png \r\n\r\n")
-    assert dataset.queries[0].right == {"b.png"}
+    assert [(query.path.name, query.right) for query in dataset.queries] == [("b.png", {"b.png"})]
 
 
 HEAD = "query_file,ref_files,status\n"
@@ -58,19 +54,15 @@ HEAD = "query_file,ref_files,status\n"
         ("query_file,refs\na.png,a.png\n", ["truth.csv", "`ref_files` is missing"]),
         ("", ["truth.csv", "`query_file` is missing"]),
         (HEAD + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv", "`z.png`", "correct its name"]),
-        (HEAD + "z.png,,novel\n", ["truth.csv", "`z.png`"]),
-        (HEAD + ",a.png,ok\n", ["truth.csv", "``"]),
         (HEAD + "a.png,a.png y.png,ok\n", ["truth.csv", "`y.png`", "correct its name"]),
         (HEAD + "a.png,,ok\n", ["truth.csv, line 2", "`a.png`", "no ref_files"]),
         (HEAD + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
-        (HEAD + "a.png,a.png,b.png,ok\n", ["truth.csv, line 2", "fields"]),
         (HEAD + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
         (HEAD + "a.png,a.png,novel\n", ["truth.csv", "scores no query"]),
-        (HEAD, ["truth.csv", "scores no query"]),
         (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a CSV file"]),
     ],
 )
-def test_a_wrong_file_gets_a_sentence_that_names_line_and_value(folder, truth, said):
+def test_load_dataset_names_line_and_value_of_a_wrong_file(folder, truth, said):
     with pytest.raises(UsageError) as error:
         load(folder, truth)
     for part in said:
@@ -78,6 +70,56 @@ def test_a_wrong_file_gets_a_sentence_that_names_line_and_value(folder, truth, s
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_file_gets_a_sentence(folder):
+def test_load_dataset_refuses_a_missing_file(folder):
     with pytest.raises(UsageError, match=r"nowhere\.csv"):
         load_dataset(folder / "query", folder / "ref", folder / "nowhere.csv")
+
+
+def write_pictures(folder, names):
+    folder.mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((8, 8), np.uint8))
+
+
+def right_of(dataset):
+    return {query.path.name: (set(query.right), set(query.ignored)) for query in dataset.queries}
+
+
+@pytest.mark.parametrize("inside", ["", "images/test"])
+def test_open_folder_reads_names_with_utm(tmp_path, inside):
+    places = {"@0500000.00@4100000.00@10@S@.jpg", "@0500020@4100000@.jpg"}
+    write_pictures(tmp_path / inside / "database", places)
+    queries = tmp_path / inside / "queries"
+    write_pictures(queries, ["@500005@4100000@q.jpg", "@510000@4100000@far.jpg"])
+    assert right_of(open_folder(tmp_path, Nearness())) == {"@500005@4100000@q.jpg": (places, set())}
+    (queries / "@500005@4100000@q.jpg").rename(queries / "@5@q.jpg")
+    with pytest.raises(UsageError, match="EASTING"):
+        open_folder(tmp_path, Nearness())
+
+
+def test_open_folder_matches_positions_by_distance_and_heading(tmp_path):
+    here = 47.0, 8.0
+    queries = {"q.jpg": (0, 0, 10)}
+    places = {"near.jpg": (3, 0, 20), "turned.jpg": (0, 5, 190), "beside.jpg": (20, 0, 350), "far.jpg": (60, 0, 10)}
+    for side, offsets in (("query", queries), ("ref", places)):
+        write_pictures(tmp_path / side, [*offsets, "nowhere.jpg"])
+        rows = [
+            f"{name},{','.join(map(repr, moved(*here, east_m, north_m)))},{yaw_deg}"
+            for name, (east_m, north_m, yaw_deg) in offsets.items()
+        ]
+        (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon,yaw_deg", *rows]))
+
+    def right(**rule):
+        found = right_of(open_folder(tmp_path, Nearness(**rule)))
+        assert list(found) == ["q.jpg"]
+        return found["q.jpg"][0]
+
+    assert right() == {"near.jpg", "turned.jpg", "beside.jpg"}
+    assert right(within_m=4) == {"near.jpg"}
+    assert right(within_deg=30) == {"near.jpg", "beside.jpg"}
+    assert right(within_m=100) == {*places}
+    with pytest.raises(UsageError, match="--within-m"):
+        right(within_m=0.1)
+    (tmp_path / "ref" / "positions.csv").unlink()
+    with pytest.raises(UsageError, match="no positions"):
+        right()

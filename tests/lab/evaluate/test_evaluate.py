@@ -5,12 +5,13 @@ from dataclasses import asdict
 
 import cv2
 import pytest
-from generated_sets import COHOG, HOG
+from generated_sets import COHOG, HOG, make_set
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
 from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import compare, evaluate, from_json
+from edgevpr.lab.evaluate.evaluate import evaluate
+from edgevpr.lab.evaluate.metrics import compare, from_json
 from edgevpr.lab.evaluate.tables import results_text
 from edgevpr.runtime.preflight.probe import probe
 from edgevpr.techniques import create
@@ -19,15 +20,9 @@ from edgevpr.techniques import create
 @pytest.fixture
 def folder(tmp_path):
     """Eight places; each query is its place, darker. The last query's truth is wrong on purpose."""
-    lines = ["query_file,ref_files,ref_files_loose"]
-    for split in ("query", "ref"):
-        (tmp_path / split).mkdir()
-    for place in range(8):
-        picture = textured(place)
-        cv2.imwrite(str(tmp_path / "ref" / f"r{place}.png"), picture)
-        cv2.imwrite(str(tmp_path / "query" / f"q{place}.png"), picture // 2)
-        lines.append(f"q{place}.png,r{place if place < 7 else 0}.png,")
-    (tmp_path / "truth.csv").write_text("\n".join(lines))
+    make_set(tmp_path, places=8)
+    rows = [f"q{place}.png,r{place if place < 7 else 0}.png," for place in range(8)]
+    (tmp_path / "truth.csv").write_text("\n".join(["query_file,ref_files,ref_files_loose", *rows]))
     return tmp_path
 
 
@@ -36,7 +31,7 @@ def load(folder):
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("hog", HOG), ("cohog", COHOG)])
-def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
+def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
     (result,) = compare([evaluate(name, load(folder), parameters)])
     assert (result.queries, result.references) == (8, 8)
     assert result.recall_at_1 == 7 / 8
@@ -53,7 +48,7 @@ def test_recall_costs_and_sizes_of_a_technique(folder, name, parameters):
     assert result.descriptor_bytes == sizes[name]
 
 
-def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
+def test_evaluate_ignores_a_loose_reference_and_counts_the_next(folder):
     # The only query looks exactly like r0, which is neither right nor wrong; r1 would be wrong, all others right.
     others = " ".join(f"r{place}.png" for place in range(2, 8))
     (folder / "truth.csv").write_text(f"query_file,ref_files,ref_files_loose\nq0.png,{others},r0.png {others}\n")
@@ -63,14 +58,14 @@ def test_a_loose_reference_is_passed_over_and_the_next_one_counts(folder):
     assert (result.accepted, result.accepted_wrong) == (1, 0)
 
 
-def test_results_survive_a_round_trip_as_json(folder):
+def test_from_json_gives_the_same_tables(folder):
     results = compare([evaluate("hog", load(folder), HOG), evaluate("cohog", load(folder), COHOG)])
     for result in results:
         read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
         assert results_text([from_json({**read_back, "other": 1})]) == results_text([result])
 
 
-def test_a_broken_image_stops_the_measurement(folder):
+def test_evaluate_stops_at_a_broken_image(folder):
     dataset = load(folder)
     (folder / "ref" / "r3.png").write_bytes(b"no image")
     with pytest.raises(ImageError, match=r"r3\.png"):
@@ -78,6 +73,6 @@ def test_a_broken_image_stops_the_measurement(folder):
 
 
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])
-def test_a_place_takes_as_many_bytes_as_profile_says(folder, name, settings):
+def test_evaluate_counts_as_many_bytes_a_place_as_probe(folder, name, settings):
     result, costs = evaluate(name, load(folder), settings), probe(create(name, settings))
     assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)

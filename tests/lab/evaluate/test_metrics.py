@@ -11,7 +11,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.metrics import figures, interval
 
 
-def test_recall_at_k_counts_queries_with_a_right_reference_among_the_first_k():
+def test_recall_at_counts_queries_with_a_right_reference_among_the_first_k():
     right = np.array([False, True, False, True])
     ranks = [metrics.first_right(np.array(order), right) for order in ([1, 0, 2, 3], [0, 2, 3, 1], [2, 0])]
     assert ranks == [0, 2, math.inf]
@@ -19,13 +19,6 @@ def test_recall_at_k_counts_queries_with_a_right_reference_among_the_first_k():
     assert metrics.recall_at(2, ranks) == 1 / 3
     assert metrics.recall_at(3, ranks) == 2 / 3
     assert metrics.recall_at(10, ranks) == 2 / 3
-
-
-def test_an_ignored_reference_leaves_its_rank_to_the_next():
-    ranked, ignored = np.array([3, 2, 0, 1]), np.array([True, False, False, True])
-    at = metrics.counting(ranked, ignored)
-    assert at.tolist() == [1, 3]
-    assert metrics.first_right(ranked[at], right=np.array([False, True, False, False])) == 1
 
 
 def test_pcu_of_the_slowest_technique_is_its_precision():
@@ -48,7 +41,7 @@ def arrays(queries):
 @pytest.mark.slow
 @settings(deadline=None)
 @given(QUERIES)
-def test_every_figure_is_a_share_and_they_fit_each_other(queries):
+def test_figures_are_shares_that_fit_each_other(queries):
     scores, ranks = arrays(queries)
     found, right = figures(scores, ranks), ranks == 0
     shares = [value for key, value in found.items() if isinstance(value, float)]
@@ -68,7 +61,7 @@ def test_every_figure_is_a_share_and_they_fit_each_other(queries):
 @pytest.mark.slow
 @settings(deadline=None)
 @given(QUERIES)
-def test_scikit_learn_says_the_same(queries):
+def test_figures_equal_those_of_scikit_learn(queries):
     sklearn = pytest.importorskip("sklearn.metrics")
     scores, ranks = arrays(queries)
     right = ranks == 0
@@ -90,7 +83,7 @@ def test_scikit_learn_says_the_same(queries):
 
 
 @pytest.mark.slow
-def test_an_interval_covers_what_the_queries_were_drawn_from():
+def test_interval_covers_the_share_that_the_queries_were_drawn_with():
     random = np.random.default_rng(5)
     covered = 0
     for _ in range(200):

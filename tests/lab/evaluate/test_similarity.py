@@ -23,7 +23,7 @@ def truth(tmp_path):
 
 
 @pytest.mark.data
-def test_eight_published_matrices_come_out_as_published(capsys):
+def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
     if not _PUBLISHED.is_dir():
         pytest.skip("the published matrices are not here")
     with open(_PUBLISHED / "corridor_figures.csv") as handle:
@@ -46,16 +46,13 @@ def test_eight_published_matrices_come_out_as_published(capsys):
     ("content", "said"),
     [
         (np.zeros((2, 3)), "scores of 2 queries and 3 references, and the ground truth is of 3 and 3"),
-        (np.zeros((3, 4)), "with --query and --ref"),
         (np.zeros(3), "a row of numbers for each query"),
         (np.full((3, 3), np.nan), "no NaN"),
-        (np.array([["a", "b"]]), "a row of numbers for each query"),
         (np.array([[None]]), "holds no similarities"),
         (b"rubbish", "holds no similarities"),
-        (b"", "holds no similarities"),
     ],
 )
-def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, content, said):
+def test_measure_refuses_what_does_not_fit_in_one_sentence(tmp_path, truth, capsys, content, said):
     path = tmp_path / "a.npy"
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -65,3 +62,20 @@ def test_what_does_not_fit_is_said_in_a_sentence(tmp_path, truth, capsys, conten
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+def test_measure_takes_all_images_of_the_folders(tmp_path, truth, capsys):
+    for folder, names in (("query", ["q1", "q2", "q3", "q4"]), ("ref", ["r1", "r2", "r10", "r11"])):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / f"{name}.png").touch()
+    rows = "query_file,ref_files\n" + "".join(f"q{n}.png,r{n}.png\n" for n in (1, 2))
+    truth.write_text(rows)
+    np.save(tmp_path / "a.npy", np.eye(4))
+    flags = ["--query", str(tmp_path / "query"), "--ref", str(tmp_path / "ref"), "--ground-truth", str(truth)]
+    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
+    assert (found["queries"], found["references"], found["recall_at_1"]) == (2, 4, 1.0)
+    truth.write_text(rows + "q9.png,r1.png\n")
+    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags]) == 2
+    assert "`q9.png`, which is not in --query" in capsys.readouterr().err
