@@ -47,10 +47,10 @@ def profile(args: Namespace) -> int:
     """Run `profile`: estimate what techniques cost in a flight; or list the boards that have a profile, or say which
     board this is."""
     from edgevpr.power.boards import board_names, load_board
-    from edgevpr.runtime.preflight.choose import preferred
+    from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate
-    from edgevpr.runtime.preflight.own_board import scaled_from
     from edgevpr.runtime.preflight.presentation import format_boards, format_table
+    from edgevpr.runtime.preflight.scale import with_comparable_score
     from edgevpr.runtime.preflight.trial import Trial, try_each
 
     if args.out and not args.detect:
@@ -63,7 +63,7 @@ def profile(args: Namespace) -> int:
         return _detect(args)
     boards = [load_board(name.strip()) for name in args.board.split(",")]
     for board in boards:
-        preferred(board)  # raises if the profile names a technique that is not there
+        list_preferred(board)  # raises if the profile names a technique that is not there
     results = []
     tried: dict[int, list[Trial]] = {}  # by the number of threads for networks
     for board in boards:
@@ -72,7 +72,8 @@ def profile(args: Namespace) -> int:
             if board.threads not in tried:
                 trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
                 tried[board.threads] = list(trials)
-            results.append(estimate(board, scaled_from(load_board("this"), board), tried[board.threads], plan))
+            here = with_comparable_score(load_board("this"), board)
+            results.append(estimate(board, here, tried[board.threads], plan))
     if len(results) == 1:
         show(results[0], args.json, format_table(results[0]))
     else:
@@ -122,7 +123,7 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
 
 def _detect(args: Namespace) -> int:
     from edgevpr.power.boards import detect
-    from edgevpr.runtime.preflight.own_board import write_profile
+    from edgevpr.power.calibrate import write_profile
 
     power = write_profile(Path(args.out)) if args.out else None
     found = detect()

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from edgevpr.core.errors import EdgevprError
@@ -19,11 +18,8 @@ from edgevpr.core.errors import EdgevprError
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
-def ask_child(
-    module: str, job: Any, limit_s: float, what: str, turn: AbstractContextManager[object] | None = None
-) -> Any:
-    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON). The
-    child starts at once, and gets the job within `turn` (None: at once).
+def ask_child(module: str, job: Any, limit_s: float, what: str) -> Any:
+    """Run `python -m MODULE` on a job (any JSON) for at most `limit_s` seconds, and return its answer (any JSON).
 
     Raises EdgevprError if the child takes longer or crashes, and for an error that the work itself raised. `what` names
     the work at the beginning of the message, such as "Trying hog".
@@ -38,8 +34,7 @@ def ask_child(
         start_new_session=True,  # so that only the parent process receives Ctrl-C
     ) as process:
         try:
-            with turn or nullcontext():
-                out, err = process.communicate(json.dumps({"parent_pid": os.getpid(), "job": job}), limit_s)
+            out, err = process.communicate(json.dumps({"parent_pid": os.getpid(), "job": job}), limit_s)
         except subprocess.TimeoutExpired:
             process.kill()
             raise EdgevprError(f"{what} took longer than {limit_s:g} s: it has no end, or is too slow here.") from None

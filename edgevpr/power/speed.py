@@ -20,8 +20,8 @@ from edgevpr.power.boards import MachineSpeed
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
-_LEAST_S = 0.4  # the shortest time of each of the four measurements
-_LEAST_ROUNDS = 5
+_MIN_TIME_S = 0.4  # of each of the four measurements
+_MIN_ROUNDS = 5
 
 
 def micro_benchmark() -> MachineSpeed:
@@ -42,8 +42,7 @@ def product_round() -> Callable[[], object]:
     """Return a function that computes one float32 product of 961 x 32 by 32 x 961, which compares the regions of a
     query with those of a place."""
     random = np.random.default_rng(1)
-    query = random.random((961, 32), np.float32)
-    place = random.random((961, 32), np.float32)
+    query, place = random.random((2, 961, 32), np.float32)
     out = np.empty((961, 961), np.float32)
     return lambda: np.matmul(query, place.T, out=out)
 
@@ -68,8 +67,8 @@ def pass_round() -> Callable[[], object]:
 
 
 def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
-    """Return the calls of the work per second by one thread alone, and in total by `threads` threads at once. `make` is
-    called once for each thread and returns the function that this thread calls again and again."""
+    """Return the calls of the work per second by one thread alone, and in total by `threads` threads at once, each with
+    its own work from `make`."""
     alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))  # a slower round was disturbed by something else
     start = Barrier(threads)
     with ThreadPoolExecutor(threads) as pool:
@@ -83,7 +82,7 @@ def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
     work()
     start.wait()
     times_s: list[float] = []
-    while len(times_s) < _LEAST_ROUNDS or sum(times_s) < _LEAST_S:
+    while len(times_s) < _MIN_ROUNDS or sum(times_s) < _MIN_TIME_S:
         before_s = time.perf_counter()
         work()
         times_s.append(time.perf_counter() - before_s)

@@ -14,7 +14,9 @@ _UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from h
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
 # Bits of the firmware's answer that tell the present state. 16 places higher they tell it for any time since start.
 _BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
-_UNDER_VOLTAGE, _SLOWS, _HOT = 1, 2 | 4 | 8, 8
+_UNDER_VOLTAGE = 1
+_SLOWS = 2 | 4 | 8
+_HOT = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,19 +61,15 @@ class ThermalWatch:
         bits = _number(self._firmware, 16) if self._firmware else None
         reasons = list(self._reasons(bits or 0, temperature_c, khz))
         can_tell = bits is not None or self._top_khz > 0
-        throttled = any(slows for slows, _ in reasons) if can_tell else None
+        is_hot = temperature_c is not None and temperature_c >= self._hot_c
         return ThermalState(
             temperature_c=temperature_c,
             frequency_mhz=frequency_mhz,
-            throttled=throttled,
+            throttled=any(slows for slows, _ in reasons) if can_tell else None,
             why="; ".join(why for _, why in reasons),
             under_voltage=self._is_under_voltage(bits),
-            hot=self._is_hot(bits, temperature_c),
+            hot=None if temperature_c is None and bits is None else is_hot or bool((bits or 0) & _HOT),
         )
-
-    def _is_hot(self, bits: int | None, temperature_c: float | None) -> bool | None:
-        is_above = temperature_c is not None and temperature_c >= self._hot_c
-        return None if temperature_c is None and bits is None else is_above or bool((bits or 0) & _HOT)
 
     def _is_under_voltage(self, bits: int | None) -> bool | None:
         """Return True if the supply is too low by the `bits` of the firmware or the driver's alarm, or if the firmware

@@ -24,8 +24,8 @@ HOG = replace(VECTOR, ram_bytes_per_place=285_794, disk_bytes_per_place=285_768)
 def alone(monkeypatch, tmp_path):
     """Nobody's stored figures, no meter, and a micro-benchmark without patience."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr(speed, "_LEAST_S", 0.01)
-    monkeypatch.setattr(calibrate, "find_meters", tuple)
+    monkeypatch.setattr(speed, "_MIN_TIME_S", 0.01)
+    monkeypatch.setattr(calibrate, "find_meter", lambda: None)
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def tried(monkeypatch):
     """What was tried, by trials that take no time."""
     asked = []
 
-    def answer(module, job, limit_s, what, turn):
+    def answer(module, job, limit_s, what):
         asked.extend(each["label"] for each in job["trials"])
         if job["trials"][0]["name"] == "calc":
             raise EdgevprError("There is no model `calc`.")

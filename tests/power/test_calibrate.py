@@ -1,28 +1,31 @@
-"""The idle and full watts of a board from two loads, made up and of the real machine."""
+"""The idle and full watts of a board from two loads, and the profile of this machine that is written with them."""
 
 from types import SimpleNamespace
 
 import pytest
 
+from edgevpr.core.errors import UsageError
 from edgevpr.power import calibrate as calibrating
-from edgevpr.power.boards import load_board
-from edgevpr.power.calibrate import MeterError, calibrate, find_meters, measure_at
+from edgevpr.power.boards import MachineSpeed, load_board
+from edgevpr.power.calibrate import MeterError, calibrate, find_meter, measure_at, write_profile
 
 METER = SimpleNamespace(title="INA3221 (hwmon1), channel VDD_IN", read_w=lambda: 4.0)
-PI4 = load_board("rpi-4b")
+SCORE = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
 
 
-def calibrated(monkeypatch, idle, full):
-    """The Pi 4 after it was measured as two points (utilisation, watts), and the loads that were announced."""
-    loads, points = [], {0.0: idle, 1.0: full}
+@pytest.fixture
+def measured(monkeypatch):
+    """A machine whose loads are held at once: the points (utilisation, watts) of idle and full load can be set."""
+    points = {0.0: (0.0, 2.0), 1.0: (1.0, 6.5)}
     monkeypatch.setattr(calibrating, "measure_at", lambda meter, load: points[load])
-    return calibrate(PI4, METER, loads.append), loads
+    monkeypatch.setattr(calibrating, "micro_benchmark", lambda: SCORE)
+    monkeypatch.setattr(calibrating, "find_meter", lambda: METER)
+    return points
 
 
-def test_a_board_gets_the_watts_at_what_the_whole_machine_did(monkeypatch):
-    # Another program takes 0.04 of the machine all the time.
-    board, loads = calibrated(monkeypatch, (0.04, 2.12), (0.96, 4.88))
-    assert loads == [0.0, 1.0]
+def test_calibrate_takes_the_watts_at_what_the_whole_machine_did(measured):
+    measured.update({0.0: (0.04, 2.12), 1.0: (0.96, 4.88)})  # another program takes 0.04 of the machine all the time
+    board = calibrate(load_board("rpi-4b"), METER)
     assert (board.idle_w, board.full_w, board.verified) == (pytest.approx(2.0), pytest.approx(5.0), True)
     assert board.source == f"measured on this machine, idle and with all cores busy, with its {METER.title}"
 
@@ -36,12 +39,33 @@ def test_a_board_gets_the_watts_at_what_the_whole_machine_did(monkeypatch):
         ((0.0, 5.0), (1.0, 5.0), "of no board"),
     ],
 )
-def test_figures_that_no_board_can_have_are_one_sentence(monkeypatch, idle, full, word):
+def test_calibrate_refuses_figures_that_no_board_can_have(measured, idle, full, word):
+    measured.update({0.0: idle, 1.0: full})
     with pytest.raises(MeterError, match=word):
-        calibrated(monkeypatch, idle, full)
+        calibrate(load_board("rpi-4b"), METER)
 
 
-def test_a_meter_that_disappears_midway_is_an_error_and_no_mean():
+def test_write_profile_names_the_meter_and_is_read_back(measured, tmp_path, capsys):
+    power = write_profile(tmp_path / "mine.yaml")
+    board = load_board(str(tmp_path / "mine.yaml"))
+    assert (board.idle_w, board.full_w, board.verified) == (pytest.approx(2.0), pytest.approx(6.5), True)
+    assert METER.title in board.source
+    assert board.benchmark_score == SCORE
+    assert power.startswith("Power: 2 W idle, 6.5 W ")
+    assert "load 100%" in capsys.readouterr().err
+
+
+def test_write_profile_never_overwrites_a_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("precious")
+    for named in (path, tmp_path / "mine.json", tmp_path / "no" / "mine.yaml"):
+        with pytest.raises(UsageError, match=str(named)):
+            write_profile(named)
+    assert path.read_text() == "precious"
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_measure_at_raises_where_the_meter_disappears():
     readings = iter([4.0, 4.0])
 
     def read_w():
@@ -64,42 +88,34 @@ def orin(**changes):
     return {f"{HWMON}/hwmon1/{name}": text for name, text in (files | changes).items()}
 
 
-def test_of_three_channels_only_the_boards_input_is_a_meter(tree):
-    (meter,) = find_meters(tree(orin()))
-    assert meter.read_w() == pytest.approx(6.0)
-    assert "channel VDD_IN" in meter.title
-
-
 @pytest.mark.parametrize(
     ("changes", "watts"),
     [
-        ({"in1_label": "POM_5V_GPU", "in3_label": "POM_5V_IN"}, [1.98]),  # a Jetson Nano
-        ({"in1_enable": "0\n", "in3_enable": "1\n"}, []),
-        ({"in1_label": "VDD_GPU"}, []),
+        ({}, 6.0),
+        ({"in1_label": "POM_5V_GPU", "in3_label": "POM_5V_IN"}, 1.98),  # a Jetson Nano
+        ({"curr1_input": "-1"}, 0.0),  # the offset of an idle channel
+        ({"in1_enable": "0\n", "in3_enable": "1\n"}, None),
+        ({"in1_label": "VDD_GPU"}, None),
     ],
 )
-def test_the_input_goes_by_its_name_and_must_be_switched_on(tree, changes, watts):
-    assert [meter.read_w() for meter in find_meters(tree(orin(**changes)))] == pytest.approx(watts)
+def test_find_meter_takes_only_the_input_of_the_board(tree, changes, watts):
+    meter = find_meter(tree(orin(**changes)))
+    assert (meter and meter.read_w()) == (watts and pytest.approx(watts))
 
 
 @pytest.mark.parametrize(
     ("current", "word"),
-    [("-800", "-4 W"), ("900000", "4500 W"), ("many", "'many'"), ("", "''"), ("nan", "nan W"), ("inf", "inf W")],
+    [("-800", "-4 W"), ("900000", "4500 W"), ("many", "'many'"), ("nan", "nan W"), ("inf", "inf W")],
 )
-def test_nonsense_is_never_passed_on_as_a_figure(tree, current, word):
-    (meter,) = find_meters(tree(orin(curr1_input=current)))
+def test_read_w_refuses_an_impossible_value(tree, current, word):
+    meter = find_meter(tree(orin(curr1_input=current)))
     with pytest.raises(MeterError, match=word):
         meter.read_w()
 
 
-def test_the_offset_of_an_idle_channel_is_no_nonsense(tree):
-    (meter,) = find_meters(tree(orin(curr1_input="-1")))
-    assert meter.read_w() == 0
-
-
-def test_a_meter_that_goes_is_a_sentence(tree):
+def test_read_w_refuses_a_meter_that_is_gone(tree):
     root = tree(orin())
-    (meter,) = find_meters(root)
+    meter = find_meter(root)
     (root / HWMON / "hwmon1/curr1_input").unlink()
     with pytest.raises(MeterError, match="curr1_input"):
         meter.read_w()

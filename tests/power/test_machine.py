@@ -11,14 +11,14 @@ MEMINFO = "MemTotal:        2000000 kB\nMemFree:          100000 kB\n"
 SERVICE = "1:cpu:/\n0::/system.slice/edgevpr.service\n"
 
 
-def test_without_control_groups_the_machine_is_the_limit(tree):
+def test_ram_limit_is_that_of_the_machine_without_control_groups(tree):
     root = tree({"proc/meminfo": MEMINFO})
     assert machine.ram_limit_mb(root) == machine.ram_mb(root) == 2048.0
     assert machine.cores(root) == len(os.sched_getaffinity(0))
 
 
 @pytest.mark.parametrize(("above", "limit_mb"), [("max", 536.870912), ("100000000", 100.0)])
-def test_the_memory_limits_of_the_service_and_of_a_group_above_bind(tree, above, limit_mb):
+def test_ram_limit_is_the_lowest_of_the_control_groups(tree, above, limit_mb):
     slice_of_system = "sys/fs/cgroup/system.slice"
     limits = {f"{slice_of_system}/edgevpr.service/memory.max": "536870912\n", f"{slice_of_system}/memory.max": above}
     root = tree({"proc/meminfo": MEMINFO, "proc/self/cgroup": SERVICE} | limits)
@@ -27,7 +27,7 @@ def test_the_memory_limits_of_the_service_and_of_a_group_above_bind(tree, above,
 
 
 @pytest.mark.parametrize(("quota", "expected"), [("50000 100000", 0.5), ("max 100000", None)])
-def test_the_quota_of_the_service_bounds_the_cores(tree, quota, expected):
+def test_cores_obey_the_quota_of_the_service(tree, quota, expected):
     root = tree({"proc/self/cgroup": SERVICE, "sys/fs/cgroup/system.slice/edgevpr.service/cpu.max": f"{quota}\n"})
     assert machine.cores(root) == (expected or len(os.sched_getaffinity(0)))
 
@@ -41,7 +41,7 @@ def test_cores_obey_the_affinity_of_the_process(tree):
         os.sched_setaffinity(0, allowed)
 
 
-def test_memory_of_the_process_is_read_in_megabytes(tree):
+def test_rss_and_pss_are_in_megabytes(tree):
     root = tree(
         {"proc/self/statm": "90000 10000 4000 1 0 20000 0\n", "proc/self/smaps_rollup": "Rss: 9 kB\nPss: 1000 kB\n"}
     )
@@ -49,7 +49,7 @@ def test_memory_of_the_process_is_read_in_megabytes(tree):
     assert machine.pss_mb(root) == 1.024
 
 
-def test_the_real_process_grows_by_what_it_touches():
+def test_rss_grows_by_what_the_process_touches():
     before_mb = machine.rss_mb()
     with mmap.mmap(-1, 30_000_000) as held:  # pages of its own: other memory may come from what tests before have freed
         held.write(os.urandom(30_000_000))

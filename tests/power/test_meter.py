@@ -16,13 +16,7 @@ def clock(*readings):
     return iter(readings).__next__
 
 
-def test_a_stage_costs_what_both_clocks_have_moved_on():
-    with stage(clock(100.0, 100.75), clock(7.0, 8.5)) as metered:
-        assert metered.cost == NO_COST
-    assert metered.cost == StageCost(wall_s=0.75, cpu_s=1.5)
-
-
-def test_the_cpu_time_of_other_threads_is_counted():
+def test_stage_counts_the_cpu_time_of_other_threads():
     own_s = []
 
     def spin():
@@ -38,17 +32,15 @@ def test_the_cpu_time_of_other_threads_is_counted():
     assert metered.cost.wall_s > 0
 
 
-def test_a_query_costs_by_the_closed_form():
+def test_query_cost_follows_the_closed_form():
     # Pi 4B, 2.29 W idle, 6.82 W full, 4 cores: one busy core for 0.4 s, then two for 1.5 s.
     with stage(clock(0.0, 0.4), clock(0.0, 0.4)) as encoding:
-        pass
+        assert encoding.cost == NO_COST
     with stage(clock(0.4, 1.9), clock(0.4, 3.4)) as matching:
         pass
     cost = query_cost(encoding.cost, matching.cost, load_board("rpi-4b"), Pack(4, 5200), 0.85, rss_mb=80.0)
-    assert cost.u_encode == pytest.approx(0.25, abs=1e-9)
-    assert cost.u_match == pytest.approx(0.5, abs=1e-9)
-    assert (cost.t_encode_s, cost.t_match_s) == pytest.approx((0.4, 1.5), abs=1e-9)
-    assert cost.cpu_s == pytest.approx(3.4, abs=1e-9)
+    assert (cost.u_encode, cost.u_match) == pytest.approx((0.25, 0.5), abs=1e-9)
+    assert (cost.t_encode_s, cost.t_match_s, cost.cpu_s) == pytest.approx((0.4, 1.5, 3.4), abs=1e-9)
     volt_hours = 14.8 * 0.85 * 3600
     total_j = (2.29 + 4.53 * 0.25) * 0.4 + (2.29 + 4.53 * 0.5) * 1.5
     marginal_j = 4.53 * 0.25 * 0.4 + 4.53 * 0.5 * 1.5
@@ -57,7 +49,7 @@ def test_a_query_costs_by_the_closed_form():
     assert cost.rss_mb == 80.0
 
 
-def test_the_memory_that_takes_long_to_read_is_read_every_twenty_seconds():
+def test_own_memory_reads_pss_every_twenty_seconds():
     now_s, answers = [0.0], iter([80.0, 81.0, None])
     memory = OwnMemory(lambda: now_s[0], lambda: next(answers))
     seen = []
@@ -66,7 +58,7 @@ def test_the_memory_that_takes_long_to_read_is_read_every_twenty_seconds():
     assert seen == [80.0, 80.0, 80.0, 81.0, 81.0, None, None]
 
 
-def test_a_signal_between_a_step_and_the_setting_of_its_cost_is_not_masked():
+def test_step_does_not_mask_an_exception_before_its_cost_is_set():
     """A flight is ended by an exception of a signal's handler, which can come at any call: here, of the clock."""
 
     class Ended(BaseException):
@@ -100,7 +92,7 @@ class Working(FakeClock):
         self.load.busy(StageCost(wall_s, ran_s))
 
 
-def test_the_share_of_all_cores_counts_what_no_work_explains_too():
+def test_own_load_counts_what_no_recorded_work_explains_too():
     clocks = Working()
     clocks.work(0.5, 0.5)
     clocks.now_s += 1.5
@@ -112,7 +104,7 @@ def test_the_share_of_all_cores_counts_what_no_work_explains_too():
     assert clocks.load.look() == (0.0, 0.0), "since the last look"
 
 
-def test_work_is_late_only_where_its_thread_was_kept_waiting():
+def test_own_load_is_late_only_where_its_thread_was_kept_waiting():
     clocks = Working()
     clocks.work(0.99, 0.97)
     clocks.now_s += 0.01

@@ -7,7 +7,7 @@ import pytest
 from edgevpr.power import speed
 
 
-def test_the_score_is_relative_to_the_reference_and_keeps_its_two_parts_apart(monkeypatch):
+def test_micro_benchmark_is_relative_to_the_reference(monkeypatch):
     rates_hz = {speed.product_round: speed.REFERENCE_PRODUCTS_HZ / 16, speed.pass_round: speed.REFERENCE_PASSES_HZ / 4}
     monkeypatch.setattr(speed, "_rates_hz", lambda make, threads: (rates_hz[make], 3 * rates_hz[make]))
     found = speed.micro_benchmark()
@@ -16,13 +16,13 @@ def test_the_score_is_relative_to_the_reference_and_keeps_its_two_parts_apart(mo
     assert found.verified
 
 
-def test_one_thread_counts_by_its_quickest_round_and_several_by_all(monkeypatch):
+def test_rates_take_the_quickest_round_of_one_thread_and_all_of_several(monkeypatch):
     lengths_s = iter([[0.1, 0.3, 0.05, 0.2], [0.1, 0.3], [0.5]])
     monkeypatch.setattr(speed, "_round_times_s", lambda work, start: next(lengths_s))
     assert speed._rates_hz(lambda: None, 2) == (pytest.approx(20.0), pytest.approx(2 / 0.4 + 1 / 0.5))
 
 
-def test_rounds_go_on_until_there_are_enough_of_them_and_of_time(monkeypatch):
+def test_round_times_go_on_until_there_are_enough_rounds_and_time(monkeypatch):
     now_s = [0.0]
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now_s[0])
 
@@ -33,8 +33,8 @@ def test_rounds_go_on_until_there_are_enough_of_them_and_of_time(monkeypatch):
         assert speed._round_times_s(work, Barrier(1)) == [length_s] * rounds
 
 
-def test_the_real_benchmark_runs(monkeypatch):
-    monkeypatch.setattr(speed, "_LEAST_S", 0.01)
+def test_micro_benchmark_runs_on_this_machine(monkeypatch):
+    monkeypatch.setattr(speed, "_MIN_TIME_S", 0.01)
     found = speed.micro_benchmark()
     assert all(value > 0 for value in (found.single, found.multi, found.products, found.passes))
     assert found.single == pytest.approx((found.products * found.passes) ** 0.5, rel=0.01)

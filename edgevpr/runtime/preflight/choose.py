@@ -24,7 +24,7 @@ from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
-_NAMED = 3  # options whose objections are told where nothing can be chosen
+_MAX_OBJECTIONS = 3  # that are named where nothing can be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,16 +46,15 @@ class Accuracy:
     accepted_elsewhere: int
 
     @property
-    def beside(self) -> str:
-        """Number of accepted places that were wrong but neighbours of the right one, as text for a table such as
-        " (+3 beside)"; empty for none."""
+    def neighbours(self) -> str:
+        """Number of accepted wrong places that are neighbours of the right one, such as " (+3 beside)" ("": none)."""
         count = self.accepted_wrong - self.accepted_elsewhere
         return f" (+{count} beside)" if count else ""
 
     def __str__(self) -> str:
         return (
             f"recall@1 {self.recall_at_1:.2f} on {self.sets} image sets, {self.accepted} of {self.asked} accepted, "
-            f"{self.accepted_elsewhere} wrong{self.beside}"
+            f"{self.accepted_elsewhere} wrong{self.neighbours}"
         )
 
 
@@ -75,16 +74,14 @@ class Demand:
         """The number of places that a query is compared with."""
         return self.places if self.searched is None else min(self.searched, self.places)
 
-    @property
-    def counted(self) -> str:
-        """The places as text."""
+    def __str__(self) -> str:
         few = f" (some {self.compared} of them compared with a query)" if self.compared < self.places else ""
         return f"{self.places} places{few}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """Says if a technique fits on a board, and what it takes there. `t_query_s`: wall seconds of a query. `cpu_s`: its
+    """Whether a technique fits on a board, and what it takes there. `t_query_s`: wall seconds of a query. `cpu_s`: its
     CPU-seconds of all cores together. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
     `process_ram_mb`: RAM of the process with the index. `reachable_hz`: most queries per second. `misfit`: reason why
     it does not fit, as words that follow a name (None: it fits)."""
@@ -112,11 +109,6 @@ class Option:
     accuracy: Accuracy | None
 
     @property
-    def recall(self) -> float:
-        """Recall@1, 0..1, or 0 if it was not measured."""
-        return self.accuracy.recall_at_1 if self.accuracy else 0.0
-
-    @property
     def objection(self) -> str | None:
         """Reason not to choose the option automatically, as words that follow its label; None if there is none."""
         if self.fit.misfit:
@@ -130,76 +122,75 @@ class Option:
         return None
 
 
-def options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
+def list_options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
     """Yield the options of the technique `name`: with its default number of candidates, then with each smaller number
     whose accuracy was measured. `label` is technique and form; `costs` are those on `board`."""
-    measured = fewer_candidates(label, demand.camera)
-    for candidates in (None, *(count for count in measured if count < (costs.candidates or 0))):
-        fewer = replace(costs, candidates=candidates or costs.candidates)
+    smaller = (count for count in list_fewer_candidates(label, demand.camera) if count < (costs.candidates or 0))
+    for candidates in (None, *smaller):
+        option_costs = replace(costs, candidates=candidates or costs.candidates)
         yield Option(
-            label=_labelled(label, candidates),
+            label=_label(label, candidates),
             name=name,
             candidates=candidates,
-            costs=fewer,
-            fit=fit(board, fewer, demand),
-            accuracy=accuracy_of(label, demand.camera, candidates),
+            costs=option_costs,
+            fit=check_fit(board, option_costs, demand),
+            accuracy=find_accuracy(label, demand.camera, candidates),
         )
 
 
-def accuracy_of(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
+def find_accuracy(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
     """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
 
     `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
     if fewer than the technique's default (None: the default).
     """
-    figures = _accuracies()[camera or "forward"].get(_labelled(label, candidates))
+    figures = _accuracies()[camera or "forward"].get(_label(label, candidates))
     return Accuracy(**figures) if figures else None
 
 
-def fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
+def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
     """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
     names = _accuracies()[camera or "forward"]
-    known = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
-    return tuple(sorted((int(found[1]) for found in known if found), reverse=True))
+    matches = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
+    return tuple(sorted((int(match[1]) for match in matches if match), reverse=True))
 
 
-def best(wanted: Sequence[Option], board: Board) -> Option | None:
+def choose_best(options: Sequence[Option], board: Board) -> Option | None:
     """Choose the most accurate option without an objection, the cheaper one (in CPU time) of two alike. Options of the
     board's own technique (`board.technique`) go before all others, even if none was measured, since the profile names
     it. Returns None if no option is suitable."""
-    sound = [option for option in wanted if option.objection is None]
+    sound = [option for option in options if option.objection is None]
     own = [option for option in sound if option.name == board.technique]
-    unmeasured = (each for each in wanted if each.name == board.technique and not (each.accuracy or each.fit.misfit))
-    if not own and (named := next(unmeasured, None)):
+    unmeasured = (option for option in options if not (option.accuracy or option.fit.misfit))
+    if not own and (named := next((option for option in unmeasured if option.name == board.technique), None)):
         return named
-    return max(own or sound, key=lambda option: (option.recall, -option.fit.cpu_s), default=None)
+    return max(own or sound, key=lambda option: (_recall(option), -option.fit.cpu_s), default=None)
 
 
-def nothing_to_choose(wanted: Sequence[Option], board: Board) -> str:
-    """Return the reason why `best` returned None."""
-    against = (f"{option.label} {option.objection}" for option in wanted[:_NAMED])
-    return f"nothing is chosen for {board.title} by itself: {', and '.join(against)}"
+def explain_no_choice(options: Sequence[Option], board: Board) -> str:
+    """Return the reason why `choose_best` returned None."""
+    objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
+    return f"nothing is chosen for {board.title} by itself: {', and '.join(objections)}"
 
 
-def fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
+def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     """Check whether a technique fits: its index into the budget of RAM for the map, its process into the board's
     memory, its queries into the CPU time.
 
     A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
     the share `cpu_share` of the cores.
     """
-    usable_cores = board.cores * board.cpu_share
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
     query = costs.encode + costs.match(demand.compared)
-    reachable_hz = min(1 / query.wall_s, usable_cores / query.cpu_s)
+    reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
     shortfalls = []
     if map_ram_mb > demand.budget_mb:
         shortfalls.append(f"its map takes {map_ram_mb:.1f} MB of RAM and {demand.budget_mb:.1f} are allowed")
     if process_ram_mb > board.memory_max_mb:
         shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
     if reachable_hz < demand.rate_hz:
-        shortfalls.append(f"it reaches {_rounded_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
+        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
     if query.wall_s > FIX_MAX_AGE_S:
         shortfalls.append(too_late(query.wall_s))
     return Fit(
@@ -218,7 +209,7 @@ def too_late(t_query_s: float) -> str:
     return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
-def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
+def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     """Return the techniques to try if the user names none, best first: the board's own, then those offered to any
     board.
 
@@ -235,19 +226,22 @@ def preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
 
 
-def described(board: Board, option: Option, demand: Demand) -> str:
+def describe_option(board: Board, option: Option, demand: Demand) -> str:
     """Return the accuracy of an option, the figures of its fit and, if it does not fit, why not and what would help."""
-    found = option.fit
+    fit = option.fit
     figures = (
-        f"{option.accuracy or 'never measured'}; {demand.counted} take {found.map_ram_mb:.1f} of "
-        f"{demand.budget_mb:.1f} MB, the process {found.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and "
-        f"{_rounded_down(found.reachable_hz):g} Hz of {demand.rate_hz:g} are reached with "
-        f"{board.cores * board.cpu_share:.2g} of {board.cores} cores"
+        f"{option.accuracy or 'never measured'}; {demand} take {fit.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the "
+        f"process {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_round_down(fit.reachable_hz):g} Hz "
+        f"of {demand.rate_hz:g} are reached with {board.cores * board.cpu_share:.2g} of {board.cores} cores"
     )
-    return f"{figures}; it {found.misfit}" if found.misfit else figures
+    return f"{figures}; it {fit.misfit}" if fit.misfit else figures
 
 
-def _labelled(label: str, candidates: int | None) -> str:
+def _recall(option: Option) -> float:
+    return option.accuracy.recall_at_1 if option.accuracy else 0.0
+
+
+def _label(label: str, candidates: int | None) -> str:
     return label if candidates is None else f"{label}, {candidates} candidates"
 
 
@@ -257,7 +251,7 @@ def _accuracies() -> dict[str, dict[str, dict[str, Any]]]:
     return content
 
 
-def _rounded_down(value: float) -> float:
+def _round_down(value: float) -> float:
     """Round down to two significant digits, so that a rate reported as reached is really reached."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / step) * step

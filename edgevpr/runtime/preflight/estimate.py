@@ -11,7 +11,7 @@ from edgevpr.core.types import QueryCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
-from edgevpr.runtime.preflight.choose import Demand, Option, best, nothing_to_choose, options
+from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, list_options
 from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
@@ -79,10 +79,10 @@ def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPla
     for trial in trials:
         if trial.costs:
             costs = on_board(trial.costs, here, board, counted_work(trial.name, trial.parameters))
-            found = options(board, trial.label, trial.name, costs, plan)
-            rows += [_estimated(option, board, plan) for option in found]
+            options = list_options(board, trial.label, trial.name, costs, plan)
+            rows += [_estimate_option(option, board, plan) for option in options]
     ratio = ratios(here, board)
-    recommended, reason = _recommended(rows, board, plan)
+    recommended, reason = _recommend(rows, board, plan)
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)
     return FlightEstimate(
         board=board.name,
@@ -93,12 +93,12 @@ def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPla
         techniques=tuple(rows),
         recommended=recommended,
         reason=reason,
-        notes=(*weights, *_notes(board, here, ratio, plan)),
+        notes=(*weights, *_list_notes(board, here, ratio, plan)),
         unusable={trial.label: trial.problem for trial in trials if trial.problem},
     )
 
 
-def _estimated(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
+def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
     costs, match = option.costs, option.costs.match(plan.compared)
     query = query_cost(costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
     flight_s = 60 * plan.flight_min
@@ -123,27 +123,27 @@ def _estimated(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstim
     )
 
 
-def _recommended(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) -> tuple[str | None, str]:
+def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) -> tuple[str | None, str]:
     """Return `recommended` and `reason` as in `FlightEstimate`."""
-    wanted = [row.option for row in rows]
-    if not wanted:
+    options = [row.option for row in rows]
+    if not options:
         return None, "None: no technique can be used here."
-    taken = best(wanted, board)
-    if taken is None:
-        return None, f"None: {nothing_to_choose(wanted, board)}."
-    row, fit = rows[wanted.index(taken)], taken.fit
-    why = "it is what the board's profile names, and it was never measured"
-    if taken.accuracy:
-        why = f"nothing that fits finds more: {taken.accuracy}"
-    return taken.label, (
-        f"{taken.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+    chosen = choose_best(options, board)
+    if chosen is None:
+        return None, f"None: {explain_no_choice(options, board)}."
+    row, fit = rows[options.index(chosen)], chosen.fit
+    why = "the board's profile names it, and it was never measured"
+    if chosen.accuracy:
+        why = f"nothing that fits finds more: {chosen.accuracy}"
+    return chosen.label, (
+        f"{chosen.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
         f"{fit.reachable_hz:.3g} Hz where {plan.rate_hz:g} are asked, {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
         f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh a flight beside the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} of the idle board."
     )
 
 
-def _notes(board: Board, here: Board, ratio: Ratios | None, plan: FlightPlan) -> Iterator[str]:
+def _list_notes(board: Board, here: Board, ratio: Ratios | None, plan: FlightPlan) -> Iterator[str]:
     score, own_score = board.benchmark_score, here.benchmark_score
     if ratio is None:
         unknown = board if score.single is None else here

@@ -5,8 +5,7 @@
 
 import json
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.files import own_models, read_file, write_whole
 from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 from edgevpr.power.machine import rss_mb
+from edgevpr.power.meter import stage
 from edgevpr.runtime.recognise.gate_networks import CROPS, Detector, Memorability
 from edgevpr.techniques.card import Card, card_names, load_card, read_card
 from edgevpr.techniques.session import Backbone, file_sha256, import_onnxruntime
@@ -32,10 +32,10 @@ _LIMIT_S = 120.0  # of a trial: at this limit, each of its ten pictures takes tw
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """One line of the list of networks: the card (the YAML file that describes a network) called `name`. `problem`: why
-    the card or its network file cannot be used, in a sentence (None: both can); if it is set, all other fields except
-    `name` are empty. `file`: path of the network file. `outputs`: kinds of output that the network has. `techniques`:
-    the techniques and settings that use the network by default."""
+    """One line of the list of networks: the card called `name`. `problem`: why the card or its network file cannot be
+    used, in a sentence (None: both can); if it is set, all other fields except `name` are empty. `file`: path of the
+    network file. `outputs`: kinds of output that the network has. `techniques`: the techniques and settings that use
+    the network by default."""
 
     name: str
     problem: str | None = None
@@ -67,18 +67,18 @@ class Verified:
 
 def list_models() -> tuple[Listed, ...]:
     """List the networks of all cards, including those that cannot be read. No network is run."""
-    return tuple(_listed(name) for name in card_names())
+    return tuple(map(_read_listed, card_names()))
 
 
-def verify(card: Card, threads: int = 1, limit_s: float = _LIMIT_S) -> Verified:
-    """Check that the network of a card works, by `verify_here` in a child process, for at most `limit_s` seconds.
+def verify(card: Card, threads: int = 1) -> Verified:
+    """Check that the network of a card works, by `verify_here` in a child process, for at most two minutes.
 
     In a new process no other network has loaded libraries, whose memory would be missing from the figures. A network
     that is too large for the board, or never ends, ends the child process instead of this one. Raises EdgevprError if
     that happens, or if the network does not work.
     """
     job = {"card": asdict(card) | {"path": str(card.path)}, "threads": threads}
-    answer = ask_child("edgevpr.runtime.preflight.networks", job, limit_s, f"Trying {card.file_path}")
+    answer = ask_child("edgevpr.runtime.preflight.networks", job, _LIMIT_S, f"Trying {card.file_path}")
     return Verified(**answer | {"shapes": {output: tuple(shape) for output, shape in answer["shapes"].items()}})
 
 
@@ -87,25 +87,29 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
     that would prevent its use in flight."""
     from edgevpr.techniques.network import of_card
 
-    rng = np.random.default_rng(0)
     before_mb = rss_mb()
     import_onnxruntime()
     imported_mb = rss_mb()
-    outputs = [output for output in ("descriptor", "features") if getattr(card.outputs, output)]
-    backbones = {output: Backbone(card, output, threads) for output in outputs}
-    shapes = {output: backbone.shape for output, backbone in backbones.items()}
-    runs: dict[str, Callable[[Image], object]] = {output: backbone.run for output, backbone in backbones.items()}
+    shapes: dict[str, tuple[int, ...]] = {}
+    runs: list[Callable[[Image], object]] = []
+    for output in ("descriptor", "features"):
+        if getattr(card.outputs, output):
+            backbone = Backbone(card, output, threads)
+            shapes[output] = backbone.shape
+            runs.append(backbone.run)
     if card.outputs.boxes:
-        runs["boxes"], shapes["boxes"] = Detector(card, threads).is_static, _FRAME
+        shapes["boxes"] = _FRAME
+        runs.append(Detector(card, threads).is_static)
     if card.outputs.memorability:
-        runs["memorability"], shapes["memorability"] = Memorability(card, threads).matrix, (CROPS, CROPS)
-    run = next(iter(runs.values()))
-    times_s = []
+        shapes["memorability"] = (CROPS, CROPS)
+        runs.append(Memorability(card, threads).matrix)
+    rng = np.random.default_rng(0)
+    costs = []
     for _ in range(_ROUNDS):
         frame = rng.integers(0, 256, _FRAME, np.uint8)
-        start_s = time.perf_counter()
-        run(frame)
-        times_s.append(time.perf_counter() - start_s)
+        with stage() as running:
+            runs[0](frame)
+        costs.append(running.cost)
     return Verified(
         name=card.name,
         title=card.title,
@@ -113,7 +117,7 @@ def verify_here(card: Card, threads: int = 1) -> Verified:
         file_mb=card.file_path.stat().st_size / 1e6,
         shapes=shapes,
         vector_length=of_card(card).spec.coarse.shape[0] if card.is_technique else None,
-        image_ms=1000 * min(times_s),
+        image_ms=1000 * min(cost.wall_s for cost in costs),
         runtime_mb=imported_mb - before_mb,
         network_mb=rss_mb() - imported_mb,
     )
@@ -124,20 +128,21 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     The SHA-256 on the card must be that of the file; if the card has none, it is added. Returns the figures of the
     network and the path of the new card. Raises EdgevprError if the network does not work, or another has its name."""
     card = read_card(card_path, needs_hash=False)
-    found = file_sha256(file)
-    if card.sha256 not in ("", found):
+    sha256 = file_sha256(file)
+    if card.sha256 not in ("", sha256):
         raise ModelError(
-            f"{file} is not the file of {card_path}: its SHA-256 is {found} and the card says {card.sha256}; get the "
+            f"{file} is not the file of {card_path}: its SHA-256 is {sha256} and the card says {card.sha256}; get the "
             "right file, or correct the card."
         )
     target = own_models() / f"{card.name}.yaml"
     # Try the file where it is. The file name on the card is used only in the folder that both are copied to.
-    tried = replace(card, sha256=found, path=file.absolute().with_name(target.name), file=file.name)
-    verified = verify(tried, threads)
-    text = _text_of(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": found})
+    verified = verify(
+        replace(card, sha256=sha256, path=file.absolute().with_name(target.name), file=file.name), threads
+    )
+    text = _read_text(card_path) if card.sha256 else card_text({**read_yaml(card_path), "sha256": sha256})
     network = target.with_name(card.file)
-    card_differs = target.exists() and _text_of(target) != text
-    if card_differs or (network.exists() and file_sha256(network) != found):
+    card_differs = target.exists() and _read_text(target) != text
+    if card_differs or (network.exists() and file_sha256(network) != sha256):
         raise ModelError(
             f"{target if card_differs else network} is there already and is of another network: take it away, or name "
             "yours otherwise."
@@ -149,16 +154,16 @@ def add(file: Path, card_path: Path, threads: int = 1) -> tuple[Verified, Path]:
     return verified, target
 
 
-def _text_of(card_path: Path) -> str:
-    return read_file(card_path, MAX_FILE_BYTES).decode("utf-8")
-
-
 def card_text(values: dict[str, Any]) -> str:
     """Return a card as YAML text, one line per key. JSON values are valid YAML."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
 
-def _listed(name: str) -> Listed:
+def _read_text(card_path: Path) -> str:
+    return read_file(card_path, MAX_FILE_BYTES).decode("utf-8")
+
+
+def _read_listed(name: str) -> Listed:
     try:
         card = load_card(name)
         sha256 = file_sha256(card.file_path)
@@ -167,6 +172,13 @@ def _listed(name: str) -> Listed:
     except EdgevprError as error:
         return Listed(name=name, problem=str(error))
     outputs = tuple(output for output, layer in asdict(card.outputs).items() if layer)
+    users = [card.name] if card.is_technique and not techniques.is_own(card.name) else []
+    for technique in techniques.names():
+        is_of_card = techniques.parameters(technique).get("model") == card.name
+        if is_of_card and techniques.network_output(technique) in outputs:
+            users.append(technique)
+    users += ["salience.detector"] if card.detector else []
+    users += ["salience.network"] if card.outputs.memorability else []
     return Listed(
         name=name,
         title=card.title,
@@ -174,22 +186,8 @@ def _listed(name: str) -> Listed:
         source=card.source,
         file=str(card.file_path),
         outputs=outputs,
-        techniques=tuple(_users(card, outputs)),
+        techniques=tuple(users),
     )
-
-
-def _users(card: Card, outputs: tuple[str, ...]) -> Iterator[str]:
-    """Yield what uses a network by default: its own technique, other techniques, settings of the salience gate."""
-    if card.is_technique and not techniques.is_own(card.name):
-        yield card.name
-    for technique in techniques.names():
-        is_of_card = techniques.parameters(technique).get("model") == card.name
-        if is_of_card and techniques.network_output(technique) in outputs:
-            yield technique
-    if card.detector:
-        yield "salience.detector"
-    if card.outputs.memorability:
-        yield "salience.network"
 
 
 def _verify_job(job: dict[str, Any]) -> dict[str, Any]:

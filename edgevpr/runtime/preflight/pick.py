@@ -11,13 +11,13 @@ from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight.choose import (
     Demand,
     Option,
-    accuracy_of,
-    best,
-    described,
-    fewer_candidates,
-    nothing_to_choose,
-    options,
-    preferred,
+    choose_best,
+    describe_option,
+    explain_no_choice,
+    find_accuracy,
+    list_fewer_candidates,
+    list_options,
+    list_preferred,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import counted_work, on_board
@@ -43,28 +43,28 @@ def picked_technique(board_name: str, places: int, camera: str | None = None) ->
     """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
     (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
-    If the board can afford none, the first usable one of `preferred` is taken, and the log says what is lacking: a map
-    is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
+    If the board can afford none, the first usable one of `list_preferred` is taken, and the log says what is lacking: a
+    map is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
     """
     board = load_board(board_name)
     demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
-    wanted: list[Option] = []
-    for name in preferred(board, camera):
+    options: list[Option] = []
+    for name in list_preferred(board, camera):
         try:
             technique = made_for(board.threads, name, camera_setting(name, camera))
         except ModelError as error:
             _log.warning("technique %s is passed over: %s", name, error)
             continue
-        wanted += options(board, _label(technique), name, _costs_on(technique, board), demand)
-    if not wanted:
+        options += list_options(board, _label(technique.spec), name, _measure_costs(technique, board), demand)
+    if not options:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
-    taken = best(wanted, board)
-    if taken is None:
-        _log.warning("technique %s is taken all the same: %s", wanted[0].name, nothing_to_choose(wanted, board))
-        return wanted[0].name
-    against = [f"{each.label} {each.objection}" for each in wanted if each.name != taken.name and each.objection]
-    _log.info("technique %s: %s", taken.label, "; ".join([described(board, taken, demand), *against]))
-    return taken.name
+    chosen = choose_best(options, board)
+    if chosen is None:
+        _log.warning("technique %s is taken all the same: %s", options[0].name, explain_no_choice(options, board))
+        return options[0].name
+    others = [f"{each.label} {each.objection}" for each in options if each.name != chosen.name and each.objection]
+    _log.info("technique %s: %s", chosen.label, "; ".join([describe_option(board, chosen, demand), *others]))
+    return chosen.name
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
@@ -75,10 +75,10 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     usual = candidates = recogniser.candidates or technique.candidates
     t_query_s = None
     try:
-        taken, afforded = _afforded(recogniser, config)
-        t_query_s, candidates = taken.fit.t_query_s, taken.candidates or candidates
+        option, cost = _find_affordable(recogniser, config)
+        t_query_s, candidates = option.fit.t_query_s, option.candidates or candidates
     except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
-        afforded = f"what it takes could not be tried ({error})"
+        cost = f"what it takes could not be tried ({error})"
     parts = ["the map was built with it" if config.technique is None else "it was named"]
     if weights := weights_of(technique.spec):
         parts.append(f"weights of {weights}")
@@ -86,14 +86,14 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
         parts.append(f"{left_out} places are left to the map file")
     if candidates != usual:
         parts.append(f"{candidates} candidates instead of {usual}")
-    return Outlook(f"technique {_label(technique)}: {'; '.join([*parts, afforded])}", candidates, t_query_s)
+    return Outlook(f"technique {_label(technique.spec)}: {'; '.join([*parts, cost])}", candidates, t_query_s)
 
 
-def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
+def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
     """Return two things: the technique with the number of candidates that the flight will compare, as an option; and
     its accuracy and cost as text."""
-    technique, board = recogniser.technique, recogniser.meter.board
-    spec, costs = technique.spec, _costs_on(technique, board)
+    board, spec = recogniser.meter.board, recogniser.technique.spec
+    costs = _measure_costs(recogniser.technique, board)
     costs = replace(
         costs,
         ram_bytes_per_place=ram_bytes(spec, recogniser.sequence),
@@ -103,49 +103,48 @@ def _afforded(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
         places=places_in_ram(recogniser),
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
-        camera=_camera(technique),
+        camera=_camera(spec),
         searched=searched_places(recogniser),
     )
-    taken, *fewer = options(board, _label(technique), spec.name, costs, demand)
-    if taken.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:
-        taken = next((option for option in fewer if not option.objection), taken)
-    return taken, described(board, taken, demand)
-
-
-def _label(technique: Technique) -> str:
-    """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
-    spec = technique.spec
-    other = "" if spec.name != "cohog" or _votes(spec) else ", thesis"
-    return techniques.labelled(spec.name, spec.form) + other
-
-
-def _votes(spec: TechniqueSpec) -> bool:
-    """Tell whether a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it has a
-    glance, looking ahead, or several heights, looking down."""
-    return bool(spec.in_full or spec.height_ratios)
-
-
-def _camera(technique: Technique) -> str | None:
-    """Return the camera direction that a technique is set to, "nadir" or "forward"; None if it has no such setting."""
-    camera = technique.spec.parameters.get("camera")
-    return None if camera is None else str(camera)
-
-
-def _costs_on(technique: Technique, board: Board) -> TechniqueCosts:
-    """Measure the costs of a technique here, and convert them to `board`."""
-    work = counted_work(technique.spec.name, technique.spec.parameters) if _votes(technique.spec) else None
-    return on_board(probe(technique), load_board("this"), board, work)
+    option, *fewer = list_options(board, _label(spec), spec.name, costs, demand)
+    if option.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:
+        option = next((smaller for smaller in fewer if not smaller.objection), option)
+    return option, describe_option(board, option, demand)
 
 
 def trusted_candidates(technique: Technique) -> tuple[int, ...]:
     """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
     from the right one on the image sets, largest first."""
-    label, camera = _label(technique), _camera(technique)
-    measured = ((count, accuracy_of(label, camera, count)) for count in fewer_candidates(label, camera))
-    return tuple(count for count, figures in measured if figures and not figures.accepted_elsewhere)
+    label, camera = _label(technique.spec), _camera(technique.spec)
+    measured = ((count, find_accuracy(label, camera, count)) for count in list_fewer_candidates(label, camera))
+    return tuple(count for count, accuracy in measured if accuracy and not accuracy.accepted_elsewhere)
 
 
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:
     """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
     (None) or the technique has no such parameter."""
     return {"camera": camera} if camera and "camera" in techniques.parameters(name) else {}
+
+
+def _label(spec: TechniqueSpec) -> str:
+    """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
+    return techniques.labelled(spec.name, spec.form) + ("" if spec.name != "cohog" or _votes(spec) else ", thesis")
+
+
+def _votes(spec: TechniqueSpec) -> bool:
+    """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it has a
+    glance, looking ahead, or several heights, looking down."""
+    return bool(spec.in_full or spec.height_ratios)
+
+
+def _camera(spec: TechniqueSpec) -> str | None:
+    """Return the camera direction that a technique is set to, "nadir" or "forward"; None if it has no such setting."""
+    camera = spec.parameters.get("camera")
+    return None if camera is None else str(camera)
+
+
+def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
+    """Measure the costs of a technique here, and convert them to `board`."""
+    spec = technique.spec
+    work = counted_work(spec.name, spec.parameters) if _votes(spec) else None
+    return on_board(probe(technique), load_board("this"), board, work)

@@ -19,26 +19,21 @@ def format_table(estimate: FlightEstimate) -> str:
     plan, rows = estimate.plan, estimate.techniques
     hovers = f", hovering at {plan.hover_w:g} W" if plan.hover_w else ""
     heading = (
-        f"{estimate.title}: {plan.counted}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
+        f"{estimate.title}: {plan}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency{hovers}; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
-    unusable = ([name, "n/a"] for name in estimate.unusable)
-    tables = [
-        *aligned([_NEEDS, *map(_needs, rows), *unusable], left=2),
-        "",
-        *aligned([_FINDS, *(_finds(row, estimate.recommended) for row in rows)]),
-        "",
-        *aligned([_DRAWS + (_LOSES if plan.hover_w else ()), *map(_draws, rows)]),
-        "",
-    ]
+    needs = aligned([_NEEDS, *map(_needs, rows), *([name, "n/a"] for name in estimate.unusable)], left=2)
+    finds = aligned([_FINDS, *(_finds(row, estimate.recommended) for row in rows)])
+    draws = aligned([_DRAWS + (_LOSES if plan.hover_w else ()), *map(_draws, rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
     for why in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == why]
         notes.append(f"{', '.join(names)} cannot be used: {why}")
     notes += estimate.notes
     answer = wrapped(f"Recommended: {estimate.reason}")
-    return "\n".join([*answer, "", heading, "", *tables, *(line for note in notes for line in wrapped(note))])
+    text = [line for note in notes for line in wrapped(note)]
+    return "\n".join([*answer, "", heading, "", *needs, "", *finds, "", *draws, "", *text])
 
 
 def format_boards(estimates: Sequence[FlightEstimate]) -> str:
@@ -47,7 +42,7 @@ def format_boards(estimates: Sequence[FlightEstimate]) -> str:
     rows = [_BOARD, *map(_on_board, estimates)]
     none = [f"{each.title}: {each.reason}" for each in estimates if not each.recommended]
     plan = estimates[0].plan
-    heading = f"{plan.counted}, {plan.flight_min:g} min, {plan.pack.cells}S{plan.pack.capacity_mah}"
+    heading = f"{plan}, {plan.flight_min:g} min, {plan.pack.cells}S{plan.pack.capacity_mah}"
     return "\n".join([heading, "", *aligned(rows, left=2), *(line for note in none for line in wrapped(note))])
 
 
@@ -79,18 +74,19 @@ def _needs(row: TechniqueEstimate) -> list[str]:
 
 
 def _finds(row: TechniqueEstimate, recommended: str | None) -> list[str]:
-    option, known = row.option, row.option.accuracy
-    if known is None:
+    option, accuracy = row.option, row.option.accuracy
+    if accuracy is None:
         return [option.label, "?", "?", "?", "", "", "never measured"]
     chosen = "needs a sequence" if option.objection else "another is better"
     if option.fit.misfit:
         chosen = ""
     elif option.label == recommended:
         chosen = "yes"
-    elif known.accepted_elsewhere:
+    elif accuracy.accepted_elsewhere:
         chosen = "wrong places"
-    figures = f"{known.recall_at_1:.2f}", f"{known.accepted} of {known.asked}", f"{known.accepted_elsewhere}"
-    return [option.label, *figures[:2], figures[2] + known.beside, str(known.sets), str(known.queries), chosen]
+    accepted, wrong = f"{accuracy.accepted} of {accuracy.asked}", f"{accuracy.accepted_elsewhere}{accuracy.neighbours}"
+    counts = str(accuracy.sets), str(accuracy.queries)
+    return [option.label, f"{accuracy.recall_at_1:.2f}", accepted, wrong, *counts, chosen]
 
 
 def _draws(row: TechniqueEstimate) -> list[str]:

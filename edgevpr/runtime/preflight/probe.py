@@ -4,8 +4,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
@@ -94,43 +93,37 @@ def noise(count: int) -> list[Image]:
     return [np.frombuffer(rng.randbytes(480 * 640), np.uint8).reshape(480, 640) for _ in range(count)]
 
 
-def probe(
-    technique: Technique,
-    *,
-    tried_s: float = 0.0,
-    wall_clock: Callable[[], float] = time.perf_counter,
-    cpu_clock: Callable[[], float] = time.process_time,
-) -> TechniqueCosts:
+def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
     """Measure the costs of a technique on this machine. Pictures of `noise` go through the steps of a query, first with
     an empty map, then with a small map on disk, then with a large index.
 
     Each picture is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of
     other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
-    meter = QueryMeter(load_board("this"), _ANY_PACK, 1.0, wall_clock=wall_clock, cpu_clock=cpu_clock)
-    bench = _Bench(technique, meter, tried_s)
+    bench = _Bench(technique, meter or QueryMeter(load_board("this"), _ANY_PACK, 1.0), tried_s)
     spec, candidates = technique.spec, technique.candidates
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
         peak_is_new = machine.forget_peak()
         bench.fill(trial_map)
         index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
-        # Of a technique with one stage the small map tells no more than how much memory a query takes.
-        small = bench.tries(trial_map, index, 1, _TRIES if spec.fine else 1)
+        # Of a technique with one stage the small map shows only how much memory a query takes.
+        small = bench.try_map(trial_map, index, 1, _TRIES if spec.fine else 1)
         process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
-        many = _many(technique, index)
-        times = times_as_many(bool(spec.height_ratios), len(many))
+        large_index = _repeat_places(technique, index)
+        times = times_as_many(bool(spec.height_ratios), len(large_index))
         most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
-        large = bench.tries(trial_map, many, most)
-        half = bench.tries(trial_map, many, fewer) if spec.in_full else large
+        large = bench.try_map(trial_map, large_index, most)
+        half = bench.try_map(trial_map, large_index, fewer) if spec.in_full else large
     once = _least([steps.scan for steps in small]) if spec.fine else NO_COST
     # The time of scanning six places is not spent on them, but on preparing the query and on the call.
-    scan = _beyond(_least([steps.scan if spec.fine else steps.match for steps in large]), once) * (1 / len(many))
+    scan = _subtract(_least([steps.scan if spec.fine else steps.match for steps in large]), once)
+    scan *= 1 / len(large_index)
     compare, part = (_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
-        one_more = _beyond(compare, part) * (1 / max(1, times * (most - fewer)))
+        one_more = _subtract(compare, part) * (1 / max(1, times * (most - fewer)))
         # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
-        compare_once = _beyond(compare, one_more * candidates) + verify
+        compare_once = _subtract(compare, one_more * candidates) + verify
     else:
         one_more, compare_once = compare * (1 / candidates) if spec.fine else scan, NO_COST
     return TechniqueCosts(
@@ -151,35 +144,35 @@ def probe(
 
 
 class _Bench:
-    """Measures a technique: lets it recognise the same pictures of noise again and again, and returns what each step
-    cost. `sequence`: number of queries that the technique matches together. `tried_s`: seconds for the repetitions."""
+    """Lets a technique recognise the same pictures of noise again and again, and returns what each step cost.
+    `sequence`: number of queries that the technique matches together. `tried_s`: seconds for the repetitions."""
 
     def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
         self.sequence = length_of(technique.spec, None)
         self._technique, self._meter, self._tried_s = technique, meter, tried_s
-        self._frames = [
-            Frame(image=image, name=f"trial {i}", t_mono_s=0.1 * i) for i, image in enumerate(noise(_PICTURES))
-        ]
+        self._images = noise(_PICTURES)
 
     def fill(self, trial_map: PlaceMap) -> None:
         """Add the trial's places to a map, all of them copies of the first picture."""
-        alone = self._walk(trial_map, empty_index(self._technique.spec, 0, None), 1)
-        first = _stepped(alone, self._frames[0])
-        if first.descriptor is None:
-            raise ModelError(f"{self._technique.spec.name} describes no picture of noise: it cannot be tried.")
+        technique = self._technique
+        recogniser = self._open_recogniser(trial_map, empty_index(technique.spec, 0, None), 1)
+        event = _recognise(recogniser, self._images[0], 0.0)
+        if event.descriptor is None:
+            raise ModelError(f"{technique.spec.name} describes no picture of noise: it cannot be tried.")
         for _ in range(_PLACES):
-            trial_map.add(self._frames[0], first.descriptor, landmarks=alone.landmarks(first))
+            frame = Frame(image=self._images[0], name="trial", t_mono_s=0.0)
+            trial_map.add(frame, event.descriptor, landmarks=recogniser.landmarks(event))
 
-    def tries(self, place_map: PlaceMap, index: PlaceIndex, candidates: int, most: int = _TRIES) -> list[Steps]:
+    def try_map(self, place_map: PlaceMap, index: PlaceIndex, candidates: int, most: int = _TRIES) -> list[Steps]:
         """Match each picture several times (`most` at most) with `place_map`, of which `index` is in RAM and
         `candidates` places are compared. Returns one `Steps` per picture: the least cost of every step."""
-        walk = self._walk(place_map, index, candidates)
+        recogniser = self._open_recogniser(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
         def ask() -> list[Steps]:
-            return [_stepped(walk, replace(frame, t_mono_s=next(times_s))).steps for frame in self._frames]
+            return [_recognise(recogniser, image, next(times_s)).steps for image in self._images]
 
-        for _ in range(math.ceil((self.sequence - 1) / len(self._frames))):
+        for _ in range(math.ceil((self.sequence - 1) / len(self._images))):
             ask()  # the frames of the first rounds fill the sequence
         end_s, rounds = time.monotonic() + self._tried_s, [ask()]
         while len(rounds) < most and time.monotonic() < end_s:
@@ -189,21 +182,21 @@ class _Bench:
             for tries in zip(*rounds, strict=True)
         ]
 
-    def _walk(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
+    def _open_recogniser(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
         matcher = Matcher(technique, index, rule, search_of(self.sequence))
         return Recogniser(matcher, place_map, self._meter, WalkSettings(candidates=candidates))
 
 
-def _stepped(walk: Recogniser, frame: Frame) -> Recognition:
-    event = walk.step(frame)
+def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
+    event = recogniser.step(Frame(image=image, name=f"trial {t_mono_s:.1f}", t_mono_s=t_mono_s))
     if event.failed:
         raise ModelError(event.reason)
     return event
 
 
-def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
+def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
     """Return an index of some thousand places without positions, by repeating the places of `index`."""
     count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
@@ -217,7 +210,7 @@ def _many(technique: Technique, index: PlaceIndex) -> PlaceIndex:
     )
 
 
-def _beyond(cost: StageCost, part: StageCost) -> StageCost:
+def _subtract(cost: StageCost, part: StageCost) -> StageCost:
     """Return `cost` minus `part`, but at least a thousandth of `cost`, since clocks are not exact."""
     least = cost * 0.001
     return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))

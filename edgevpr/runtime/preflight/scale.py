@@ -14,7 +14,7 @@ from typing import Any
 
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, MachineSpeed
-from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ
+from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ, micro_benchmark
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 # Score at products as a share of `single`, for boards where it was not measured: that of the Raspberry Pi 4, the
@@ -43,17 +43,20 @@ def counted_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] |
 
 
 def is_same(here: Board, board: Board) -> bool:
-    """Tell whether `board` is the machine `here`, so that nothing has to be converted."""
+    """Return True if `board` is the machine `here`, so that nothing has to be converted."""
     return here.name == board.name or (board.machine is not None and board.machine == here.machine)
 
 
-def ratios(here: Board, board: Board) -> Ratios | None:
-    """Return the speed of `board` divided by that of `here`, the machine that measured; None if a score is unknown.
+def with_comparable_score(here: Board, board: Board) -> Board:
+    """Return the machine `here` with the speed score from which its costs are scaled to `board`. Both scores must be
+    of one kind: that of the profile of `here` if it is verified and `board` has a published score only (no `passes`),
+    else that of the micro-benchmark, run now."""
+    published = here.benchmark_score.verified and board.benchmark_score.passes is None
+    return here if published or is_same(here, board) else replace(here, benchmark_score=micro_benchmark())
 
-    The scores are fields of `MachineSpeed`. If `products` or `passes` is missing, it is computed from `arm64_mips` and
-    the instructions counted for that part of the micro-benchmark. Without `arm64_mips`, the single-thread score
-    `single` is used for passes, and a modest share of it for products.
-    """
+
+def ratios(here: Board, board: Board) -> Ratios | None:
+    """Return the speed of `board` divided by that of `here`, the machine that measured; None if a score is unknown."""
     if is_same(here, board):
         return Ratios(1.0, 1.0)
     (products, passes), (own_products, own_passes) = _speeds(board.benchmark_score), _speeds(here.benchmark_score)
@@ -70,27 +73,28 @@ def on_board(
     if is_same(here, board):
         return costs
     if work and (mips := board.benchmark_score.arm64_mips):
-        times = {stage: StageCost(*2 * (count / (1e6 * mips),)) for stage, count in work.items()}
+        times = {stage: StageCost(count / (1e6 * mips), count / (1e6 * mips)) for stage, count in work.items()}
         return replace(costs, **times)  # type: ignore[arg-type]  # they are fields of TechniqueCosts
-    ratio = ratios(here, board)
-    if ratio is None:
+    if (ratio := ratios(here, board)) is None:
         return costs
     # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
     # rows of the index is passes.
-    encode_by, threads = (ratio.products, board.threads) if costs.is_network else (ratio.passes, None)
+    encode_by, threads = (ratio.products, board.threads) if costs.is_network else (ratio.passes, board.cores)
     match_by = ratio.passes if costs.candidates is None else ratio.products
     return replace(
         costs,
-        encode=_scaled(costs.encode, encode_by, board, threads),
-        match_per_place=_scaled(costs.match_per_place, match_by, board),
-        compare_once=_scaled(costs.compare_once, ratio.products, board),
-        scan_per_place=_scaled(costs.scan_per_place, ratio.passes, board),
-        scan_once=_scaled(costs.scan_once, ratio.passes, board),
+        encode=_scale(costs.encode, encode_by, board, threads),
+        match_per_place=_scale(costs.match_per_place, match_by, board, board.cores),
+        compare_once=_scale(costs.compare_once, ratio.products, board, board.cores),
+        scan_per_place=_scale(costs.scan_per_place, ratio.passes, board, board.cores),
+        scan_once=_scale(costs.scan_once, ratio.passes, board, board.cores),
     )
 
 
 def _speeds(score: MachineSpeed) -> tuple[float | None, float | None]:
-    """Return the speed of one thread at products and at passes, each None if nothing tells it."""
+    """Return the speed of one thread at products and at passes (None: unknown). One that is missing is computed from
+    `arm64_mips` and the instructions counted for that part of the micro-benchmark. Without `arm64_mips`, `single` is
+    used for passes, and a modest share of it for products."""
     products, passes = score.single and UNKNOWN_PRODUCTS * score.single, score.single
     if mips := score.arm64_mips:
         products = 1e6 * mips / float(_counted()["products"]) / REFERENCE_PRODUCTS_HZ
@@ -98,13 +102,13 @@ def _speeds(score: MachineSpeed) -> tuple[float | None, float | None]:
     return score.products or products, score.passes or passes
 
 
-def _scaled(cost: StageCost, ratio: float, board: Board, threads: int | None = None) -> StageCost:
-    """Return the cost of a stage on `board`, where a thread is `ratio` times as fast. `threads`: most threads that the
-    stage may use there (None: as many as the board has cores)."""
+def _scale(cost: StageCost, ratio: float, board: Board, threads: int) -> StageCost:
+    """Return the cost of a stage on `board`, where a thread is `ratio` times as fast and the stage may use at most
+    `threads` threads."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return cost * (1 / ratio)
-    busy_cores = min(busy_cores, board.cores, threads or board.cores)
+    busy_cores = min(busy_cores, board.cores, threads)
     # Cores share memory and current, so that all together may be less than so many times a single one.
     score, together = board.benchmark_score, busy_cores
     if score.single and score.multi:

@@ -7,24 +7,19 @@ another, and a library that crashes on this processor fails only its own trials.
 import ctypes
 import gc
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from itertools import groupby
-from threading import Semaphore
 from typing import Any
 
 from edgevpr import techniques
 from edgevpr.core.child import ask_child, serve_parent
 from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import EdgevprError
-from edgevpr.power import machine
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import weights_of
 
 _TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
-_TRIAL_MB = 1500.0  # of RAM for each that runs beside others; the largest networks take less
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
@@ -53,55 +48,43 @@ def offers(
     """Return the trials to make, not yet made: one for each technique of `names` in each of `forms`, or only one if it
     has no forms or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name,
     ModelError for a card that is incomplete."""
-    listed = []
+    trials = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
         is_one = "form" in own or "form" not in techniques.parameters(name)
-        for each in (own,) if is_one else ({**own, "form": form} for form in forms):
-            listed.append(Trial(label=techniques.labelled(name, each.get("form")), name=name, settings=each))
-    return tuple(listed)
+        for chosen in (own,) if is_one else ({**own, "form": form} for form in forms):
+            trials.append(Trial(label=techniques.labelled(name, chosen.get("form")), name=name, settings=chosen))
+    return tuple(trials)
 
 
 def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
     """Make the `wanted` trials, those of a technique in one child process, and yield each with its result. A technique
-    that cannot be used has one result, labelled with its name. `threads`: number of threads for networks.
-
-    Where cores and RAM allow, several techniques are tried at once, each with its own cores."""
-    at_once = max(1, min(int(machine.cores()) // threads, int(machine.ram_limit_mb() // _TRIAL_MB)))
-    of_each = [list(forms) for _, forms in groupby(wanted, lambda trial: trial.name)]
-    # The next child starts while another is measured: starting takes as long as measuring.
-    pool = ThreadPoolExecutor(at_once + (machine.cores() > 1))
-    try:
-        for trials in pool.map(partial(_tried, threads, Semaphore(at_once)), of_each):
-            yield from trials
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _tried(threads: int, turn: Semaphore, forms: Sequence[Trial]) -> list[Trial]:
-    name = forms[0].name
-    try:
-        job = {"threads": threads, "trials": [asdict(each) for each in forms]}
-        answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}", turn)
-        return [build(Trial, each, "a trial") for each in answer]
-    except EdgevprError as error:
-        return [replace(forms[0], label=name, problem=str(error))]
+    that cannot be used has one result, labelled with its name. `threads`: number of threads for networks."""
+    for name, forms in groupby(wanted, lambda trial: trial.name):
+        trials = list(forms)
+        job = {"threads": threads, "trials": [asdict(trial) for trial in trials]}
+        try:
+            answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}")
+        except EdgevprError as error:
+            yield replace(trials[0], label=name, problem=str(error))
+        else:
+            yield from (build(Trial, tried, "a trial") for tried in answer)
 
 
 def _try_here(job: dict[str, Any]) -> list[dict[str, Any]]:
     tried = []
-    for each in job["trials"]:
-        offer = build(Trial, each, "a trial")
+    for content in job["trials"]:
+        offer = build(Trial, content, "a trial")
         technique = made_for(job["threads"], offer.name, offer.settings)
         costs = probe(technique, tried_s=_TRIED_S)
         spec = technique.spec
-        tried.append(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters))
+        tried.append(asdict(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters)))
         # What a form has taken is given back, or it would be counted for the next one.
         del technique
         gc.collect()
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
             trim(0)
-    return [asdict(each) for each in tried]
+    return tried
 
 
 if __name__ == "__main__":

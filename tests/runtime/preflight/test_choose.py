@@ -14,16 +14,19 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
+from edgevpr.power.equations import Pack
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import (
     Demand,
-    accuracy_of,
-    best,
-    fewer_candidates,
-    nothing_to_choose,
-    options,
-    preferred,
+    check_fit,
+    choose_best,
+    explain_no_choice,
+    find_accuracy,
+    list_fewer_candidates,
+    list_options,
+    list_preferred,
 )
 from edgevpr.runtime.preflight.probe import probe
 
@@ -38,18 +41,18 @@ def accuracies(monkeypatch):
     return table
 
 
-def wanted(board, costs, places, rate_hz=1.0):
-    demand = Demand(places=places, rate_hz=rate_hz, budget_mb=100)
-    return [each for name, cost in costs.items() for each in options(board, name, name, cost, demand)]
+def options_of(board, costs, places):
+    demand = Demand(places=places, rate_hz=1.0, budget_mb=100)
+    return [option for name, cost in costs.items() for option in list_options(board, name, name, cost, demand)]
 
 
-def fit(board, costs, places, rate_hz=1.0, budget_mb=100):
-    return choosing.fit(board, costs, Demand(places=places, rate_hz=rate_hz, budget_mb=budget_mb))
+def fit(board, costs, places, rate_hz=1.0):
+    return check_fit(board, costs, Demand(places=places, rate_hz=rate_hz, budget_mb=100))
 
 
-def chosen(board, costs, places, rate_hz=1.0):
-    taken = best(wanted(board, costs, places, rate_hz), board)
-    return taken and taken.label
+def chosen(board, costs, places):
+    option = choose_best(options_of(board, costs, places), board)
+    return option and option.label
 
 
 def board(**changes):
@@ -82,7 +85,7 @@ class TinyTechnique:
         return FineMatch(float((query.fine * fine).mean()))
 
 
-def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
+def test_probe_tries_a_technique_on_frames_of_a_camera_and_a_map_on_disk():
     technique = TinyTechnique(fine=True)
     costs = probe(technique)
     assert technique.shapes == {((480, 640), np.dtype(np.uint8))}
@@ -93,65 +96,54 @@ def test_a_technique_is_tried_on_frames_of_a_camera_and_a_map_on_disk():
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
 
 
-def test_what_other_programs_take_does_not_count():
+def test_probe_does_not_count_what_other_programs_take():
     technique, now = TinyTechnique(fine=True), {"wall": 0.0, "cpu": 0.0}
     others_s = itertools.cycle([0.9, 0.3, 0.0])
 
-    def slow(image, mask=None):
+    def encode_slowly(image, mask=None):
         now["cpu"] += 0.1
         now["wall"] += 0.1 + next(others_s)
         return TinyTechnique.encode(technique, image, mask)
 
-    technique.encode = slow
-    costs = probe(technique, tried_s=0.2, wall_clock=lambda: now["wall"], cpu_clock=lambda: now["cpu"])
+    technique.encode = encode_slowly
+    clocks = {"wall_clock": lambda: now["wall"], "cpu_clock": lambda: now["cpu"]}
+    costs = probe(technique, tried_s=0.2, meter=QueryMeter(board(), Pack(1, 1), 1.0, **clocks))
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
-def test_the_most_accurate_is_taken_where_it_fits(accuracies):
+def test_choose_best_takes_the_most_accurate_that_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
-    assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "the order says nothing"
+    assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
+    assert chosen(board(), COSTS, places=300) == "vector", "regions are too slow"
+    assert chosen(board(technique="vector"), COSTS, 100) == "vector", "the board's own goes before a better one"
+    of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
+    assert chosen(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
+    del accuracies["regions"]
+    assert chosen(board(), COSTS, 100) == "vector", "what was never measured"
+    assert chosen(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
 
 
-def test_another_is_taken_where_the_most_accurate_is_too_slow(accuracies):
-    assert chosen(board(), COSTS, places=300) == "vector"
-
-
-def test_fewer_candidates_come_before_another_technique(accuracies):
+def test_choose_best_takes_fewer_candidates_before_another_technique(accuracies):
     two_stages = {**COSTS, "regions": dataclasses.replace(REGIONS, candidates=400)}
     assert chosen(board(), two_stages, places=200) == "regions"
     assert chosen(board(), two_stages, places=300) == "regions, 10 candidates"
-    assert [each.label for each in wanted(board(), COSTS, 300)] == ["regions", "vector"], "one stage has no candidates"
+    assert [option.label for option in options_of(board(), COSTS, 300)] == ["regions", "vector"], "of one stage"
     few = {"regions": dataclasses.replace(REGIONS, candidates=10)}
-    assert [each.label for each in wanted(board(), few, 300)] == ["regions"], "ten are no fewer"
+    assert [option.label for option in options_of(board(), few, 300)] == ["regions"], "ten are no fewer"
 
 
-def test_what_has_accepted_wrong_places_is_never_chosen_by_itself(accuracies):
+def test_choose_best_never_takes_what_has_accepted_wrong_places(accuracies):
     accuracies["regions"] = found(0.9, wrong=1)
     assert chosen(board(), COSTS, 100) == "vector"
     assert chosen(board(technique="regions"), COSTS, 100) == "vector"
     accuracies["vector"] = found(0.5, wrong=2)
     assert chosen(board(), COSTS, 100) is None
-    why = nothing_to_choose(wanted(board(), COSTS, 100), board())
+    why = explain_no_choice(options_of(board(), COSTS, 100), board())
     assert "regions accepted 1 " in why
     assert "vector accepted 2 " in why
 
 
-def test_what_was_never_measured_is_chosen_only_where_the_board_names_it(accuracies):
-    del accuracies["regions"]
-    assert chosen(board(), COSTS, 100) == "vector"
-    assert chosen(board(technique="regions"), COSTS, 100) == "regions"
-
-
-def test_a_sequence_is_not_chosen_by_itself(accuracies):
-    of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
-    assert chosen(board(), of_ten, 100) == "vector"
-
-
-def test_the_boards_own_technique_goes_before_a_better_one(accuracies):
-    assert chosen(board(technique="vector"), COSTS, 100) == "vector"
-
-
-def test_a_large_map_is_scanned_whole_and_compared_in_part_and_a_query_is_prepared_once():
+def test_match_scans_a_large_map_whole_and_compares_a_part_of_it():
     two_stages = dataclasses.replace(
         REGIONS, candidates=20, scan_per_place=StageCost(1e-6, 1e-6), scan_once=StageCost(0.03, 0.03)
     )
@@ -162,24 +154,31 @@ def test_a_large_map_is_scanned_whole_and_compared_in_part_and_a_query_is_prepar
         assert turned.match(places).wall_s == pytest.approx(0.03 + 0.004 * compared + 1e-6 * places)
 
 
-def test_the_whole_map_counts_in_ram_and_only_its_candidates_in_time():
+def test_check_fit_counts_the_whole_map_in_ram_and_its_candidates_in_time():
     two_stages = dataclasses.replace(REGIONS, candidates=20)
-    fitting = fit(board(), two_stages, places=50_000, rate_hz=1, budget_mb=100)
+    fitting = fit(board(), two_stages, places=50_000)
     assert not fitting.misfit
     assert fitting.map_ram_mb == pytest.approx(50.0)
     assert fitting.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
-    assert not fit(board(), two_stages, 100_000, 1, 100).misfit
-    assert "RAM" in fit(board(), two_stages, 100_100, 1, 100).misfit
+    assert not fit(board(), two_stages, 100_000).misfit
+    assert "RAM" in fit(board(), two_stages, 100_100).misfit
 
 
-def test_the_cpu_share_limits_a_technique_that_keeps_all_cores_busy():
+def test_check_fit_limits_a_technique_that_keeps_all_cores_busy_by_the_cpu_share():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
-    assert fit(board(cpu_share=1.0), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.2)
-    assert fit(board(cpu_share=0.25), four_threads, 100, 1, 100).reachable_hz == pytest.approx(1 / 0.8)
+    assert fit(board(cpu_share=1.0), four_threads, 100).reachable_hz == pytest.approx(1 / 0.2)
+    assert fit(board(cpu_share=0.25), four_threads, 100).reachable_hz == pytest.approx(1 / 0.8)
+
+
+def test_check_fit_refuses_any_rate_where_no_fix_could_be_sent_in_time():
+    slow = fit(board(), REGIONS, places=1300, rate_hz=0.1)
+    assert slow.t_query_s == pytest.approx(5.3)
+    assert slow.misfit == f"does not fit: {choosing.too_late(5.3)}"
+    assert not fit(board(), REGIONS, places=1225, rate_hz=0.1).misfit
 
 
 @pytest.mark.slow
-def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(monkeypatch, caplog, accuracies):
+def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, caplog, accuracies):
     accuracies["cohog"] = found(0.9)
     really = pick.made_for
 
@@ -195,21 +194,16 @@ def test_a_network_that_the_board_wants_and_that_is_not_there_is_passed_over(mon
     assert any("netvlad" in message for message in caplog.messages)
 
 
-def test_where_no_fix_could_be_sent_in_time_it_does_not_fit_at_any_rate():
-    slow = fit(board(), REGIONS, places=1300, rate_hz=0.1, budget_mb=100)
-    assert slow.t_query_s == pytest.approx(5.3)
-    assert slow.misfit == f"does not fit: {choosing.too_late(5.3)}"
-    assert not fit(board(), REGIONS, places=1225, rate_hz=0.1, budget_mb=100).misfit
+def test_list_preferred_begins_with_the_boards_own_technique():
+    assert list_preferred(board(technique=None)) == techniques.AUTOMATIC
+    assert list_preferred(board(technique="seqslam")) == ("seqslam", *techniques.AUTOMATIC)
+    assert list_preferred(board(technique="hog"), "forward") == ("hog", "cohog")
+    assert (
+        list_preferred(board(technique="hog"), "nadir") == list_preferred(board(technique=None), "nadir") == ("cohog",)
+    )
 
 
-def test_the_boards_own_technique_is_tried_first_and_only_what_can_be_told_that_the_camera_looks_down():
-    assert preferred(board(technique=None)) == techniques.AUTOMATIC
-    assert preferred(board(technique="seqslam")) == ("seqslam", *techniques.AUTOMATIC)
-    assert preferred(board(technique="hog"), "forward") == ("hog", "cohog")
-    assert preferred(board(technique="hog"), "nadir") == preferred(board(technique=None), "nadir") == ("cohog",)
-
-
-def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_what_it_lacks(monkeypatch, caplog):
+def test_picked_technique_is_the_best_where_nothing_fits_and_the_log_says_why(monkeypatch, caplog):
     slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
     monkeypatch.setattr(pick, "probe", lambda technique: slow)
     for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
@@ -221,16 +215,16 @@ def test_where_nothing_fits_the_best_is_picked_all_the_same_and_the_log_says_wha
     assert choosing.too_late(30.0) in said[0]
 
 
-def test_the_figures_that_travel_are_those_of_the_results():
-    assert fewer_candidates("cohog", "nadir") == fewer_candidates("cohog", None) == (20, 10)
+def test_find_accuracy_gives_the_figures_of_the_results():
+    assert list_fewer_candidates("cohog", "nadir") == list_fewer_candidates("cohog", None) == (20, 10)
     for camera in ("forward", "nadir"):
         for name in ("cohog", "hog 1bit", "seqslam", "netvlad 8bit"):
-            assert accuracy_of(name, camera).queries > 50
-        assert not accuracy_of("cohog", camera).accepted_elsewhere
+            assert find_accuracy(name, camera).queries > 50
+        assert not find_accuracy("cohog", camera).accepted_elsewhere
     results = Path(__file__).parents[3] / "benchmarks" / "results"
     recalls = []
     for name in ("grief_stromovka_seasons", "nordland_tiny"):
         table = json.loads((results / f"{name}.json").read_text())["rows"]
         rows = {row[0]: dict(zip(table["columns"], row, strict=True)) for row in table["rows"]}
         recalls.append(rows["cohog"]["recall_at_1"])
-    assert accuracy_of("cohog", "forward").recall_at_1 == pytest.approx(sum(recalls) / 2, abs=1e-4)
+    assert find_accuracy("cohog", "forward").recall_at_1 == pytest.approx(sum(recalls) / 2, abs=1e-4)

@@ -39,7 +39,7 @@ def estimate(board, here, costs, plan):
     return estimate_of(board, here, trials(costs), plan)
 
 
-def test_a_flight_on_the_board_itself_by_hand():
+def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     regions, vector = estimate(PI, PI, COSTS, PLAN).techniques
     fit, query = regions.option.fit, regions.query
     assert (regions.option.label, fit.misfit, vector.option.fit.misfit) == ("regions", None, None)
@@ -58,7 +58,7 @@ def test_a_flight_on_the_board_itself_by_hand():
     assert regions.flight_pack_frac == pytest.approx(regions.flight_mah / 5200)
 
 
-def test_a_rate_out_of_reach_is_not_charged_for():
+def test_estimate_charges_no_rate_that_is_out_of_reach():
     fast = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(PI, PI, COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
     assert fast.option.fit.misfit
@@ -80,26 +80,20 @@ THESIS, ODROID = load_board("thesis-xeon"), load_board("odroid-xu4")
         (ZERO, ZERO, "measured", ("The power of Raspberry Pi Zero 2 W is unverified",)),
     ],
 )
-def test_how_far_the_figures_can_be_believed_is_said(board, here, times, notes):
+def test_estimate_notes_how_far_figures_can_be_trusted(board, here, times, notes):
     estimated = estimate(board, here, COSTS, PLAN)
     assert estimated.times == times
     assert all(part in note for part, note in zip((*notes, "--hover-w"), estimated.notes, strict=True))
 
 
-def test_the_times_of_another_board_are_scaled_by_the_ratios():
+def test_estimate_scales_the_times_of_another_board_by_the_ratios():
     estimated = estimate(PI, HERE, COSTS, PLAN)
     assert estimated.techniques[0].query.t_encode_s == pytest.approx(0.1 / estimated.ratios.passes)
     assert estimated.ratios.products == 0.056
     assert estimate(THESIS, PI, COSTS, PLAN).techniques[0].query.t_encode_s == 0.1
 
 
-def test_cohog_on_an_arm_board_does_not_depend_on_how_fast_this_machine_is():
-    slow = replace(COSTS["regions"], encode=StageCost(9.0, 9.0))
-    quick, slowed = (estimate(PI, HERE, {"cohog": costs}, PLAN).techniques[0] for costs in (COSTS["regions"], slow))
-    assert quick.query.t_encode_s == slowed.query.t_encode_s < 0.05
-
-
-def test_minutes_lost_by_hand():
+def test_estimate_of_minutes_lost_by_hand():
     estimated = estimate(PI, PI, COSTS, replace(PLAN, hover_w=180.0))
     regions = estimated.techniques[0]
     pack_wh, idle_w, marginal_w = 14.8 * 5.2, 2.29 / 0.85, 4.53 * 0.25 * 0.5 / 0.85
@@ -111,21 +105,15 @@ def test_minutes_lost_by_hand():
     assert longer.lost_min == pytest.approx(regions.lost_min), "it is power that counts, not how long was planned"
 
 
-FORMS = {
-    "cohog": COSTS["regions"],
-    "hog": COSTS["vector"],
-    "hog 1bit": replace(COSTS["vector"], ram_bytes_per_place=17_900),
-}
-
-
-def test_the_most_accurate_that_fits_is_recommended_and_why():
-    estimated = estimate(replace(PI, technique=None), PI, FORMS, PLAN)
+def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
+    forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
+    estimated = estimate(replace(PI, technique=None), PI, forms, PLAN)
     assert estimated.recommended == "cohog"
     assert estimated.reason.startswith("cohog: nothing that fits finds more: recall@1 0.90 on 2 image sets")
     assert estimate(PI, PI, {"netvlad": VECTOR}, PLAN).recommended is None
 
 
-def test_what_cannot_be_used_is_kept_beside():
+def test_estimate_lists_what_cannot_be_used():
     broken = Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
     estimated = estimate_of(PI, PI, [*trials({"cohog": COSTS["regions"]}), broken], PLAN)
     assert estimated.unusable == {"calc": "There is no model `calc`."}

@@ -31,21 +31,21 @@ def outlook_at(recording, monkeypatch):
     return found
 
 
-def test_a_board_that_affords_it_compares_as_many_candidates_as_usual(outlook_at):
+def test_outlook_keeps_the_candidates_that_a_board_affords(outlook_at):
     found = outlook_at(1.0)
     assert (found.candidates, found.t_query_s) == (42, pytest.approx(0.52))
     assert "; recall@1 " in found.reason
     assert "instead" not in found.reason
 
 
-def test_a_slower_board_compares_fewer_and_says_so(outlook_at):
+def test_outlook_takes_fewer_candidates_for_a_slower_board(outlook_at):
     found = outlook_at(3.0)
     assert (found.candidates, found.t_query_s) == (20, pytest.approx(0.3))
     assert "; 20 candidates instead " in found.reason
     assert " 3.3 Hz " in found.reason
 
 
-def test_what_the_configuration_says_is_kept_and_so_is_what_nothing_helps(outlook_at):
+def test_outlook_keeps_what_is_configured_and_what_nothing_helps(outlook_at):
     assert outlook_at(3.0, **{"match.candidates": 42}).candidates == 42
     assert outlook_at(3.0, **{"match.sequence": 3}).candidates == 42
     hopeless = outlook_at(3.0, replace(COSTS, encode=StageCost(2.0, 2.0)))
@@ -53,15 +53,15 @@ def test_what_the_configuration_says_is_kept_and_so_is_what_nothing_helps(outloo
     assert "0.41 Hz" in hopeless.reason
 
 
-def test_only_numbers_that_accepted_nothing_wrong_are_for_the_governor(recording, monkeypatch):
+def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):
     config = load_config(None, {"map": str(recording / "cohog.gpkg")})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
         assert trusted_candidates(recogniser.technique) == (20, 10)
-        measured = pick.accuracy_of
+        measured = pick.find_accuracy
         with monkeypatch.context() as changed:
             wrong = replace(measured("cohog", "forward", 10), accepted_elsewhere=1)
-            changed.setattr(pick, "accuracy_of", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
+            changed.setattr(pick, "find_accuracy", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
             assert trusted_candidates(recogniser.technique) == (20,)
     config = load_config(None, {"map": str(recording / "cohog.gpkg"), "match.matching": "thesis"})
     recogniser = open_recogniser(config, load_board("this"))

@@ -11,7 +11,8 @@ from example_costs import VECTOR
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ
-from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios
+from edgevpr.runtime.preflight import scale
+from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios, with_comparable_score
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
@@ -27,7 +28,7 @@ def scored(single=None, multi=None, products=None, passes=None, **changes):
     )
 
 
-def test_products_and_passes_are_scaled_apart_and_memory_is_not():
+def test_on_board_scales_products_and_passes_apart_and_no_memory():
     there = scored(single=0.4, products=0.05, passes=0.2)
     scaled = on_board(REGIONS, HERE, there)
     assert scaled.encode == StageCost(pytest.approx(0.1 / 0.2), pytest.approx(0.1 / 0.2))
@@ -36,14 +37,14 @@ def test_products_and_passes_are_scaled_apart_and_memory_is_not():
     assert (scaled.ram_bytes_per_place, scaled.process_mb) == (1_000, 90.0)
 
 
-def test_a_network_is_products_and_a_scan_of_vectors_is_passes():
+def test_on_board_takes_networks_as_products_and_scans_of_vectors_as_passes():
     there = scored(single=0.4, products=0.05, passes=0.2)
     assert on_board(replace(VECTOR, is_network=True), HERE, there).encode.wall_s == pytest.approx(0.05 / 0.05)
     assert on_board(VECTOR, HERE, there).encode.wall_s == pytest.approx(0.05 / 0.2)
     assert on_board(VECTOR, HERE, there).match_per_place.wall_s == pytest.approx(0.001 / 0.2)
 
 
-def test_what_is_not_known_apart_of_an_arm_board_is_by_the_instructions_that_were_counted():
+def test_ratios_of_an_arm_board_follow_from_the_counted_instructions():
     assert ratios(HERE, PI).products == PI.benchmark_score.products
     passes_hz = 1e6 * PI.benchmark_score.arm64_mips / counted_parts()["micro-benchmark: a round of passes"]
     assert ratios(HERE, PI).passes == pytest.approx(passes_hz / REFERENCE_PASSES_HZ, rel=1e-6)
@@ -53,7 +54,7 @@ def test_what_is_not_known_apart_of_an_arm_board_is_by_the_instructions_that_wer
         assert ratios(HERE, alone).products == pytest.approx(score.products, rel=0.3)
 
 
-def test_counted_work_takes_its_instructions_whatever_was_measured_here():
+def test_on_board_takes_counted_instructions_whatever_was_measured_here():
     work = counted_work("cohog", {"camera": "nadir"})
     there = on_board(REGIONS, HERE, PI, work)
     parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
@@ -65,7 +66,7 @@ def test_counted_work_takes_its_instructions_whatever_was_measured_here():
     assert on_board(REGIONS, HERE, scored(single=0.4), work) == on_board(REGIONS, HERE, scored(single=0.4))
 
 
-def test_only_what_was_counted_is_known():
+def test_counted_work_is_known_only_of_what_was_counted():
     assert counted_work("cohog", {}) == counted_work("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
     assert counted_work("cohog", {"w1": 256}) is None
     assert counted_work("cohog", {"matching": "thesis"}) is None
@@ -77,13 +78,16 @@ def counted_parts():
     return {row["part"]: row["instructions"] for row in json.loads(results.read_text())["parts"]}
 
 
-def test_more_busy_cores_than_the_board_has_take_longer():
+def test_on_board_takes_longer_with_fewer_cores():
     eight_threads = replace(REGIONS, encode=StageCost(0.1, 0.8))
     scaled = on_board(eight_threads, HERE, scored(single=0.4, cores=2)).encode
     assert scaled == StageCost(pytest.approx(0.1 / 0.4 * 4), pytest.approx(0.8 / 0.4))
+    network = replace(VECTOR, encode=StageCost(0.1, 0.8), is_network=True)
+    two = on_board(network, HERE, scored(single=0.4, products=0.4, cores=4, threads=2)).encode
+    assert two == StageCost(pytest.approx(0.8 / 0.4 / 2), pytest.approx(0.8 / 0.4)), "as many as the board gives it"
 
 
-def test_busy_cores_slow_each_other_down_as_the_score_of_all_says():
+def test_on_board_slows_busy_cores_down_as_the_score_of_all_says():
     four_threads = replace(REGIONS, encode=StageCost(0.1, 0.4))
     alone = on_board(four_threads, HERE, scored(single=0.4, cores=4)).encode
     together = on_board(four_threads, HERE, scored(single=0.4, multi=0.8, cores=4)).encode
@@ -94,20 +98,14 @@ def test_busy_cores_slow_each_other_down_as_the_score_of_all_says():
     assert one_thread.wall_s == pytest.approx(0.1 / 0.4)
 
 
-def test_a_network_keeps_no_more_cores_busy_than_the_board_gives_it():
-    eight_threads = replace(VECTOR, encode=StageCost(0.1, 0.8), is_network=True)
-    two = on_board(eight_threads, HERE, scored(single=0.4, products=0.4, cores=4, threads=2)).encode
-    assert two == StageCost(pytest.approx(0.8 / 0.4 / 2), pytest.approx(0.8 / 0.4))
-
-
-def test_an_unknown_speed_leaves_the_times_as_they_are():
+def test_on_board_leaves_times_unchanged_where_a_speed_is_unknown():
     there = load_board("thesis-xeon")
     assert ratios(HERE, there) is None
     assert ratios(there, HERE) is None
     assert on_board(REGIONS, HERE, there) == REGIONS
 
 
-def test_a_profile_written_on_this_machine_is_this_machine():
+def test_is_same_for_a_profile_that_was_written_on_this_machine():
     here = replace(HERE, machine="a box (N100)")
     mine = scored(name="mine", machine="a box (N100)")
     assert is_same(here, mine)
@@ -115,3 +113,13 @@ def test_a_profile_written_on_this_machine_is_this_machine():
     assert on_board(REGIONS, here, mine) == REGIONS
     assert not is_same(here, scored(name="mine", machine="a box (N5105)"))
     assert not is_same(replace(here, machine=None), scored(name="mine"))
+
+
+def test_with_comparable_score_measures_unless_both_are_published(monkeypatch):
+    score = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="micro-benchmark")
+    monkeypatch.setattr(scale, "micro_benchmark", lambda: score)
+    other = load_board("rpi-5")
+    assert with_comparable_score(HERE, PI).benchmark_score == score
+    assert with_comparable_score(PI, other) == PI, "7-zip beside 7-zip"
+    assert with_comparable_score(PI, replace(other, benchmark_score=score)).benchmark_score == score
+    assert with_comparable_score(HERE, HERE) == HERE
