@@ -117,19 +117,44 @@ def evaluate(
 
 
 def answer_queries(
-    technique: Technique,
-    dataset: Dataset,
-    options: MatchOptions,
-    progress: Progress,
-    gate: Gate | None = None,
+    technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: Gate | None = None
 ) -> list[QueryAnswer]:
-    """Map the references of `dataset` in a temporary file, ask every query, and return the judged answers. Raises
-    UsageError where no query has what `options.known` asks for."""
-    known_of(options.known, dataset, technique.spec, options.sequence)  # raises before the map is made
+    """Map the references of `dataset` in a temporary file, ask every query, and return one judged answer for each that
+    is scored. Raises UsageError where no query has what `options.known` asks for, ModelError for a query that fails."""
+    spec = technique.spec
+    prior, tags = known_of(options.known, dataset, spec, options.sequence)
+    together = length_of(spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), meter_of(load_config(None), load_board("this"))
-    frames = progress(read_frames(source), source.total, f"{technique.spec.name}: references")
-    with mapped(frames, technique, meter, dataset.ref_dir, progress) as opened:
-        return ask_queries(technique, opened, meter, dataset, options, gate, progress)
+    frames = progress(read_frames(source), source.total, f"{spec.name}: references")
+    with mapped(frames, technique, meter, dataset.ref_dir, progress) as (place_map, index):
+        rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
+        follows = options.follow and together == 1 and rule.sure is not None
+
+        def open_recogniser(length: int, follows: bool) -> Recogniser:
+            return Recogniser(
+                Matcher(technique, index, rule, search_of(length)),
+                place_map,
+                meter,
+                WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
+                preparation=Preparation(gate=gate),
+                prior=prior,
+                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
+            )
+
+        scored = {query.path.name: query for query in dataset.queries}
+        paths = [query.path for query in dataset.queries]
+        # One query is not counted: the first pays for lazy imports and a cold disk.
+        _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
+        if gate:
+            gate.forget()
+        if together > 1 or follows:  # those that are not scored are part of a sequence as well
+            paths = list_images(paths[0].parent)
+        recogniser, answers = open_recogniser(together, follows), []
+        for path in progress(paths, len(paths), f"{spec.name}: queries"):
+            event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
+            if query := scored.get(path.name):
+                answers.append(_judge(event, query, dataset.references, index))
+    return answers
 
 
 @contextmanager
@@ -221,50 +246,6 @@ def known_of(
     )
     map_height_m = float(np.median(map_heights_m)) if query_heights_m and map_heights_m else None
     return Told(parts, spec.heading_within_deg, map_height_m), queries
-
-
-def ask_queries(
-    technique: Technique,
-    opened: tuple[PlaceMap, PlaceIndex],
-    meter: QueryMeter,
-    dataset: Dataset,
-    options: MatchOptions,
-    gate: Gate | None,
-    progress: Progress,
-) -> list[QueryAnswer]:
-    """Ask all queries of `dataset` on an open map with its index, and return one judged answer for each that is scored.
-    Raises UsageError where no query has what `options.known` asks for, and ModelError for a query that fails."""
-    place_map, index = opened
-    prior, tags = known_of(options.known, dataset, technique.spec, options.sequence)
-    together = length_of(technique.spec, options.sequence)
-    rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
-    follows = options.follow and together == 1 and rule.sure is not None
-
-    def open_recogniser(length: int, follows: bool) -> Recogniser:
-        return Recogniser(
-            Matcher(technique, index, rule, search_of(length)),
-            place_map,
-            meter,
-            WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
-            preparation=Preparation(gate=gate),
-            prior=prior,
-            follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
-        )
-
-    scored = {query.path.name: query for query in dataset.queries}
-    paths = [query.path for query in dataset.queries]
-    # One query is not counted: the first pays for lazy imports and a cold disk.
-    _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
-    if gate:
-        gate.forget()
-    if together > 1 or follows:  # those that are not scored are part of a sequence as well
-        paths = list_images(paths[0].parent)
-    recogniser, answers = open_recogniser(together, follows), []
-    for path in progress(paths, len(paths), f"{technique.spec.name}: queries"):
-        event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
-        if query := scored.get(path.name):
-            answers.append(_judge(event, query, dataset.references, index))
-    return answers
 
 
 def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:

@@ -86,16 +86,10 @@ def disk_bytes(spec: TechniqueSpec) -> int:
     return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MOST_LANDMARK_BYTES if spec.cells else 0)
 
 
-def noise(count: int) -> list[Image]:
-    """Return `count` random pictures, uint8 (480, 640). Every region has structure, so that matching costs the most it
-    can."""
-    rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
-    return [np.frombuffer(rng.randbytes(480 * 640), np.uint8).reshape(480, 640) for _ in range(count)]
-
-
 def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
-    """Measure the costs of a technique on this machine. Pictures of `noise` go through the steps of a query, first with
-    an empty map, then with a small map on disk, then with a large index.
+    """Measure the costs of a technique on this machine. Pictures of noise, whose every region has structure and so
+    costs the most to match, go through the steps of a query, first with an empty map, then with a small map on disk,
+    then with a large index.
 
     Each picture is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of
     other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
@@ -150,7 +144,9 @@ class _Bench:
     def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
         self.sequence = length_of(technique.spec, None)
         self._technique, self._meter, self._tried_s = technique, meter, tried_s
-        self._images = noise(_PICTURES)
+        rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
+        pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_PICTURES)]
+        self._images = [picture.reshape(480, 640) for picture in pictures]
 
     def fill(self, trial_map: PlaceMap) -> None:
         """Add the trial's places to a map, all of them copies of the first picture."""
