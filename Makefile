@@ -99,7 +99,6 @@ never-worse: $(VENV)/installed
 from-space: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/from_space.py
-	$(BIN)/python benchmarks/seams.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build site

@@ -12,7 +12,7 @@ _HARD = 0.6
 _MOST_GREY = 40.0  # of a step, so that a few large ones do not make a line
 _BESIDE_PX = 21
 # Grey values. Pictures from space have 6 at most, mosaics of two days 11 to 33. 5 of 405 pictures of drones have more
-# than this (benchmarks/results/seams.md).
+# than this (measured in November 2026 by a script that is no longer in the repository).
 _LEAST_GREY = 12.0
 
 
