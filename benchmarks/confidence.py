@@ -29,10 +29,10 @@ from shipped_model import FittedSite, shipped_model
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
-from edgevpr.runtime.recognise.confidence import Evidence, Model
-from edgevpr.runtime.recognise.evidence import AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE, FEWEST_PLACES, kind_of
-from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.confidence import Model
+from edgevpr.runtime.recognise.evidence import AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE, FEWEST_PLACES, Evidence
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
 
 PRECISIONS = (0.9, 0.99, 0.999)
 KINDS = {"forward": (AHEAD, AHEAD_PROVEN), "nadir": (DOWN, DOWN_BARE)}
@@ -89,8 +89,9 @@ def _read(path: Path) -> list[Row]:
     """Read gathered rows. A best place that was not worth a look at its landmarks has none that agree."""
     rows = pickle.loads(path.read_bytes())
     if camera_of(path.stem) == "nadir":
-        for row in rows:
-            row.evidence.setdefault("landmarks", 0.0)
+        for number, row in enumerate(rows):
+            if row.evidence.landmarks is None:
+                rows[number] = replace(row, evidence=replace(row.evidence, landmarks=0.0))
     return rows
 
 
@@ -146,13 +147,13 @@ def _sure(models: Models, row: Row) -> float:
 def _accepted(models: Models, row: Row, precision: float) -> bool:
     sure = Sureness(models, precision)
     return row.veto is None and any(
-        sure.confidence(each) >= models[kind_of(each)].threshold(precision) for each in _looks(row)
+        sure.confidence(each) >= models[each.kind].threshold(precision) for each in _looks(row)
     )
 
 
 def _looks(row: Row) -> tuple[Evidence, Evidence]:
     """Return the evidence of a row before landmarks are compared, ahead, and all of it: both can make a match sure."""
-    return {**row.evidence, "proof": 0.0}, row.evidence
+    return replace(row.evidence, proof=0.0), row.evidence
 
 
 def followed(name: str, models: dict[str, Models]) -> base.Row:
@@ -179,8 +180,8 @@ def followed(name: str, models: dict[str, Models]) -> base.Row:
         for way, paths in ways.items():
             counts = {}
             for mode in ("alone", "followed"):
-                follower = Follower(place_map, fastest_m_s=None, is_live=False) if mode == "followed" else None
-                walk = walks.walk(place_map, index, technique, rule=rule, follower=follower)
+                place_filter = PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if mode == "followed" else None
+                walk = walks.walk(place_map, index, technique, rule=rule, place_filter=place_filter)
                 counts[mode] = {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
                 for path in paths:
                     event, query = walk.step(walks.frame(path)), truth.get(path.name) if path in own else None

@@ -18,6 +18,7 @@ from edgevpr.lab.evaluate.dataset import ScoredQuery
 from edgevpr.mapmaking.calibrate import ask, asked_of
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import elsewhere
+from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.judge import accept_rule
 
 # Sets of the same ground are one site.
@@ -38,7 +39,7 @@ class Row:
     right: bool
     near: bool
     score: float
-    evidence: dict[str, float]
+    evidence: Evidence
     veto: str | None = None
 
 
@@ -88,7 +89,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                     right=kind == "right",
                     near=kind == "beside",
                     score=event.best.match.score,
-                    evidence=dict(event.evidence),
+                    evidence=event.evidence,
                     veto=event.reason if refused else None,
                 )
         if technique.spec.looks_down and np.isnan(index.lat_deg).any():
@@ -100,7 +101,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
         pictures = ((ids[frame.name], Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
         for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):
             if answer.evidence is not None:
-                told = {"kind": answer.way, "right": answer.right, "evidence": dict(answer.evidence)}
+                told = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}
                 yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **told)
 
 

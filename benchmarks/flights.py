@@ -48,10 +48,10 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import search_of
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.evidence import calibration_of
-from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import open_recogniser
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -89,7 +89,7 @@ def _recogniser(
         search=search_of(length),
         prior=Prior(reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
-        follower=Follower(place_map, fastest_m_s=reach_m_s, is_live=True) if follows else None,
+        place_filter=PlaceFilter(place_map, max_speed_m_s=reach_m_s, is_live=True) if follows else None,
     )
 
 

@@ -22,7 +22,8 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.opening import meter_of, open_learning, open_recogniser
+from edgevpr.runtime.recognise.encoder import FrameEncoder
+from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
@@ -95,7 +96,7 @@ def make_whole_map(path: Path) -> Path:
     """Make the map that is damaged: a few places of random pictures, small and quick."""
     technique = create("cohog", {"w1": 208})
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(_frame, range(_PLACES)), technique, place_map, meter_of(load_config(None), _BOARD))
+        build_map(map(_frame, range(_PLACES)), FrameEncoder(technique=technique), place_map)
     return path
 
 

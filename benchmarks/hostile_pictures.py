@@ -25,6 +25,7 @@ from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -58,7 +59,7 @@ def mapped(folder: Path, temporary: Path, draw: Draw | None = None) -> Recognise
     technique, frames = walks.cohog(camera), walks.frames_of(folder / "ref")
     with PlaceMap.create(path, technique.spec) as place_map:
         drawn = (replace(frame, image=draw(frame.image)) for frame in frames) if draw else frames
-        build_map(drawn, technique, place_map, walks.meter())
+        build_map(drawn, FrameEncoder(technique=technique), place_map)
     return open_recogniser(walks.config(map=str(path), **{"source.camera": camera}), load_board("this"))
 
 

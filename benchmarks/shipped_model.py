@@ -8,9 +8,8 @@ from datetime import date
 import numpy as np
 
 from edgevpr.mapmaking.calibrate import MapAnswer, adapted, evidence_matrix, fitted
-from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, Scale, Tail
-from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
-from edgevpr.runtime.recognise.judge import leads
+from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
+from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
 
 _PULL = 0.3
 # Parts of the wrong matches that are the tail. With .3 of those of a site itself, the draw of the pictures that a map
@@ -63,7 +62,7 @@ def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model
 
 def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
     groups = [(rows, right) for rows, right in groups if len(rows)]
-    rows = [row for group, _ in groups for row in group]
+    rows = [row.figures() for group, _ in groups for row in group]
     right = np.concatenate([np.full(len(group), each) for group, each in groups])
     weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
     scales = np.maximum(evidence_matrix(rows, names).std(0), 1e-3)
@@ -76,19 +75,19 @@ def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
     is in no tail of `off_place`."""
     foreign = [(model, evidence) for site, model in sites for evidence in site.foreign]
     own = [(model, evidence, right) for site, model in sites for evidence, right in site.own]
-    wrong = [(model, evidence) for model, evidence, right in own if not right and leads(evidence)]
+    wrong = [(model, evidence) for model, evidence, right in own if not right and evidence.leads]
     count, part = len(own), _OFF_PLACE
     if len(wrong) < _FEWEST_WRONG:  # ground of other sites stands in for ground that looks alike
-        wrong = [(model, evidence) for model, evidence in foreign if leads(evidence)]
+        wrong = [(model, evidence) for model, evidence in foreign if evidence.leads]
         count, part = len(foreign), _STAND_IN
-    off_map = _tail([model.of_map.logit(evidence) for model, evidence in foreign], len(foreign), _OFF_MAP)
-    off_place = _tail([model.of_place.logit(evidence) for model, evidence in wrong], count, part)
+    off_map = _tail([model.of_map.logit(evidence.figures()) for model, evidence in foreign], len(foreign), _OFF_MAP)
+    off_place = _tail([model.of_place.logit(evidence.figures()) for model, evidence in wrong], count, part)
     scale = Scale(off_map, off_place, 1.0, 0.0)
     rows, right, weights = [], [], []
     for site, model in sites:
         model = replace(model, scale=scale)
         for group in (site.own, [(evidence, False) for evidence in site.foreign]):
-            rows += [{"log_chance": -math.log(max(model.chance(evidence), 1e-15))} for evidence, _ in group]
+            rows += [{"log_chance": -math.log(max(model.chance(evidence.figures()), 1e-15))} for evidence, _ in group]
             right += [each for _, each in group]
             weights += [_EACH / len(group)] * len(group)
     line = fitted(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)

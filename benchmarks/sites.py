@@ -38,6 +38,7 @@ from edgevpr.places.examine import examine
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 SIZES = (50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
@@ -114,7 +115,7 @@ def _build(camera: str) -> None:
     dataset, technique = dataset_of(camera), walks.cohog(camera)
     strangers = foreign(camera, max(SIZES) - len(dataset.references), base.DATA, folders_of(camera))
     with PlaceMap.create(unfinished, technique.spec) as place_map:
-        build_map(chain(walks.frames_of(dataset.ref_dir), strangers), technique, place_map, walks.meter())
+        build_map(chain(walks.frames_of(dataset.ref_dir), strangers), FrameEncoder(technique=technique), place_map)
     unfinished.rename(path)
 
 

@@ -20,12 +20,13 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
@@ -66,7 +67,7 @@ def map_of(
     """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
     `map build` does where `images` names their folder, from which pictures are read again."""
     technique = technique or cohog(base.camera_of(folder.name))
-    with mapped(frames_of(folder / "ref"), technique, meter(), images) as (place_map, index):
+    with mapped(frames_of(folder / "ref"), technique, images) as (place_map, index):
         yield place_map, index, technique
 
 
@@ -89,8 +90,8 @@ def walk(
     settings = WalkSettings(
         candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
     )
-    matcher, preparation = Matcher(technique, index, rule, search), Preparation(levelling=levelling)
-    return Recogniser(matcher, place_map, meter(), settings, preparation=preparation, **more)
+    encoder = FrameEncoder(technique=technique, levelling=levelling)
+    return Recogniser(encoder, place_map, Matcher(index, rule, search), meter(), settings, **more)
 
 
 def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
@@ -111,5 +112,5 @@ def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
 def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
     """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
-    with mapped(map(frame, places), technique, meter()) as (place_map, index):
+    with mapped(map(frame, places), technique) as (place_map, index):
         yield walk(place_map, index, technique, rule=ACCEPT_NOTHING)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Evidence
+from edgevpr.runtime.recognise.confidence import Figures
 from edgevpr.runtime.recognise.evidence import OF_MAP
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness
 
@@ -18,11 +18,11 @@ NEEDED = 0.9
 class Told:
     """A model of confidence that is told what to say of evidence; a match that is wrong is then of no place at all."""
 
-    confidence: Callable[[Evidence], float]
-    of_map: Callable[[Evidence], float] | None = None
+    confidence: Callable[[Figures], float]
+    of_map: Callable[[Figures], float] | None = None
     needed: float = NEEDED
 
-    def confidence_of_map(self, evidence: Evidence) -> float:
+    def confidence_of_map(self, evidence: Figures) -> float:
         return (self.of_map or self.confidence)(evidence)
 
     def threshold(self, precision: float) -> float:
@@ -30,15 +30,15 @@ class Told:
 
 
 def told(
-    confidence: Callable[[Evidence], float],
-    of_map: Callable[[Evidence], float] | None = None,
+    confidence: Callable[[Figures], float],
+    of_map: Callable[[Figures], float] | None = None,
     needed: float = NEEDED,
 ) -> Sureness:
     """The decision by a confidence that is told what to say."""
     return Sureness(dict.fromkeys(OF_MAP, Told(confidence, of_map, needed)), 0.999)
 
 
-def sure_rule(confidence: Callable[[Evidence], float], needed: float = NEEDED, **limits: float) -> AcceptRule:
+def sure_rule(confidence: Callable[[Figures], float], needed: float = NEEDED, **limits: float) -> AcceptRule:
     """The rule that accepts a match whose confidence is `needed`."""
     sure = told(confidence, needed=needed)
     return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": sure, **limits})
@@ -55,6 +55,6 @@ def agreed(inliers: int, shift_share: tuple[float, float] = (0.1, 0.0), **more) 
     return Agreement(inliers=inliers, shift_share=shift_share, **{"is_expected": True} | found | more)
 
 
-def landmarks_count(evidence: Evidence) -> float:
+def landmarks_count(evidence: Figures) -> float:
     """Sure where ten landmarks agree as expected, whatever else is known."""
     return float(evidence.get("landmarks", 0.0) >= math.log1p(10))

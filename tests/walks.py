@@ -15,9 +15,10 @@ from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 
 USUAL = WalkSettings(candidates=50)
 
@@ -28,10 +29,10 @@ def query_meter(clock: FakeClock | None = None) -> QueryMeter:
     return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
-def map_of(path: Path, technique: Technique, frames: Iterable[Frame], preparation: Preparation | None = None) -> Path:
-    """Make a map of frames; return its path."""
+def map_of(path: Path, technique: Technique, frames: Iterable[Frame], **encoder) -> Path:
+    """Make a map of frames; return its path. `encoder` has other parts of a `FrameEncoder`."""
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, technique, place_map, query_meter(), preparation)
+        build_map(frames, FrameEncoder(technique=technique, **encoder), place_map)
     return path
 
 
@@ -43,9 +44,11 @@ def walk_over(
     *,
     clock: FakeClock | None = None,
     settings: WalkSettings = USUAL,
+    encoder: dict | None = None,
     **more,
 ) -> Recogniser:
-    """A recogniser over an open map, by the usual rule where none is given."""
+    """A recogniser over an open map, by the usual rule where none is given; `encoder` as in `map_of`."""
     rule = rule or accept_rule(technique, load_config(None).match)
-    matcher = Matcher(technique, load_index(place_map, technique, 10**7), rule, search)
-    return Recogniser(matcher, place_map, query_meter(clock), settings, **more)
+    matcher = Matcher(load_index(place_map, technique, 10**7), rule, search)
+    of_frames = FrameEncoder(technique=technique, **(encoder or {}))
+    return Recogniser(of_frames, place_map, matcher, query_meter(clock), settings, **more)

@@ -13,7 +13,7 @@ from sweep_changes import OF_CAMERA, SWEEPS, view
 from sweeps import Shown
 
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 
 SIZE = (320, 240)
 MIDDLE = (np.array(SIZE) - 1) / 2
@@ -78,6 +78,6 @@ def test_the_camera_moves_as_is_said():
 def test_what_a_sweep_shows_is_asked_as_it_is_with_its_mask():
     image, shown = picture(), Shown()
     shown.mask = np.zeros(image.shape[:2], bool)
-    levelled = Preparation(levelling=shown).picture(walks.frame(image))
+    levelled = FrameEncoder(technique=None, levelling=shown).prepare(walks.frame(image))
     assert levelled.image is image
     assert levelled.mask is shown.mask

@@ -86,11 +86,11 @@ def run_match(args: Namespace) -> int:
     from edgevpr.cli.matched import match_of, of_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.hints import told_parts
+    from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import weights_of
 
-    config, known = config_of(args, args.config, map=args.map), told_parts(args.known)
+    config, known = config_of(args, args.config, map=args.map), parse_known_fields(args.known)
     recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
     page = _MatchPage(args) if args.page else None
     found = []
@@ -155,7 +155,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     """Raise UsageError if no query of `match`, or no place of the map, has what is to be known of it."""
     from edgevpr.frames.positions import find_track, read_track
     from edgevpr.frames.source import tags_of
-    from edgevpr.runtime.recognise.hints import lacking
+    from edgevpr.runtime.recognise.hints import explain_useless
 
     source, positions = Path(args.source), path_of(args.positions)
     if source.is_dir():
@@ -163,7 +163,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
-    if why := lacking(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
+    if why := explain_useless(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
         raise UsageError(why)
 
 

@@ -226,7 +226,8 @@ def map_info(args: Namespace) -> int:
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import info_of
-    from edgevpr.runtime.recognise.evidence import WITH_CONFIDENCE, calibration_of, not_calibrated
+    from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
+    from edgevpr.techniques import WITH_CONFIDENCE
 
     if args.page:
         require_out(args.page, args.map)

@@ -24,9 +24,9 @@ def match_of(event: "Recognition") -> dict[str, Any]:
     is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
     """
     from edgevpr.core.geodesy import distance_m
-    from edgevpr.runtime.recognise.recognition import unrounded_fields_of
+    from edgevpr.runtime.recognise.recognition import fields_of
 
-    fields = unrounded_fields_of(event)
+    fields = fields_of(event, exact=True)
     number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
     accuracy_m, fix = fields.pop("accuracy_m"), fields.pop("located")
     tag, from_tag_m = event.frame and event.frame.position, None

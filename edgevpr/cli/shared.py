@@ -105,7 +105,7 @@ def add_map_images(parser: ArgumentParser) -> None:
 
 
 def add_known(parser: ArgumentParser) -> None:
-    """Add the flag for what is known of recorded queries, which `hints.told_parts` reads."""
+    """Add the flag for what is known of recorded queries, which `hints.parse_known_fields` reads."""
     parser.add_argument(
         "--known",
         metavar="A,B",

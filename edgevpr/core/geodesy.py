@@ -6,7 +6,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from edgevpr.core.arrays import Degrees, Doubles, Floats, LatLon
+from edgevpr.core.arrays import Array, Degrees, Doubles, Floats, LatLon
 
 D = TypeVar("D", float, Doubles, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
@@ -77,3 +77,18 @@ def axes_of(up_deg: float) -> Doubles:
     (2, 2). The first column is the unit vector (east, north) of the picture's right, the second that of its top."""
     up = math.radians(up_deg)
     return np.array([[math.cos(up), math.sin(up)], [-math.sin(up), math.cos(up)]])
+
+
+def fit_similarity(points: Array, targets: Array, weights: Doubles | None = None) -> tuple[complex, complex]:
+    """Return the factor (rotation and scale) and the offset with which factor * `points` + offset fits `targets`,
+    complex (N,) each, by least squares; `weights` (N,) are those of the squares. The factor is 1 for a single point."""
+    if weights is None:
+        middle, target = points.mean(), targets.mean()
+        spread = np.vdot(points - middle, points - middle).real
+        covariance = np.vdot(points - middle, targets - target)
+    else:
+        middle, target = np.average(points, weights=weights), np.average(targets, weights=weights)
+        spread = np.sum(weights * abs(points - middle) ** 2)
+        covariance = np.sum(weights * np.conj(points - middle) * (targets - target))
+    factor = covariance / spread if spread > 0 else 1.0 + 0j
+    return factor, target - factor * middle

@@ -36,20 +36,22 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.confidence import Evidence, Logistic, Model, prior
+from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
     AHEAD_PROVEN,
     DOWN,
     DOWN_BARE,
     FEWEST_PLACES,
+    Evidence,
     MapCalibration,
     calibration_text,
     kinds_of,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
@@ -111,7 +113,8 @@ def ask(
             if not len(among):
                 continue
             image, shown = changed(seen.image, rng, looks_down, seen.mask)
-            event = looked_for(place_id, image, shown, Matcher(technique, among, rule, layers=layers), place_map, meter)
+            matcher = Matcher(among, rule, layers=layers)
+            event = looked_for(place_id, image, shown, technique, matcher, place_map, meter)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
@@ -127,30 +130,30 @@ def looked_for(
     place_id: int,
     image: Image,
     shown: Shown | None,
+    technique: Technique,
     matcher: Matcher,
     place_map: PlaceMap,
     meter: QueryMeter,
 ) -> Recognition:
     """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
     shows no ground (None: it shows ground everywhere)."""
-    prepared = Preparation(mask=None if shown is None else Mask(shown, sha256=""))
-    settings = WalkSettings(candidates=matcher.technique.candidates, all_evidence=True)
-    walk = Recogniser(matcher, place_map, meter, settings, preparation=prepared)
+    encoder = FrameEncoder(technique=technique, mask=None if shown is None else Mask(shown, sha256=""))
+    settings = WalkSettings(candidates=technique.candidates, all_evidence=True)
+    walk = Recogniser(encoder, place_map, matcher, meter, settings)
     return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
 
 def calibrate(
-    technique: Technique,
+    encoder: FrameEncoder,
     place_map: PlaceMap,
     config: MatchConfig,
     meter: QueryMeter,
     pictures: Pictures,
     watch: Watch[Frame],
-    preparation: Preparation | None = None,
 ) -> MapCalibration:
     """Calibrate a map that is open for adding, and store the result in the map. `pictures` opens the pictures of given
-    names; `watch` wraps the iteration over these frames, to show progress. `preparation` is the preparation of pictures
-    with which the map was made (None: no mask and no levelling).
+    names; `watch` wraps the iteration over these frames, to show progress. `encoder` is that with which the map was
+    made.
     Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
     pictures are found. Raises MapError for a file that cannot be read or written.
     """
@@ -161,13 +164,14 @@ def calibrate(
                 f"{place_map.path} cannot be calibrated, and flies with the shipped confidence: {lacking}."
             )
 
+    technique = encoder.technique
     kinds = kinds_of(technique.spec)
     require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
     is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
-    as_mapped = _as_mapped(technique, place_map, pictures, watch, preparation or Preparation())
+    as_mapped = _as_mapped(encoder, place_map, pictures, watch)
     answers = list(ask(technique, place_map, index, accept_rule(technique, config), meter, as_mapped))
     at_hand = len({answer.place_id for answer in answers})
     require(
@@ -186,27 +190,28 @@ def asked_of(technique: Technique) -> int:
 
 
 def _as_mapped(
-    technique: Technique, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], preparation: Preparation
+    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame]
 ) -> Iterator[tuple[int, Levelled]]:
     """Yield (a place's number, its prepared picture) for a random selection of places. A picture that has the name of a
     place's picture, but another content, is left out."""
     ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
-    count = asked_of(technique)
+    count = asked_of(encoder.technique)
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
-        picture = preparation.picture(frame)
-        coarse = technique.encode(picture.image, picture.mask).coarse
+        encoded = encoder.encode(frame)
         of_name = ids_by_image.get(readable(frame.name), ())
-        if (place_id := next((at for at in of_name if place_map.is_of(at, coarse)), None)) is not None:
-            yield place_id, picture
+        if (
+            place_id := next((at for at in of_name if place_map.is_of(at, encoded.descriptor.coarse)), None)
+        ) is not None:
+            yield place_id, encoded.picture
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
     """Fit the models of all `kinds` of evidence to the answers, and count those that are accepted at the `precision`
-    asked for. A best place that was not worth a look at its landmarks has none that agree."""
-    known = [replace(each, evidence={"landmarks": 0.0, **each.evidence}) for each in answers if each.evidence]
+    asked for."""
+    known = [answer for answer in answers if answer.evidence]
     made_of = f"{len(known)} answers of the map itself"
     models = {kind: adapted(prior(kind), kind, known, made_of) for kind in kinds}
     sure = Sureness(models, precision)
@@ -236,11 +241,13 @@ def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str)
     answers of a map. Answers without evidence are ignored. `made_of`: a note, kept in the model, on the data that it
     was fitted to."""
     known = [(answer, answer.evidence) for answer in answers if answer.evidence and answer.way != MIRRORED]
+    # A best place that was not worth a look at its landmarks has none that agree.
+    rows = [{"landmarks": 0.0} | evidence.figures() for _, evidence in known]
     right = np.array([answer.right for answer, _ in known], bool)
     of_place = model.of_place
     if not right.all():  # wrong ones are needed to fit anything
         weights = np.array([_LEFT_OUT_COUNTS if answer.way == LEFT_OUT else 1.0 for answer, _ in known])
-        of_place = fitted(of_place, [evidence for _, evidence in known], right, weights, *_PULL[kind])
+        of_place = fitted(of_place, rows, right, weights, *_PULL[kind])
     return Model(
         of_map=model.of_map,
         of_place=of_place,
@@ -251,7 +258,7 @@ def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str)
 
 
 def fitted(
-    start: Logistic, rows: Sequence[Evidence], right: Bools, weights: Doubles, pull: float, pull_of_bias: float = 0.0
+    start: Logistic, rows: Sequence[Figures], right: Bools, weights: Doubles, pull: float, pull_of_bias: float = 0.0
 ) -> Logistic:
     """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
     `weights`, float (N,), are their weights.
@@ -275,7 +282,7 @@ def fitted(
     return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
 
 
-def evidence_matrix(rows: Sequence[Evidence], names: Sequence[str]) -> Doubles:
+def evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
     """Return the evidence of N matches as a matrix, float64 (N, F), with a column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 

@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import SuperLU, splu
 
 from edgevpr.core.arrays import Array, Complexes, Floats
+from edgevpr.core.geodesy import fit_similarity
 from edgevpr.core.text import at_work
 
 _ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
@@ -199,14 +200,10 @@ def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, comple
     weight = np.ones(len(shape))
     scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
     for _ in range(20):
-        middle, there = np.average(shape, weights=weight), np.average(recorded, weights=weight)
-        spread = np.sum(weight * abs(shape - middle) ** 2)
-        if spread < 1e-12:
-            break
-        fitted = np.sum(weight * np.conj(shape - middle) * (recorded - there)) / spread
+        fitted, shift = fit_similarity(shape, recorded, weight)
         if abs(fitted) < 1e-6:
             break
-        scale, offset = fitted, there - fitted * middle
+        scale, offset = fitted, shift
         off = abs(scale * shape + offset - recorded)
         weight = _agree(off / max(_LEAST_M, _scatter(off))) + 1e-6
     return scale, offset

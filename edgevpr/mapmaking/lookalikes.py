@@ -13,10 +13,10 @@ from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.decide import Matcher
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of, technique_of
-from edgevpr.runtime.recognise.recogniser import Matcher
 
 LEAST = 0.1  # confidence from which a place elsewhere looks alike
 
@@ -50,7 +50,7 @@ def look_alikes(place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask |
         away = index.only(~same_ground(index, slot, near_m))
         if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
             continue
-        event = looked_for(place_id, image, mask, Matcher(technique, away, rule, layers=layers), place_map, meter)
+        event = looked_for(place_id, image, mask, technique, Matcher(away, rule, layers=layers), place_map, meter)
         if event.best is None or event.confidence is None or event.confidence < LEAST:
             yield None
         else:

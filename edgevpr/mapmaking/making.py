@@ -24,10 +24,10 @@ from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import info_of
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import MapCalibration, kinds_of
 from edgevpr.runtime.recognise.levelling import levelling_of
-from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, say_other_lens, say_other_mask, technique_of
-from edgevpr.runtime.recognise.preparation import Preparation
+from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, technique_of, warn_of_other_pictures
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
@@ -163,8 +163,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     else:
         place_map = PlaceMap.open_for_adding(path)
         source, technique = _opened(order, config, place_map, mask)
-        say_other_mask(place_map, mask)
-        say_other_lens(place_map, lens)
+        warn_of_other_pictures(place_map, mask, lens)
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):
@@ -175,10 +174,8 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 _say_and_fetch(source, pictures.spacing_m, technique, shown)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
-                technique,
+                replace(encoder_of(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
                 place_map,
-                meter_of(config, here),
-                replace(preparation_of(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
@@ -265,13 +262,12 @@ def calibrate_map(
         yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
 
     return calibrate(
-        technique,
+        encoder_of(config, pictures, technique),
         place_map,
         config.match,
         meter_of(config, load_board("this")),
         frames,
         lambda asked, total: shown(asked, total, "calibrating"),
-        preparation_of(config, pictures, technique),
     )
 
 
@@ -298,11 +294,12 @@ def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None, mask: M
     return source, made_for(here.threads, name, settings)
 
 
-def preparation_of(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> Preparation:
-    """Return the steps before encoding: overlay mask and levelling. Pictures cut from an orthophoto need neither."""
+def encoder_of(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> FrameEncoder:
+    """Return the encoder of places: with mask and levelling, which pictures cut from an orthophoto do not need."""
     if isinstance(pictures, Cuttings):
-        return Preparation()
-    return Preparation(mask=mask_of(config.source.mask), levelling=levelling_of(config.source, technique, below=True))
+        return FrameEncoder(technique=technique)
+    levelling = levelling_of(config.source, technique, below=True)
+    return FrameEncoder(technique=technique, mask=mask_of(config.source.mask), levelling=levelling)
 
 
 @contextmanager

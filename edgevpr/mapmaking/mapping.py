@@ -1,6 +1,6 @@
 """Making places of a map from frames: every frame is encoded, and is on the disk before the next one is read.
 
-With salience criteria (`Preparation.gate`), only frames that reach all thresholds become places. So that no long gaps
+With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. So that no long gaps
 arise (thesis 3.4.8), the other frames are held back ("wait"). After `most_frames` frames or `most_m` metres without a
 place, all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
@@ -11,80 +11,71 @@ from typing import TypeVar
 
 import numpy as np
 
-from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, ModelError
 from edgevpr.core.geodesy import distance_m, metres, moved
 from edgevpr.core.types import Frame, Position, Salience
-from edgevpr.places.index import empty_index
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
-from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, says_nothing
-from edgevpr.runtime.recognise.levelling import laid
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
-from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
+from edgevpr.runtime.recognise.judge import says_nothing
+from edgevpr.runtime.recognise.levelling import place_at_middle
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, best_of
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
 Watch = Callable[[Iterable[T], int], Iterable[T]]  # gets items and their number, yields them and shows the progress
-Kept = tuple[Recognition, Salience | None]  # event of a frame that becomes a place, and its salience (None: no gate)
+Kept = tuple[EncodedFrame, Salience | None]  # a frame that becomes a place, and its salience (None: no gate)
 
 
 class Gaps:
-    """Chooses the frames that become places, so that no long gaps arise, see the module. An event is the `Recognition`
-    of one frame: the result of its processing. `most_m` None: distances are ignored."""
+    """Chooses the frames that become places, so that no long gaps arise, see the module. `most_m` None: distances are
+    ignored."""
 
     def __init__(self, most_frames: int = GAP_FRAMES, most_m: float | None = None) -> None:
         self._most_frames, self._most_m = most_frames, most_m
-        self._waiting: list[Recognition] = []
+        self._waiting: list[EncodedFrame] = []
         self._last: Position | None = None  # of the last place; before there is one, of the first frame
         self._has_begun = False
 
-    def take(self, event: Recognition) -> Iterator[Kept]:
-        """Process the next event. Yield the events that now become places: some of those waiting, then this one if it
+    def take(self, encoded: EncodedFrame) -> Iterator[Kept]:
+        """Process the next frame. Yield those that now become places: some of those waiting, then this one if it
         reaches all thresholds; else it waits. Each comes with its salience (None: there are no criteria)."""
-        if event.worth is None:
-            yield event, None
+        if encoded.worth is None:
+            yield encoded, None
             return
-        frame = _frame_of(event)
+        frame = encoded.frame
         while self._waiting and (len(self._waiting) >= self._most_frames or self._is_too_far(frame.position)):
             yield from self._best_waiting()
-        if event.worth.reason is None:
+        if encoded.worth.reason is None:
             self._waiting.clear()
-            yield self._kept(event), event.worth.salience
+            yield self._kept(encoded), encoded.worth.salience
         else:
             self._last = self._last or frame.position
-            self._waiting.append(replace(event, frame=replace(frame, image=_NO_PIXELS)))
+            self._waiting.append(replace(encoded, frame=replace(frame, image=_NO_PIXELS)))
 
     def end(self) -> Iterator[Kept]:
-        """Yield the events that become places at the end of a recording: the best ones, if there is no place yet."""
+        """Yield the frames that become places at the end of a recording: the best ones, if there is no place yet."""
         if not self._has_begun and self._waiting:
             yield from self._best_waiting()
 
     def _best_waiting(self) -> Iterator[Kept]:
-        """Yield the best of the waiting events, as places of low quality. Of the others, those before the last event
+        """Yield the best of the waiting frames, as places of low quality. Of the others, those before the last one
         yielded are dropped, and those after it continue to wait."""
-        waiting = [(event, event.worth) for event in self._waiting if event.worth]
+        waiting = [(encoded, encoded.worth) for encoded in self._waiting if encoded.worth]
         best = np.flatnonzero(best_of([worth.short_by for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
-        for event, worth in (waiting[at] for at in best):
-            yield self._kept(event), replace(worth.salience, is_low=True)
+        for encoded, worth in (waiting[at] for at in best):
+            yield self._kept(encoded), replace(worth.salience, is_low=True)
 
-    def _kept(self, event: Recognition) -> Recognition:
-        self._has_begun, self._last = True, _frame_of(event).position or self._last
-        return event
+    def _kept(self, encoded: EncodedFrame) -> EncodedFrame:
+        self._has_begun, self._last = True, encoded.frame.position or self._last
+        return encoded
 
     def _is_too_far(self, position: Position | None) -> bool:
         if self._most_m is None or position is None or self._last is None:
             return False
         return distance_m(self._last.lat_deg, self._last.lon_deg, position.lat_deg, position.lon_deg) > self._most_m
-
-
-def _frame_of(event: Recognition) -> Frame:
-    assert event.frame is not None  # always set when frames are processed
-    return event.frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,10 +140,8 @@ class MappingResult:
 
 def build_map(
     frames: Iterable[Frame],
-    technique: Technique,
+    encoder: FrameEncoder,
     place_map: PlaceMap,
-    meter: QueryMeter,
-    preparation: Preparation | None = None,
     gaps: Gaps | None = None,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
@@ -163,37 +152,37 @@ def build_map(
     cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised. Of pictures cut
     from an orthophoto (surveyed ones), those that hold too little to be recognised are left out.
     """
-    place_map.require(technique.spec)
-    matcher = Matcher(technique, empty_index(technique.spec, 0, None), ACCEPT_NOTHING)
-    walk = Recogniser(matcher, place_map, meter, preparation=preparation or Preparation())
+    place_map.require(encoder.technique.spec)
     gaps = gaps or Gaps()
     ids_by_image = place_map.ids_by("source_image")
-    result = MappingResult()
+    result, layers = MappingResult(), layers_of(place_map)
 
     def keep(kept: Iterable[Kept]) -> None:
-        for event, salience in kept:
-            frame = _frame_of(event)
-            assert event.descriptor is not None  # set for every frame that could be encoded
-            place_map.add(laid(frame, event.view), event.descriptor, salience, walk.landmarks(event))
+        for encoded, salience in kept:
+            place, landmarks = place_at_middle(encoded.frame, encoded.view), encoder.pack_landmarks(encoded.picture)
+            place_map.add(place, encoded.descriptor, salience, landmarks)
             result.added += 1
-            result.without_position += frame.position is None
+            result.without_position += encoded.frame.position is None
             if salience and salience.is_low:
                 result.of_low_quality += 1
                 result.not_memorable -= 1
 
     for frame in frames:
-        event = walk.step(frame)
-        min_quality = technique.min_quality if frame.pose and frame.pose.is_surveyed else 0.0
-        if event.failed or event.descriptor is None:
+        min_quality = encoder.technique.min_quality if frame.pose and frame.pose.is_surveyed else 0.0
+        try:
+            encoded = encoder.encode(frame, layers=layers)
+        except Exception as error:
             if unusable is None:
-                raise ModelError(event.reason)
-            unusable(ImageError(f"{frame.name}: {event.reason}"))
-        elif says_nothing(event.descriptor, min_quality):
+                raise ModelError(describe_error(error)) from error
+            unusable(ImageError(f"{frame.name}: {describe_error(error)}"))
+            continue
+        of_name = ids_by_image.get((readable(frame.name),), ())
+        if says_nothing(encoded.descriptor, min_quality):
             result.says_nothing += 1
-        elif any(place_map.is_of(at, event.descriptor.coarse) for at in ids_by_image.get((readable(frame.name),), ())):
+        elif any(place_map.is_of(place_id, encoded.descriptor.coarse) for place_id in of_name):
             result.already_here += 1
         else:
-            result.not_memorable += bool(event.worth and event.worth.lacks)
-            keep(gaps.take(event))
+            result.not_memorable += bool(encoded.worth and encoded.worth.lacks)
+            keep(gaps.take(encoded))
     keep(gaps.end())
     return result

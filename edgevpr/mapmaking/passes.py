@@ -26,7 +26,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.geodesy import distance_m, metres, moved
 from edgevpr.core.types import Frame, Place
 from edgevpr.frames.source import read_to_end
-from edgevpr.mapmaking.making import Cuttings, FlownPictures, preparation_of
+from edgevpr.mapmaking.making import Cuttings, FlownPictures, encoder_of
 from edgevpr.places.examine import Wanted
 from edgevpr.places.history import FlownPass, GroundChange, History
 from edgevpr.places.index import bytes_per_place, load_index
@@ -34,12 +34,13 @@ from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.evidence import calibration_of
-from edgevpr.runtime.recognise.hints import Told
+from edgevpr.runtime.recognise.hints import RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
 from edgevpr.runtime.recognise.opening import meter_of, technique_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 
 FADES_AFTER = 3  # later passes over the ground of a place, none of which found it
 PASS_GAP_S = 3600.0  # between two pictures of a folder, from which on they are of two flights
@@ -165,12 +166,12 @@ def _looks(
     rule = accept_rule(technique, config.match, calibration=calibration_of(place_map))
     candidates, layers = config.match.candidates or technique.candidates, layers_of(place_map)
     settings = WalkSettings(candidates=candidates, verify=config.match.verify)
-    at_its_height = Told(("height",), None)  # those of one spot are of one scale: no other needs to be tried
-    meter, preparation = meter_of(config, load_board("this")), preparation_of(config, pictures, technique)
+    at_its_height = RecordedPrior(("height",), None)  # those of one spot are of one scale: no other needs to be tried
+    meter, encoder = meter_of(config, load_board("this")), encoder_of(config, pictures, technique)
 
     def without(passes: Collection[int]) -> Recogniser:
-        matcher = Matcher(technique, index.only(~np.isin(flight, list(passes))), rule, layers=layers)
-        return Recogniser(matcher, place_map, meter, settings, preparation=preparation, prior=at_its_height)
+        matcher = Matcher(index.only(~np.isin(flight, list(passes))), rule, layers=layers)
+        return Recogniser(encoder, place_map, matcher, meter, settings, prior=at_its_height)
 
     for number in range(len(ground.began_s)):
         here = np.flatnonzero(ground.flight == number).tolist()

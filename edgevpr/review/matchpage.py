@@ -17,7 +17,7 @@ from edgevpr.review.queries import few, layers_of, steps_of
 from edgevpr.review.steps import Explored, Thresholds, counts, stepped
 from edgevpr.runtime.recognise.confidence import model_of
 from edgevpr.runtime.recognise.judge import Sureness
-from edgevpr.runtime.recognise.recognition import Recognition, unrounded_fields_of
+from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
@@ -31,7 +31,7 @@ def line_of(event: Recognition, number: int) -> dict[str, Any]:
     tag = event.frame and event.frame.position
     gps = {"lat_deg": tag.lat_deg, "lon_deg": tag.lon_deg, "t_s": float(number)} if tag else None
     times = {"kind": "query", "t_mono_s": float(number), "t_frame_s": float(number)}
-    return unrounded_fields_of(event) | times | {"vehicle": {"gps": gps}}
+    return fields_of(event, exact=True) | times | {"vehicle": {"gps": gps}}
 
 
 def match_page_of(

@@ -31,6 +31,7 @@ _OWN = {
 # Chosen without being asked for: the first that fits the board. Networks must be asked for: they need onnxruntime in
 # RAM, and weights that a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
 AUTOMATIC = ("cohog", "hog")
+WITH_CONFIDENCE = "cohog"  # whose matches have a confidence, where its spec is not at hand
 _WORDS = {int: "a whole number", float: "a number", str: "a word"}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Ints, Singles
 from edgevpr.core.contract import FineMatch, Support
+from edgevpr.core.geodesy import fit_similarity
 from edgevpr.techniques.views import ViewRegions
 
 _ALONG = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
@@ -169,7 +170,6 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
     from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
     it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
-    # In complex numbers a rotation and a scale are one factor, and least squares one division.
     mine, there = _from_middle(*asking), _from_middle(*best)
     turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
     for again in range(_ROUNDS + 1):
@@ -179,15 +179,11 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
             return match
         if again == _ROUNDS:
             break
-        of, to = mine[near], there[near]
-        middle_of, middle_to = of.mean(), to.mean()
-        spread = np.vdot(of - middle_of, of - middle_of).real
-        turned = np.vdot(of - middle_of, to - middle_to) / spread if spread > 0 else 0j
+        turned, shift = fit_similarity(mine[near], there[near])
         if not 1 / _FURTHEST_SCALE < abs(turned) < _FURTHEST_SCALE:
             return match
         if abs(np.angle(turned, deg=True)) > _FURTHEST_TURN_DEG:
             return match
-        shift = middle_to - turned * middle_of
     x, y = off[near].real, off[near].imag
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = float(x.var()) + 1 / 12, float(np.mean(x * y) - x.mean() * y.mean()), float(y.var()) + 1 / 12

@@ -7,7 +7,7 @@ import pytest
 from pictures import from_height
 
 from edgevpr.cli.main import main
-from edgevpr.runtime.recognise.hints import TOLD_REACH_M
+from edgevpr.runtime.recognise.hints import RECORDED_REACH_M
 
 pytestmark = pytest.mark.slow
 
@@ -71,7 +71,7 @@ def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
     assert all(each["accepted"] and "hints" not in each for each in without)
     found = run_json(capsys, *match, "--known", "reach, heading")
     assert [each["hints"]["heading"] for each in found] == [True] * 5 + [False]
-    assert {each["hints"]["reach_m"] for each in found} == {TOLD_REACH_M}
+    assert {each["hints"]["reach_m"] for each in found} == {RECORDED_REACH_M}
     assert [each["accepted"] for each in found] == [True] * 3 + [False, False, True]
     bare = make(tmp_path / "bare")
     assert "yaw_deg" in refused(capsys, "match", path, "--images", bare / "query", "--known", "heading")

@@ -20,10 +20,10 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.confidence import Logistic
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.preparation import Preparation
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -63,7 +63,8 @@ def place_map(tmp_path):
 
 
 def calibrated(place_map, pictures, technique=AHEAD, **more):
-    return calibrate(technique, place_map, CONFIG, query_meter(), pictures, lambda frames, total: frames, **more)
+    encoder = FrameEncoder(technique=technique, **more)
+    return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, lambda frames, total: frames)
 
 
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
@@ -123,7 +124,7 @@ def test_a_map_that_is_too_small_and_a_technique_without_confidence_are_refused(
 def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
-    build_map([frame(20)], AHEAD, place_map, query_meter())
+    build_map([frame(20)], FrameEncoder(technique=AHEAD), place_map)
     found = calibrated(place_map, at_hand(*map(frame, (*range(PLACES), 20)))[0])
     assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
 
@@ -132,12 +133,12 @@ def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:60] = allowed[190:] = False
     mask = Mask(allowed, sha256="display")
-    path = map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)), Preparation(mask=mask))
+    path = map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)), mask=mask)
     with PlaceMap.open_for_adding(path) as place_map:
         pictures, _ = at_hand(*map(frame, range(PLACES)))
         with pytest.raises(UsageError, match="mask"):
             calibrated(place_map, pictures)
-        assert calibrated(place_map, pictures, preparation=Preparation(mask=mask)).asked == 2 * PLACES
+        assert calibrated(place_map, pictures, mask=mask).asked == 2 * PLACES
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
@@ -148,11 +149,11 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     def levelling():
         return Levelling(Lens(60.0), below=True, is_live=False)
 
-    path = map_of(tmp_path / "m.gpkg", down, tilted, Preparation(levelling=levelling()))
+    path = map_of(tmp_path / "m.gpkg", down, tilted, levelling=levelling())
     with PlaceMap.open_for_adding(path) as place_map:
         with pytest.raises(UsageError, match=" 0 places"):
             calibrated(place_map, at_hand(tilted[0])[0], down)
-        found = calibrated(place_map, at_hand(*tilted)[0], down, preparation=Preparation(levelling=levelling()))
+        found = calibrated(place_map, at_hand(*tilted)[0], down, levelling=levelling())
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
 

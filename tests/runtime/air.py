@@ -162,8 +162,8 @@ class Air:
             self._see(step, vehicle)
 
     def _see(self, step, vehicle, is_query=True) -> None:
-        event = Recognition(frame=Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S), vehicle=vehicle)
-        event.stride = self._stride(step)
+        frame = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S)
+        event = Recognition(frame=frame, vehicle=vehicle, stride=self._stride(step))
         self.navigator.hear_frame(event, is_query)
 
     def _stride(self, step) -> Stride | None:
@@ -183,11 +183,12 @@ class Air:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
         where = Position(*moved(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
-        event.frame = replace(event.frame, t_sd_s=self.t_sd_s)
-        event.stride = self._stride(step)
+        frame = replace(event.frame, t_sd_s=self.t_sd_s)
+        event = replace(event, frame=frame, stride=self._stride(step))
         if self.shows_turn:
-            event.picture = Levelled(_PICTURE, None, replace(event.view, up_deg=0.0))
-            event.located = replace(event.located, heading_deg=-math.degrees(self.turn))
+            picture = Levelled(_PICTURE, None, replace(event.view, up_deg=0.0))
+            located = replace(event.located, heading_deg=-math.degrees(self.turn))
+            event = replace(event, picture=picture, located=located)
         self.events.append(event)
         advice = self.tell(event)
         self.advices.append((self.t_s, advice))

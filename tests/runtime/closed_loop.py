@@ -3,6 +3,7 @@ conversation and the navigator of edgevpr beside it, in steps of 20 ms. The same
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from air import match_at
@@ -148,8 +149,7 @@ class ClosedLoop:
         else:
             frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=Levelled(_PICTURE, None, _VIEW))
-        event.stride = self._stride(truth, t_s)
-        self._waiting.append(event)
+        self._waiting.append(replace(event, stride=self._stride(truth, t_s)))
 
     def _stride(self, truth, t_s):
         before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)

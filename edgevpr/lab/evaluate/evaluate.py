@@ -31,15 +31,16 @@ from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.sequence import length_of, search_of
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
-from edgevpr.power.meter import QueryMeter, query_cost
+from edgevpr.power.meter import query_cost
 from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import calibration_of
-from edgevpr.runtime.recognise.follow import Follower
-from edgevpr.runtime.recognise.hints import Told, lacking, told_parts
+from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, labelled
@@ -55,7 +56,7 @@ class MatchOptions:
     """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
     flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
     are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
-    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, see `hints.Told`).
+    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, see `hints.RecordedPrior`).
     """
 
     candidates: int | None = bounded(1, 1_000_000, default=None)
@@ -126,19 +127,19 @@ def answer_queries(
     together = length_of(spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), meter_of(load_config(None), load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
-    with mapped(frames, technique, meter, dataset.ref_dir, progress) as (place_map, index):
+    with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index):
         rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
         follows = options.follow and together == 1 and rule.sure is not None
 
         def open_recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
-                Matcher(technique, index, rule, search_of(length)),
+                FrameEncoder(technique=technique, gate=gate),
                 place_map,
+                Matcher(index, rule, search_of(length)),
                 meter,
                 WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
-                preparation=Preparation(gate=gate),
                 prior=prior,
-                follower=Follower(place_map, fastest_m_s=None, is_live=False) if follows else None,
+                place_filter=PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None,
             )
 
         scored = {query.path.name: query for query in dataset.queries}
@@ -161,7 +162,6 @@ def answer_queries(
 def mapped(
     frames: Iterable[Frame],
     technique: Technique,
-    meter: QueryMeter,
     images: Path | None = None,
     progress: Progress = iterate_silently,
 ) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
@@ -175,7 +175,7 @@ def mapped(
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
         path = Path(folder) / "references.gpkg"
         with PlaceMap.create(path, technique.spec) as place_map:
-            build_map(frames, technique, place_map, meter)
+            build_map(frames, FrameEncoder(technique=technique), place_map)
             with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
                 refine_map(place_map, technique, images, show)
             if images:
@@ -221,7 +221,7 @@ def summarise(
         u_match=cost.u_match,
         ah_total=queries_ah(queries, cost.used_mah / 1000),
         sequence=sequence,
-        known=options.known and ",".join(told_parts(options.known)),
+        known=options.known and ",".join(parse_known_fields(options.known)),
         ah_assumes=(
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
             f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
@@ -231,21 +231,21 @@ def summarise(
 
 def known_of(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
-) -> tuple[Told | None, dict[Path, GeoTag]]:
+) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
     """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),
     and the tags of the queries by path. The height of the map is the median of those of its pictures. `sequence` is
     that of `MatchOptions`. Raises UsageError if no query has what is asked for, and for a text that cannot be read."""
-    if not (parts := told_parts(text)):
+    if not (parts := parse_known_fields(text)):
         return None, {}
     queries, places = tags_of(dataset.queries[0].path.parent), tags_of(dataset.ref_dir)
-    if why := lacking(parts, queries.values(), places.values(), length_of(spec, sequence)):
+    if why := explain_useless(parts, queries.values(), places.values(), length_of(spec, sequence)):
         raise UsageError(why)
     query_heights_m, map_heights_m = (
         [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]
         for tags in (queries, places)
     )
     map_height_m = float(np.median(map_heights_m)) if query_heights_m and map_heights_m else None
-    return Told(parts, spec.heading_within_deg, map_height_m), queries
+    return RecordedPrior(parts, spec.heading_within_deg, map_height_m), queries
 
 
 def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:

@@ -47,12 +47,12 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
     If the map cannot be written (a memory card that has become read-only, a full disk), only the recogniser is opened:
     the places of the map can still be recognised. Raises an EdgevprError if the map cannot be opened.
     """
-    here = replace(config, map=world.place_map)
+    here, meter = replace(config, map=world.place_map), _query_meter(config, world)
     name = world.tape.read("picked", lambda: _picked(config))
 
     @cache
     def learning() -> tuple[Recogniser, Learner]:
-        recogniser, growing = open_learning(here, world.board, name)
+        recogniser, growing = open_learning(here, world.board, name, meter)
         spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
         return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
 
@@ -68,7 +68,7 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
     if config.mapping.learn and not cannot_learn:
         return *learning(), None
     try:
-        recogniser = open_recogniser(here, world.board, narrowed=True, follows=config.match.follow)
+        recogniser = open_recogniser(here, world.board, narrowed=True, follows=config.match.follow, meter=meter)
     except MapError:
         if cannot_learn:
             raise MapError(cannot_learn) from None
@@ -76,11 +76,10 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
     return recogniser, None, cannot_learn
 
 
-def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
-    """Measure how fast the technique is on this board, and set the recogniser to compare as many candidates as there is
-    time for. Returns the expected performance (see `Outlook`)."""
+def _query_meter(config: Config, world: World) -> QueryMeter:
+    """Make the meter of the queries of a flight, by its clock."""
     memory = OwnMemory()
-    recogniser.meter = QueryMeter(
+    return QueryMeter(
         world.board,
         parse_pack(config.battery.pack),
         config.battery.regulator_efficiency,
@@ -88,8 +87,13 @@ def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
         cpu_clock=world.clock.process_cpu_s,
         memory_mb=lambda: world.tape.read("memory_mb", memory.look),
     )
+
+
+def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
+    """Measure how fast the technique is on this board, and set the recogniser to compare as many candidates as there is
+    time for. Returns the expected performance (see `Outlook`)."""
     found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
-    recogniser.candidates = found.candidates
+    recogniser.change(candidates=found.candidates)
     return found
 
 

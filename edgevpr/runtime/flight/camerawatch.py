@@ -10,8 +10,9 @@ import numpy as np
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Accepted matches, and a picture's footprint over that of the map, between which nothing is said: as much is found, by
@@ -110,8 +111,7 @@ class MirrorWatch:
         """Search the whole map for the flipped picture, by nothing that the flight knows."""
         assert event.frame is not None
         now, settings = self._recogniser, WalkSettings(candidates=self._recogniser.candidates)
-        matcher = Matcher(now.technique, now.index, now.rule, follows=False)
-        preparation = replace(now.preparation, strides=None)
-        alone = Recogniser(matcher, now.place_map, self._meter, settings, preparation=preparation)
+        matcher = Matcher(now.index, now.rule, follows=False)
+        alone = Recogniser(now.encoder, now.place_map, matcher, self._meter, settings)
         frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
         return alone.step(frame, event.vehicle).accepted

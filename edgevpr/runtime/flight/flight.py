@@ -215,11 +215,11 @@ class Flight:
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
         """Recognise a frame or, unless it `is_query`, measure its stride; refuse one of pictures that are frozen."""
         if isinstance(frame, ImageError):
-            return self._crew.recogniser.unread(frame)
+            return self._crew.recogniser.report_unread(frame)
         vehicle = self._crew.link.vehicle_at(frame.t_mono_s) if self._crew.link else None
         if self._crew.source.is_live and (reason := self._frozen.judge(frame, vehicle)):
             return Recognition(frame=frame, vehicle=vehicle, reason=reason)
-        return (self._crew.recogniser.step if is_query else self._crew.recogniser.stride)(frame, vehicle)
+        return (self._crew.recogniser.step if is_query else self._crew.recogniser.measure_motion)(frame, vehicle)
 
     def _is_time_for_stride(self) -> bool:
         """Tell whether to take a picture that is no query, for the motion that it shows: between rare queries, while
@@ -269,8 +269,7 @@ class Flight:
 
     def _look(self, mount: Mount) -> None:
         """Level the pictures to come as those of a camera that looks there, and navigate by their fixes only."""
-        recogniser = self._crew.recogniser
-        recogniser.preparation = recogniser.preparation.looking(mount)
+        self._crew.recogniser.change(mount=mount)
         if self._crew.autopilot:
             self._crew.autopilot.begin_anew()
 

@@ -200,4 +200,4 @@ class Governing:
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
         crew.herald.tell("governor", severity, f"{text}: {change.why}", ground=ground, topic="limits", **fields)
         self._pace.rate_hz = change.after.rate_hz
-        crew.recogniser.candidates = change.after.candidates
+        crew.recogniser.change(candidates=change.after.candidates)

@@ -19,15 +19,18 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.places.layers import layers_of
 from edgevpr.places.tilemap import Loaded, TileMap, tile_of_place
 from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.recognise.decide import Matcher
 from edgevpr.runtime.recognise.evidence import calibration_of
-from edgevpr.runtime.recognise.hints import TOLD_REACH_M, Reach
+from edgevpr.runtime.recognise.hints import RECORDED_REACH_M, Reach
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _LOST_S = 60.0
 _AHEAD_S = 60.0  # the tiles at which the aircraft then is are loaded as soon as those where it is
-_BESIDE_M = TOLD_REACH_M  # beyond the area, in which the aircraft may be nevertheless: what lies there is searched too
+_BESIDE_M = (
+    RECORDED_REACH_M  # beyond the area, in which the aircraft may be nevertheless: what lies there is searched too
+)
 _HELD_NEARER = 0.25  # by this share of its side a tile in RAM counts as nearer: two must not take turns at an edge
 
 
@@ -170,9 +173,8 @@ class Tiles:
                 self._layers = layers_of(self._map)
             self._note_held()
         rules = {tile: self._rules[tile] for tile in held}
-        self._recogniser.take(
-            Matcher(
-                self._recogniser.technique,
+        self._recogniser.change(
+            matcher=Matcher(
                 self._map.ram.of(self._searched),
                 rules[self._searched[0]] if self._searched else self._recogniser.rule,
                 layers=self._layers,

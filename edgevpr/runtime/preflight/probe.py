@@ -15,7 +15,7 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
-from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
+from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import times_as_many
 from edgevpr.places.rows import MOST_LANDMARK_BYTES
@@ -24,8 +24,10 @@ from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder, describe_error
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _PICTURES = 2
@@ -150,14 +152,14 @@ class _Bench:
 
     def fill(self, trial_map: PlaceMap) -> None:
         """Add the trial's places to a map, all of them copies of the first picture."""
-        technique = self._technique
-        recogniser = self._open_recogniser(trial_map, empty_index(technique.spec, 0, None), 1)
-        event = _recognise(recogniser, self._images[0], 0.0)
-        if event.descriptor is None:
-            raise ModelError(f"{technique.spec.name} describes no picture of noise: it cannot be tried.")
+        encoder = FrameEncoder(technique=self._technique)
+        frame = Frame(image=self._images[0], name="trial", t_mono_s=0.0)
+        try:
+            first = encoder.encode(frame)
+        except Exception as error:
+            raise ModelError(describe_error(error)) from error
         for _ in range(_PLACES):
-            frame = Frame(image=self._images[0], name="trial", t_mono_s=0.0)
-            trial_map.add(frame, event.descriptor, landmarks=recogniser.landmarks(event))
+            trial_map.add(frame, first.descriptor, landmarks=encoder.pack_landmarks(first.picture))
 
     def try_map(self, place_map: PlaceMap, index: PlaceIndex, candidates: int, most: int = _TRIES) -> list[Steps]:
         """Match each picture several times (`most` at most) with `place_map`, of which `index` is in RAM and
@@ -181,8 +183,8 @@ class _Bench:
     def _open_recogniser(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
-        matcher = Matcher(technique, index, rule, search_of(self.sequence))
-        return Recogniser(matcher, place_map, self._meter, WalkSettings(candidates=candidates))
+        matcher, settings = Matcher(index, rule, search_of(self.sequence)), WalkSettings(candidates=candidates)
+        return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings)
 
 
 def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:

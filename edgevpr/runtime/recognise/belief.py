@@ -1,4 +1,5 @@
-"""Belief where the aircraft is, updated from query to query by a Bayes filter over the places of a map (see `follow`).
+"""Belief where the aircraft is, updated from query to query by a Bayes filter over the places of a map (see
+`place_filter`).
 
 Positions are in the plane of the map: metres east and north of a fixed origin or, in a map without positions (an
 *ordinal* one), the number of the place and 0. The aircraft is *lost* (off the map, or on it where no query has
@@ -20,29 +21,45 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.runtime.recognise.motion import Moved
 
-_MOST = 64  # hypotheses kept
+_MAX_HYPOTHESES = 64  # hypotheses kept
 # Chances between two queries to leave the map, to be anywhere on it, and to enter it. The odds for a history are at
 # most 1 to the sum of the first two.
 _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
 _MISSED = 0.2  # how likely a query misses the place below it, relative to one over ground that is not in the map
 _ALIKE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
-_LEAST_REST = 1e-4  # least probability that no candidate is right
-_GOES_ON, _GOES_ON_SD = 0.75, 0.5  # probability of going on as before; its standard deviation, in spacings of the map
-# Of moving by odometry, which comes first, as an autopilot tells it or as the camera sees it: the probability, and the
-# standard deviation in spacings and as a share of the length.
-_TOLD, _SEEN = (0.6, 0.25, 0.15), (0.98, 0.05, 0.05)
+_MIN_REST = 1e-4  # least probability that no candidate is right
+_STEADY, _STEADY_SD = 0.75, 0.5  # probability of going on as before; its standard deviation, in spacings of the map
+# Of moving by odometry, which comes first, as an autopilot reports it or as the camera sees it: the probability, and
+# the standard deviation in spacings and as a share of the length.
+_REPORTED, _SEEN = (0.6, 0.25, 0.15), (0.98, 0.05, 0.05)
 _REACH_SD = 1.5  # the reach in standard deviations
-_LEARNS = 0.2  # weight of the newest displacement in the mean velocity
-_SCATTERS = 2.0  # standard deviations of a position: a shorter displacement may be none
-_FORGOTTEN = 1e-9  # a hypothesis of less weight is dropped
+_NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
+_SAME_POSITION_SD = 2.0  # standard deviations of a position: a shorter displacement may be none
+_MIN_WEIGHT = 1e-9  # a hypothesis of less weight is dropped
 _LEAST = 1e-300  # instead of zero, where a number divides
 _ROUNDING = 1e-12  # relative error of the difference of two squares
-_THINNEST = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
-_FARTHEST = 1e8  # metres or places: farther than any two points on the Earth
-_LEAST_SD = 0.25  # least standard deviation of a position, in spacings of the map
+_MIN_VARIANCE_RATIO = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
+_MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
+_MIN_SD = 0.25  # least standard deviation of a position, in spacings of the map
 _FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
+DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration says another speed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """Motion of the aircraft since the previous query, in metres or places: `reach` is how far it can have moved in
+    `elapsed_s` seconds, and `by` (2,) its displacement by odometry (None: unknown), which `is_seen` by the camera
+    itself or reported by the autopilot."""
+
+    reach: float
+    elapsed_s: float
+    by: Doubles | None = None
+    is_seen: bool = False
+
+    def share_of_new_ground(self, spacing: float) -> float:
+        """Return which share of the ground in the picture is new, as far as that is seen: 0 to 1."""
+        return min(1.0, float(np.hypot(*self.by)) / spacing) if self.is_seen and self.by is not None else 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,12 +142,12 @@ class Belief:
         shapes |= {"credited": 0, "anchor": (0, 2)}
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
-    def update(self, proposed: Proposals | None, moved: Moved, places: int) -> Posterior:
+    def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
         are not finite do not count), the motion since the previous query, and the number of places in the map now."""
-        odds = (1 - self._lost) / max(self._lost, _FORGOTTEN)
+        odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)
         now, lost, appears = self._left()
-        ways = self._ways(now, moved, places)
+        ways = self._ways(now, motion, places)
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
         if proposed is None:
@@ -139,19 +156,19 @@ class Belief:
         else:
             self._enters = _ENTERS
             numbers, proposed = _usable(proposed, self._scale)
-            there, alike, staleness, left = self._credit(proposed, now, ways, moved.elapsed_s, appears, places)
+            there, alike, staleness, left = self._credit(proposed, now, ways, motion.elapsed_s, appears, places)
             lost *= alike
             # Of a miss, too, pictures of the same ground are no new evidence.
-            unseen = _unseen(now, ways, _MISSED ** moved.to_fresh_ground(self._scale.spacing))
+            unseen = _unseen(now, ways, _MISSED ** motion.share_of_new_ground(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
-            kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _FORGOTTEN)
+            kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _MIN_WEIGHT)
             there = replace(there, w=there.w * max(1.0, kept) ** staleness)
             both = {name: (getattr(there, name), getattr(unseen, name)) for name in _Hypotheses.__slots__}
             after = _Hypotheses(**{name: np.concatenate(pair) for name, pair in both.items()})
         share = after.w / (lost + float(after.w.sum()))
         p[numbers] = share[: len(numbers)]
-        strongest = np.argsort(-share, kind="stable")[:_MOST]
-        self._now = replace(after, w=share)[strongest[share[strongest] > _FORGOTTEN]]
+        strongest = np.argsort(-share, kind="stable")[:_MAX_HYPOTHESES]
+        self._now = replace(after, w=share)[strongest[share[strongest] > _MIN_WEIGHT]]
         self._lost = max(0.0, 1 - float(self._now.w.sum()))
         return self._posterior(p)
 
@@ -167,28 +184,28 @@ class Belief:
         now = replace(self._now, w=stays * self._now.w, credited=credited)
         return now, lost, self._enters * self._lost + _JUMPS * held
 
-    def _ways(self, now: _Hypotheses, moved: Moved, places: int) -> list[_Way]:
+    def _ways(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Way]:
         """Return the ways in which each hypothesis can have moved: by odometry, on as before, or anywhere in reach."""
         scale, ways = self._scale, []
         area = places * scale.cell
         widest = area / 2 if scale.is_ordinal else math.sqrt(area / math.pi)
-        is_everywhere = not moved.reach < widest
-        reach = widest if is_everywhere else moved.reach
+        is_everywhere = not motion.reach < widest
+        reach = widest if is_everywhere else motion.reach
         is_going = ~np.isnan(now.velocity[:, 0])
-        ahead = np.where(is_going[:, None], now.velocity, 0) * moved.elapsed_s
-        ahead *= (moved.reach / np.maximum(np.hypot(*ahead.T), max(moved.reach, _LEAST)))[:, None]
-        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _GOES_ON_SD * scale.spacing)
-        if moved.by is not None:
-            share, least_sd, of_length = _SEEN if moved.is_seen else _TOLD
-            spread = (of_length**2 * moved.by @ moved.by + (least_sd * scale.spacing) ** 2) * np.eye(2)
-            ways.append(_Way(share * left, now.at + moved.by, now.covariance + spread))
+        ahead = np.where(is_going[:, None], now.velocity, 0) * motion.elapsed_s
+        ahead *= (motion.reach / np.maximum(np.hypot(*ahead.T), max(motion.reach, _LEAST)))[:, None]
+        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _STEADY_SD * scale.spacing)
+        if motion.by is not None:
+            share, least_sd, of_length = _SEEN if motion.is_seen else _REPORTED
+            spread = (of_length**2 * motion.by @ motion.by + (least_sd * scale.spacing) ** 2) * np.eye(2)
+            ways.append(_Way(share * left, now.at + motion.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
-            left, middle, sd = (1 - share) * left, moved.by, min(sd, scale.spacing + math.hypot(*moved.by))
-        variance = (_GOES_ON_SD * scale.spacing) ** 2 + (_GOES_ON_SD * np.hypot(*ahead.T)) ** 2 / 2
+            left, middle, sd = (1 - share) * left, motion.by, min(sd, scale.spacing + math.hypot(*motion.by))
+        variance = (_STEADY_SD * scale.spacing) ** 2 + (_STEADY_SD * np.hypot(*ahead.T)) ** 2 / 2
         going = now.covariance + variance[:, None, None] * np.eye(2)
-        ways.append(_Way(_GOES_ON * is_going * left, now.at + ahead, going))
+        ways.append(_Way(_STEADY * is_going * left, now.at + ahead, going))
         anywhere = now.covariance + sd**2 * np.eye(2)
-        ways.append(_Way((1 - _GOES_ON * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
+        ways.append(_Way((1 - _STEADY * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
         return ways
 
     def _credit(
@@ -202,7 +219,7 @@ class Belief:
         * the factor, 1 at most, by which the odds of not being lost shrink if this query is weaker evidence there.
         """
         scale, at, of_step = self._scale, proposed.at, proposed.covariance
-        rest = max(_LEAST_REST, 1 - float(proposed.p.sum()))
+        rest = max(_MIN_REST, 1 - float(proposed.p.sum()))
         ratio = np.log(np.maximum(proposed.p, _LEAST) * places / rest)
         born = appears / places * np.exp(ratio)
 
@@ -210,7 +227,7 @@ class Belief:
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
-        fresh = np.clip((_apart(now.anchor, at) - _SCATTERS * scatter) / scale.spacing, 0, 1)
+        fresh = np.clip((_apart(now.anchor, at) - _SAME_POSITION_SD * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * _density(way, at, of_step, scale.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
@@ -228,7 +245,7 @@ class Belief:
             np.concatenate([way.covariance for way in ways]),
         )
         at_both, of_both = _fused(at, of_step, at_before, of_before)
-        learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _LEARNS)
+        learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
@@ -281,7 +298,7 @@ def _density(way: _Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> D
     dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
     if is_ordinal:
         xy, yy, dy = np.zeros(()), np.full((), _FLAT), np.zeros(())
-    determinant = np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy)
+    determinant = np.maximum(xx * yy - xy * xy, _MIN_VARIANCE_RATIO * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
     gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
     return np.maximum(gaussian, way.least)
@@ -289,7 +306,7 @@ def _density(way: _Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> D
 
 def _firm(covariance: Doubles, least: float) -> Doubles:
     """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
-    more: Doubles = least + _THINNEST * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    more: Doubles = least + _MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
 
 
@@ -316,13 +333,15 @@ def _mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles,
 
 def _usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
     """Return the indices of the likeliest finite proposals, and these, made invertible and with a sum of 1 at most."""
-    is_near = (np.abs(proposed.at) < _FARTHEST).all(1) & (np.abs(proposed.covariance) < _FARTHEST**2).all((1, 2))
+    is_near = (np.abs(proposed.at) < _MAX_DISTANCE).all(1) & (np.abs(proposed.covariance) < _MAX_DISTANCE**2).all(
+        (1, 2)
+    )
     numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & is_near)
-    numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:_MOST]]
+    numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:_MAX_HYPOTHESES]]
     p = proposed.p[numbers]
     return numbers, Proposals(
         p=p / max(1.0, float(p.sum())),
         at=proposed.at[numbers],
-        covariance=_firm(proposed.covariance[numbers], (_LEAST_SD * scale.spacing) ** 2),
+        covariance=_firm(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
         heading_deg=proposed.heading_deg[numbers],
     )

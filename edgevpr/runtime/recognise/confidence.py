@@ -21,7 +21,7 @@ from typing import Any
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import read_file, shipped
 
-Evidence = Mapping[str, float]
+Figures = Mapping[str, float]  # the figures of the evidence of a match, by their names
 
 _MAX_FILE_BYTES = 100_000
 _MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
@@ -47,7 +47,7 @@ class Logistic:
     scales: tuple[float, ...]
     bias: float
 
-    def logit(self, evidence: Evidence) -> float:
+    def logit(self, evidence: Figures) -> float:
         """Return the logit of a match with this evidence."""
         return self.bias + sum(w * evidence[name] for w, name in zip(self.weights, self.names, strict=True))
 
@@ -99,7 +99,7 @@ class Model:
     made: str
     made_of: str
 
-    def chance(self, evidence: Evidence) -> float:
+    def chance(self, evidence: Figures) -> float:
         """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
         the heading is known, `tried` says that fewer rotations than a map was measured with had the chance to match."""
         of_map, *of_places = (each.logit(evidence) for each in (self.of_map, self.of_place, *self.of_other_places))
@@ -108,11 +108,11 @@ class Model:
         chance = self.scale.off_map.beyond(of_map) + self.scale.off_place.beyond(min(of_places))
         return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _OF_ROTATIONS))
 
-    def confidence(self, evidence: Evidence) -> float:
+    def confidence(self, evidence: Figures) -> float:
         """Return the probability that the match is right, 0..1."""
         return self.scale.confidence(self.chance(evidence))
 
-    def confidence_of_map(self, evidence: Evidence) -> float:
+    def confidence_of_map(self, evidence: Figures) -> float:
         """Return the probability, 0..1, that the query shows ground of the map, no matter which place."""
         logit = self.of_map.logit(evidence)
         return self.scale.confidence(self.scale.off_map.beyond(logit) if math.isfinite(logit) else 1.0)

@@ -12,7 +12,7 @@ match, but for `rank_gap`.
 * likeness: `Support.likeness` (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
 * landmarks: logarithm of one more than the number of landmarks that agree as expected (down)
-* proof: what `proven` returns, of the landmarks (ahead)
+* proof: what `log_times_more` returns, of the landmarks (ahead)
 * tried: `Ranking.tried`, which no model weighs (see `Model.chance`)
 """
 
@@ -21,7 +21,7 @@ import logging
 import math
 import zlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Evidence, Model, model_of, prior
+from edgevpr.runtime.recognise.confidence import Model, model_of, prior
 
 AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
 _BARE = ("lead", "coverage", "structure")
@@ -42,16 +42,71 @@ _PLACE_AHEAD = ("lead", "coverage", "rank_gap", "structure")
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
 OF_MAP = {AHEAD: _MAP_AHEAD, AHEAD_PROVEN: _MAP_AHEAD, **_LOOKING_DOWN}
 OF_PLACE = {AHEAD: _PLACE_AHEAD, AHEAD_PROVEN: (*_PLACE_AHEAD, "proof"), **_LOOKING_DOWN}
-WITH_CONFIDENCE = "cohog"  # the technique that gives evidence, where its spec is not at hand (see `kinds_of`)
-_LEAST = 1e-3  # least share, so that its logarithm exists
+_MIN_SHARE = 1e-3  # so that its logarithm exists
 # So many landmarks agree with a place that only looks alike. Were fewer told apart, wrong matches would scatter more.
-_LANDMARKS_BY_CHANCE = 8
-_BY_CHANCE = 0.07  # share that pictures of foreign ground reach; stands for a place elsewhere if there is none
+_INLIERS_BY_CHANCE = 8
+_SHARE_BY_CHANCE = 0.07  # that pictures of foreign ground reach; stands for a place elsewhere if there is none
+# A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
+_SMALL_LEAD = math.log(1.5)
+_NO_LEAD = math.log(1.05)
 FEWEST_PLACES = 30  # a map with fewer is not calibrated
-_HARDLY = 0.5  # mean confidence below which a place is hardly recognisable
+_MIN_RECOGNISABLE = 0.5  # mean confidence below which a place is hardly recognisable
 _CHECKSUM_DIGITS = 8
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """Evidence of a match, as the module describes it. None: this kind of evidence has no such figure, or it was not
+    asked for. `rival` is the number of landmarks, as `landmarks`, that agree with the best place elsewhere."""
+
+    agree: float
+    lead: float
+    coverage: float
+    structure: float = 0.0
+    tried: float = 1.0
+    rank_gap: float | None = None
+    likeness: float | None = None
+    proof: float | None = None
+    landmarks: float | None = None
+    rival: float | None = None
+
+    def figures(self) -> dict[str, float]:
+        """Return the figures that are known, by their names."""
+        return {name: value for name in self.__slots__ if (value := getattr(self, name)) is not None}
+
+    @property
+    def kind(self) -> str:
+        """Kind of this evidence, by the figures it has."""
+        if self.likeness is not None:
+            return AHEAD_PROVEN if self.proof else AHEAD
+        return DOWN if self.landmarks is not None else DOWN_BARE
+
+    @property
+    def has_twin(self) -> bool:
+        """True if at least half as many landmarks agree with a place elsewhere: both show the same kind of thing."""
+        return self.rival is not None and _to_count(self.landmarks or 0.0) < 2 * _to_count(self.rival)
+
+    @property
+    def leads(self) -> bool:
+        """True if no place elsewhere agrees about as well, by the regions and by the landmarks."""
+        return self.lead >= _NO_LEAD and not self.has_twin
+
+    @property
+    def is_hardly_ahead(self) -> bool:
+        """True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
+        return self.lead < _SMALL_LEAD
+
+    def describe(self) -> str:
+        """Describe the evidence in words, for the log."""
+        ahead = f"{math.exp(self.lead):.2f} times as many regions agree as elsewhere ({math.exp(self.agree):.1%})"
+        if self.landmarks is not None:
+            rival = "" if self.rival is None else f", and {_to_count(self.rival)} with a place elsewhere"
+            return f"{ahead}, {_to_count(self.landmarks)} landmarks agree{rival}"
+        if self.proof:
+            return f"{ahead}, and {math.exp(self.proof):.2f} times as many landmarks"
+        return f"{ahead}, {math.exp(self.coverage):.1%} of the place agrees"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +128,7 @@ class MapCalibration:
     @property
     def hardly_recognisable(self) -> float:
         """Share of the tested places that are hardly recognisable."""
-        return sum(each < _HARDLY for each in self.recognisable.values()) / max(len(self.recognisable), 1)
+        return sum(each < _MIN_RECOGNISABLE for each in self.recognisable.values()) / max(len(self.recognisable), 1)
 
     @property
     def looks_alike(self) -> bool:
@@ -113,18 +168,6 @@ def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
     return (AHEAD, AHEAD_PROVEN) if spec.scan_counts else ()
 
 
-def kind_of(evidence: Evidence) -> str:
-    """Return the kind of this evidence, by the figures it has."""
-    if "likeness" in evidence:
-        return AHEAD_PROVEN if evidence.get("proof") else AHEAD
-    return DOWN if "landmarks" in evidence else DOWN_BARE
-
-
-def has_twin(evidence: Evidence) -> bool:
-    """Return True if at least half as many landmarks agree with a place elsewhere: both show the same kind of thing."""
-    return "rival" in evidence and _count(evidence["landmarks"]) < 2 * _count(evidence["rival"])
-
-
 def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
@@ -137,57 +180,44 @@ def require_usable(kind: str, model: Model) -> None:
     model.threshold(0.999999)
 
 
-def described(evidence: Evidence) -> str:
-    """Describe the evidence of a match in words, for the log."""
-    ahead = (
-        f"{math.exp(evidence['lead']):.2f} times as many regions agree as elsewhere ({math.exp(evidence['agree']):.1%})"
-    )
-    if "landmarks" in evidence:
-        elsewhere_too = f", and {_count(evidence['rival'])} with a place elsewhere" if "rival" in evidence else ""
-        return f"{ahead}, {_count(evidence['landmarks'])} landmarks agree{elsewhere_too}"
-    if evidence.get("proof"):
-        return f"{ahead}, and {math.exp(evidence['proof']):.2f} times as many landmarks"
-    return f"{ahead}, {math.exp(evidence['coverage']):.1%} of the place agrees"
-
-
-def evidence_of(
+def gather_evidence(
     ranking: Ranking, index: PlaceIndex, neighbour_m: float, proof: Agreement | None, same: Collection[int], down: bool
-) -> dict[str, float] | None:
+) -> Evidence | None:
     """Return the evidence for the best place; None if no place was compared or, ahead, a match has no `support`.
 
     `down` tells whether the camera looks straight down. If so, `proof` is the agreement of the landmarks (None: not
     compared), and the places with the numbers `same` show the same ground as the best one, so they are not elsewhere.
     """
     matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
-    if not matches or (not down and any(match.support is None for match in matches.values())):
+    support = {slot: match.support for slot, match in matches.items() if match.support}
+    if not matches or (not down and len(support) < len(matches)):
         return None
     slots = np.array(list(matches))
     best = int(slots[0])
     away = frozenset(slots[elsewhere(index, best, slots, neighbour_m, same if down else ())].tolist())
     agree = {slot: share_of(match) for slot, match in matches.items()}
     rivals = (agree[slot] for slot in away)
-    evidence = {
-        "agree": log_share(agree[best]),
-        "lead": log_share(agree[best]) - log_share(max(rivals, default=_BY_CHANCE)),
-        "coverage": log_share(matches[best].coverage or 0.0),
-        "structure": matches[best].structure or 0.0,
-        "tried": ranking.tried,
-    }
+    evidence = Evidence(
+        agree=log_share(agree[best]),
+        lead=log_share(agree[best]) - log_share(max(rivals, default=_SHARE_BY_CHANCE)),
+        coverage=log_share(matches[best].coverage or 0.0),
+        structure=matches[best].structure or 0.0,
+        tried=ranking.tried,
+    )
     if not down:
-        support = {slot: match.support for slot, match in matches.items() if match.support}
-        evidence["rank_gap"] = support[best].log_rank - min(each.log_rank for each in support.values())
-        evidence["likeness"] = support[best].likeness
-        evidence["proof"] = 0.0  # see `proven`
-    elif proof is not None:
-        evidence["landmarks"] = of_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0)
-    return evidence
+        least_rank = min(each.log_rank for each in support.values())
+        ahead = support[best]
+        return replace(evidence, rank_gap=ahead.log_rank - least_rank, likeness=ahead.likeness, proof=0.0)
+    if proof is None:
+        return evidence
+    return replace(evidence, landmarks=log_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0))
 
 
-def proven(inliers: int, rival: int) -> float:
+def log_times_more(inliers: int, rival: int) -> float:
     """Return the evidence of the landmarks, ahead, where `inliers` agree with those of the best place and `rival` with
     those of the best place elsewhere: the logarithm of how many times more agree than with the rival and by chance. It
     is 0 at least, so it never speaks against a match."""
-    return max(0.0, math.log(max(inliers, _LANDMARKS_BY_CHANCE) / max(rival, _LANDMARKS_BY_CHANCE)))
+    return max(0.0, math.log(max(inliers, _INLIERS_BY_CHANCE) / max(rival, _INLIERS_BY_CHANCE)))
 
 
 def share_of(match: FineMatch) -> float:
@@ -277,18 +307,18 @@ def read_calibration(text: str) -> MapCalibration:
     return MapCalibration(**found)
 
 
-def of_count(landmarks: int) -> float:
+def log_count(landmarks: int) -> float:
     """Return a number of landmarks as it stands in the evidence."""
     return math.log1p(landmarks)
 
 
-def _count(of_evidence: float) -> int:
-    return round(math.expm1(of_evidence))
+def _to_count(logarithm: float) -> int:
+    return round(math.expm1(logarithm))
 
 
 def log_share(share: float) -> float:
     """Return the logarithm of a share, as in the evidence."""
-    return math.log(max(share, _LEAST))
+    return math.log(max(share, _MIN_SHARE))
 
 
 def _checksum(body: str) -> str:

@@ -3,12 +3,13 @@ the recogniser's search of the map.
 
 In flight no hint is ever the only way to find a place: a compass may be wrong and a satellite position false. A query
 that is not accepted with hints is therefore followed by one without (`Prior`). Recorded queries that are measured need
-not follow each other: each is asked with what is said to be known of it (`Told`).
+not follow each other: each is asked with what is known of it (`RecordedPrior`).
 """
 
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.core.errors import UsageError
@@ -18,18 +19,20 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.retrieve import Expectation
+from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.motion import FASTEST_M_S
 
-TOLD = ("heading", "height", "reach")  # what can be told of a recorded query
-TOLD_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
-_FIX_GOOD_FOR_S = 60.0
-_BOTH = (True, True)
-_OFF_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
-_LEAST_SCALE = 0.5
+KNOWN_FIELDS = ("heading", "height", "reach")  # what can be known of a recorded query
+RECORDED_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
+_MAX_FIX_AGE_S = 60.0
+_ALL_TRUSTED = (True, True)
+_SAME_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
+_MIN_SCALE = 0.5
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
-# the best one with: it is as large as what is told of recorded queries, and reaches over so many places.
-_SURE_MASS, _SURE_SD, _OVER_PLACES = 0.99, 4.0, 5.0
+# the best one with: it is as large as that of recorded queries, and reaches over so many places.
+_MIN_MASS = 0.99
+_AREA_SD = 4.0
+_AREA_PLACES = 5.0
 # Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
 _NEEDED = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
@@ -55,32 +58,77 @@ class Hints:
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
-    def agree_with(self, found: Candidate, heading_within_deg: float | None) -> tuple[bool, bool]:
+    def agree_with(self, match: Candidate, heading_within_deg: float | None) -> tuple[bool, bool]:
         """Return whether a match agrees with the area, and whether with the heading, as far as both are known.
         `heading_within_deg` is the largest error of a heading (None: headings are not compared)."""
-        place, turned_deg, is_there, is_so = found.place, found.match.rotation_deg, True, True
+        place, rotation_deg = match.place, match.match.rotation_deg
+        in_reach = in_heading = True
         if self.reach and place.position:
             here, there = self.reach.position, place.position
             away_m = distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
-            is_there = bool(away_m <= self.reach.radius_m)
-        if self.heading_deg is not None and place.heading_deg is not None and turned_deg is not None:
-            off_deg = shorter_deg(turned_deg - (self.heading_deg - place.heading_deg))
-            is_so = heading_within_deg is None or abs(off_deg) <= heading_within_deg
-        return is_there, is_so
+            in_reach = bool(away_m <= self.reach.radius_m)
+        if self.heading_deg is not None and place.heading_deg is not None and rotation_deg is not None:
+            off_deg = shorter_deg(rotation_deg - (self.heading_deg - place.heading_deg))
+            in_heading = heading_within_deg is None or abs(off_deg) <= heading_within_deg
+        return in_reach, in_heading
 
-    def believed(self, in_reach: bool, heading: bool) -> "Hints | None":
-        """Return those of these hints that are believed; None if nothing is left."""
+    def select(self, in_reach: bool, heading: bool) -> "Hints | None":
+        """Return those of these hints that are trusted; None if nothing is left."""
         reach, heading_deg = self.reach if in_reach else None, self.heading_deg if heading else None
         return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
 
 
-class Prior:
-    """Makes the hints for each query, and decides whether hints are to be trusted.
+class RecordedPrior:
+    """Makes the hints for each recorded query from its own frame, whatever became of the query before. `known` are
+    members of `KNOWN_FIELDS`; what a frame lacks of them is not known of this query.
+
+    `heading_within_deg` is that of `Prior`, as are the public attributes, for the query of the last `hints`.
+    `map_height_m` is the height at which the map was made, metres. None: it or the heights of all queries are unknown,
+    and `height` means that each was taken at the map's height.
+    """
+
+    def __init__(
+        self,
+        known: Collection[str] = (),
+        heading_within_deg: float | None = None,
+        map_height_m: float | None = None,
+    ) -> None:
+        self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
+        self.footprint_m: float | None = None
+        self.area: Reach | None = None
+        self.height_ratio = 1.0
+        self.looks_again = True
+
+    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
+        """Return the hints for a frame. The aircraft is within `RECORDED_REACH_M` metres of its recorded position. The
+        arguments `vehicle` and `margin_m`, of a flight, do not count."""
+        ratio: float | None = 1.0
+        if self._map_height_m is not None:
+            ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
+        self.looks_again = "height" not in self._known or ratio is None
+        self.height_ratio = 1.0 if self.looks_again else ratio or 1.0
+        uses_heading = "heading" in self._known and self._heading_within_deg is not None
+        reach = Reach(frame.position, RECORDED_REACH_M) if "reach" in self._known and frame.position else None
+        return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
+
+    def scale(self, height_ratios: Sequence[float]) -> float:
+        """Return 1: pictures are taken as they are."""
+        return 1.0
+
+    def update(self, *match: Any, **more: Any) -> None:
+        """Learn nothing: the next query is another flight's."""
+
+    def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
+        """Learn nothing, as `update`."""
+
+
+class Prior(RecordedPrior):
+    """Makes the hints for each query of a flight, and decides whether hints are to be trusted.
 
     `height_ratio` is the height of the camera, relative to that of the map's pictures (see `FineMatch`), by the last
-    match; where heights are told, and pictures scaled by them, it is how far they are wrong.
-    `footprint_m` is that of the layer of the map in which the last match was, by which the next picture is found best
-    (None: unknown, or its height tells it); the height ratio is relative to it.
+    accepted match (until there is one, that of the map); where heights are known, and pictures scaled by them, it is
+    how far they are wrong. `footprint_m` is that of the layer of the map in which the last match was, by which the next
+    picture is found best (None: unknown, or its height tells it); the height ratio is relative to it.
     `area` is where the aircraft was at the last query, as far as it is known: a wider one than narrows the search.
     `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
     highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
@@ -89,15 +137,13 @@ class Prior:
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
-        self._reach_m_s, self._heading_within_deg, self._is_live = reach_m_s, heading_within_deg, is_live
-        self.footprint_m: float | None = None
-        self.area: Reach | None = None
-        self.height_ratio = 1.0  # of the last accepted match; until there is one, that of the map
-        self.looks_again = self._uses = True
-        self._believed = _BOTH  # area and heading, by the last accepted match
+        super().__init__((), heading_within_deg)
+        self._reach_m_s, self._is_live = reach_m_s, is_live
+        self._uses_hints = True
+        self._trusted = _ALL_TRUSTED  # area and heading, by the last accepted match
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
-        self._followed: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
-        self._known: Hints | None = None
+        self._estimate: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
+        self._known_hints: Hints | None = None
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
@@ -112,33 +158,33 @@ class Prior:
         known, reach = self._last_fix, None
         if vehicle and vehicle.has_gps:
             known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s
-        elif known and frame.t_mono_s - known[1] > _FIX_GOOD_FOR_S:
+        elif known and frame.t_mono_s - known[1] > _MAX_FIX_AGE_S:
             known = None
         if known and self._reach_m_s:
             reach = Reach(known[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - known[1]))
-        if self._followed and self._reach_m_s is None:
-            area, t_s = self._followed
-            if (since_s := abs(frame.t_mono_s - t_s)) <= _FIX_GOOD_FOR_S:
-                least_m = max(TOLD_REACH_M, _OVER_PLACES * margin_m)
-                reach = Reach(area.position, least_m + area.radius_m + FASTEST_M_S * since_s)
+        if self._estimate and self._reach_m_s is None:
+            area, t_s = self._estimate
+            if (since_s := abs(frame.t_mono_s - t_s)) <= _MAX_FIX_AGE_S:
+                least_m = max(RECORDED_REACH_M, _AREA_PLACES * margin_m)
+                reach = Reach(area.position, least_m + area.radius_m + DEFAULT_MAX_SPEED_M_S * since_s)
         self.area = reach
         if known and reach is None:
-            self.area = Reach(known[0], margin_m + FASTEST_M_S * abs(frame.t_mono_s - known[1]))
+            self.area = Reach(known[0], margin_m + DEFAULT_MAX_SPEED_M_S * abs(frame.t_mono_s - known[1]))
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
-        self._known = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
-        return self._known.believed(*self._believed) if self._known and self._uses else None
+        self._known_hints = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
+        return self._known_hints.select(*self._trusted) if self._known_hints and self._uses_hints else None
 
     def scale(self, height_ratios: Sequence[float]) -> float:
         """Return the factor to enlarge the next picture by, so that it is as if taken from one of the `height_ratios`:
         between two of them less is found. Of a picture from above the edges are needed too: it is enlarged no more."""
         ratio = self.height_ratio
-        if not height_ratios or abs(math.log(ratio)) <= math.log(_OFF_SCALE):
+        if not height_ratios or abs(math.log(ratio)) <= math.log(_SAME_SCALE):
             return 1.0
-        return max(ratio, _LEAST_SCALE) if ratio < 1 else ratio / nearest_height(height_ratios, ratio)
+        return max(ratio, _MIN_SCALE) if ratio < 1 else ratio / nearest_height(height_ratios, ratio)
 
-    def learn(
+    def update(
         self,
-        found: Candidate,
+        match: Candidate,
         accepted: bool,
         t_mono_s: float,
         scale: float = 1.0,
@@ -152,94 +198,57 @@ class Prior:
         """
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
         self.looks_again = accepted or not self.looks_again
-        if self._known is None:
-            self._uses, self._believed = True, _BOTH
+        if self._known_hints is None:
+            self._uses_hints, self._trusted = True, _ALL_TRUSTED
         elif accepted:
-            self._believed = self._known.agree_with(found, self._heading_within_deg)
-            self._uses = any(self._believed)
+            self._trusted = self._known_hints.agree_with(match, self._heading_within_deg)
+            self._uses_hints = any(self._trusted)
         else:
-            self._uses = not self._uses
-            self._believed = self._believed if any(self._believed) else _BOTH
-        if accepted and found.match.height_ratio:
-            height_ratio, layer_m = scale * found.match.height_ratio, self.footprint_m
-            if layers and len(layers.footprints_m) > 1 and found.place.pose:
-                seen_m = height_ratio * found.place.pose.footprint_m
+            self._uses_hints = not self._uses_hints
+            self._trusted = self._trusted if any(self._trusted) else _ALL_TRUSTED
+        if not accepted:
+            return
+        if match.match.height_ratio:
+            height_ratio, layer_m = scale * match.match.height_ratio, self.footprint_m
+            if layers and len(layers.footprints_m) > 1 and match.place.pose:
+                seen_m = height_ratio * match.place.pose.footprint_m
                 layer_m = footprint_m or layers.fitting(seen_m)
                 height_ratio = seen_m / (layer_m or seen_m)
-            if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_OFF_SCALE):
+            if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_SAME_SCALE):
                 self.footprint_m, self.height_ratio = layer_m, height_ratio
-        if accepted and found.place.position:
-            self._last_fix = found.place.position, t_mono_s
+        if match.place.position:
+            self._last_fix = match.place.position, t_mono_s
 
-    def follow(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
+    def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
         """Keep where the flight so far puts the aircraft (None: unknown), with the probability `mass` that it is near
         there. It holds until the next is sure too, or for a minute."""
-        if estimate and mass >= _SURE_MASS:
+        if estimate and mass >= _MIN_MASS:
             east_m2, _, north_m2 = estimate.covariance_m2
-            self._followed = Reach(estimate.position, _SURE_SD * math.sqrt(east_m2 + north_m2)), t_mono_s
+            self._estimate = Reach(estimate.position, _AREA_SD * math.sqrt(east_m2 + north_m2)), t_mono_s
 
 
-class Told:
-    """Makes the hints for each recorded query from its own frame, whatever became of the query before. `known` are
-    members of `TOLD`; what a frame lacks of them is not known of this query. `looks_again` and `height_ratio` are those
-    of `Prior`, for the query of the last `hints`.
-
-    `heading_within_deg` is that of `Prior`. `map_height_m` is the height at which the map was made, metres. None: it or
-    the heights of all queries are unknown, and `height` says that each was taken at the map's height.
-    """
-
-    def __init__(
-        self, known: Collection[str], heading_within_deg: float | None, map_height_m: float | None = None
-    ) -> None:
-        self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
-        self.height_ratio = 1.0
-        self.footprint_m: float | None = None
-        self.looks_again = True
-
-    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame. The aircraft is within `TOLD_REACH_M` metres of its recorded position. The
-        arguments `vehicle` and `margin_m`, of a flight, do not count."""
-        ratio: float | None = 1.0
-        if self._map_height_m is not None:
-            ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
-        self.looks_again = "height" not in self._known or ratio is None
-        self.height_ratio = 1.0 if self.looks_again else ratio or 1.0
-        uses_heading = "heading" in self._known and self._heading_within_deg is not None
-        reach = Reach(frame.position, TOLD_REACH_M) if "reach" in self._known and frame.position else None
-        return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
-
-    def follow(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
-        """Keep nothing, as `learn` does."""
-
-    def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return 1: pictures are taken as they are."""
-        return 1.0
-
-    def learn(self, *learnt: object) -> None:
-        """Learn nothing: the next query is another flight's."""
-
-
-def told_parts(text: str | None) -> tuple[str, ...]:
-    """Read "height,heading" as members of `TOLD`, in their order; None as none. Raises UsageError for another text."""
+def parse_known_fields(text: str | None) -> tuple[str, ...]:
+    """Read "height,heading" as members of `KNOWN_FIELDS`, in their order; None as none. Raises UsageError for another
+    text."""
     names = [] if text is None else [name.strip() for name in text.split(",")]
-    if unknown := [name for name in names if name not in TOLD]:
-        raise UsageError(f"`known` names `{unknown[0]}`: use some of {', '.join(TOLD)}, with commas between them.")
-    return tuple(name for name in TOLD if name in names)
+    if unknown := [name for name in names if name not in KNOWN_FIELDS]:
+        raise UsageError(f"`known` names `{unknown[0]}`: use some of {', '.join(KNOWN_FIELDS)}, with commas between.")
+    return tuple(name for name in KNOWN_FIELDS if name in names)
 
 
-def lacking(
+def explain_useless(
     known: Collection[str],
     queries: Collection[GeoTag],
     places: Collection[GeoTag] | Collection[Place],
     sequence: int,
 ) -> str | None:
-    """Return a sentence on why no query can be asked with what is `known` (see `Told`); None if some can. `sequence` is
-    the number of queries that are matched together."""
+    """Return a sentence on why no query can be asked with what is `known` (see `RecordedPrior`); None if some can.
+    `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
         return f"{sequence} queries are matched together, and what is known narrows only single ones: leave one out."
     for part, (field, columns) in _NEEDED.items():
-        for name, of in (("query", queries), ("place", places)):
-            if part in known and all(getattr(each, field) is None for each in of):
+        for name, tags in (("query", queries), ("place", places)):
+            if part in known and all(getattr(tag, field) is None for tag in tags):
                 return f"No {name} has what `{part}` needs: write {columns} into positions.csv, or leave `{part}` out."
     return None
 
@@ -250,10 +259,10 @@ def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex
         reach = None
     if not index.knows_headings:
         heading_deg = None
-    return Hints(reach, heading_deg).believed(*_BOTH)
+    return Hints(reach, heading_deg).select(*_ALL_TRUSTED)
 
 
-def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
+def to_expectation(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
     """Convert hints and height into what a search expects of each place of the index (see `Expectation`)."""
     in_reach = turned_deg = None
     if hints and hints.reach:
@@ -261,8 +270,3 @@ def expected_of(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> 
     if hints and hints.heading_deg is not None:
         turned_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
     return Expectation(in_reach, turned_deg, height_ratio)
-
-
-def other_heights(height_ratios: Sequence[float], first: float) -> list[float]:
-    """Return the height ratios to search at after `first`: all but the one nearest to it."""
-    return [ratio for ratio in height_ratios if ratio != nearest_height(height_ratios, first)]

@@ -18,8 +18,8 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Evidence, Model, prior
-from edgevpr.runtime.recognise.evidence import MapCalibration, described, has_twin, kind_of, kinds_of
+from edgevpr.runtime.recognise.confidence import Model, prior
+from edgevpr.runtime.recognise.evidence import Evidence, MapCalibration, kinds_of
 from edgevpr.runtime.recognise.locate import Located
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
@@ -44,12 +44,9 @@ _AT_REST_HEIGHT = 0.2
 _CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
 # Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
 _OF_SCORE_WHEN_PROVEN = 0.5
-# A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
-_HARDLY_AHEAD = math.log(1.5)
 # The least lead over the same place with the picture turned otherwise. Over sat_marash's ground, heading unknown, 273
 # of 276 right matches have more, and two of three wrong ones less: a bridge taken for its other end.
 _AHEAD_OF_TURNED = math.log(1.75)
-_NO_LEAD = math.log(1.05)
 # Probabilities: the highest where a place elsewhere agrees as well; the least for accepting, at any precision, by the
 # match alone, and by the flight so far.
 _EVEN, _LEAST_SURE, _SURE_BY_FLIGHT = 0.5, 0.9, 0.99
@@ -71,22 +68,22 @@ class Sureness:
 
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees about as well."""
-        confidence = self.models[kind_of(evidence)].confidence(evidence)
-        return confidence if leads(evidence) else min(confidence, _EVEN)
+        confidence = self.models[evidence.kind].confidence(evidence.figures())
+        return confidence if evidence.leads else min(confidence, _EVEN)
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
-        return self.models[kind_of(evidence)].confidence_of_map(evidence)
+        return self.models[evidence.kind].confidence_of_map(evidence.figures())
 
     def is_open(self, evidence: Evidence) -> bool:
         """Return True if more evidence of the place can still decide: the match leads, its query is likely to show
         ground of the map, and it is not sure yet."""
-        is_likely = leads(evidence) and self.of_map(evidence) >= _EVEN
+        is_likely = evidence.leads and self.of_map(evidence) >= _EVEN
         return is_likely and self.confidence(evidence) < self.threshold(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
         """Return the confidence needed to accept a match with this kind of evidence."""
-        return self.needed(kind_of(evidence))
+        return self.needed(evidence.kind)
 
     def needed(self, kind: str) -> float:
         """Return the confidence needed to accept a match with evidence of this kind."""
@@ -236,13 +233,13 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = f"confidence {nines(confidence)}, {nines(needed)} needed: {described(evidence)}"
+    figures = f"confidence {nines(confidence)}, {nines(needed)} needed: {evidence.describe()}"
     if followed is not None:
         figures = f"{nines(followed)} sure by the flight so far; {figures}"
     by_itself = confidence >= needed
     if not (by_itself or (followed is not None and _is_sure_by_flight(followed, confidence, needed, sure.precision))):
         return Verdict(False, figures)
-    if evidence["lead"] < 0 and not by_itself:
+    if evidence.lead < 0 and not by_itself:
         return Verdict(False, f"a place elsewhere agrees better: {figures}")
     if followed is not None and followed < _LEAST_FOLLOWED:
         return Verdict(False, f"the flight so far speaks against it: {figures}")
@@ -256,16 +253,6 @@ def _is_sure_by_flight(followed: float, confidence: float, needed: float, precis
     `confidence` of the one `needed`."""
     is_raised = followed * (1 - confidence) >= _RAISED * confidence * (1 - followed)
     return followed >= max(_SURE_BY_FLIGHT, min(needed, precision) if is_raised else needed)
-
-
-def leads(evidence: Evidence) -> bool:
-    """Return True if no place elsewhere agrees about as well, by the regions and by the landmarks."""
-    return evidence["lead"] >= _NO_LEAD and not has_twin(evidence)
-
-
-def is_hardly_ahead(evidence: Evidence) -> bool:
-    """Return True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
-    return evidence["lead"] < _HARDLY_AHEAD
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:

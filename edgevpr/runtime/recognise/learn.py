@@ -20,9 +20,9 @@ from edgevpr.core.types import Frame, Place, Position, Vehicle
 from edgevpr.frames.level import View
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.retrieve import named
-from edgevpr.runtime.recognise.follow import Followed
-from edgevpr.runtime.recognise.levelling import GPS_SD_M, laid
-from edgevpr.runtime.recognise.locate import HEARD, as_learnt, located
+from edgevpr.runtime.recognise.levelling import GPS_SD_M, place_at_middle
+from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, combine_with_recorded, locate
+from edgevpr.runtime.recognise.place_filter import Followed
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -78,18 +78,18 @@ class Learner:
     def learn(self, event: Recognition) -> Place | None:
         """Make a place of an event's frame. Return its number, picture, position and quality; None if the frame is left
         out. Never raises MapError."""
-        frame, seen = event.frame, event.descriptor
-        if self.trouble is not None or self.is_off or event.failed or frame is None or seen is None:
+        frame, picture, seen = event.frame, event.picture, event.descriptor
+        if self.trouble is not None or self.is_off or event.failed or not (frame and picture and seen):
             return None
         place = None
         try:
-            here = laid(self._placed(frame, event.vehicle), event.view)
+            here = place_at_middle(self._placed(frame, event.vehicle), event.view)
             self._require_worth(here.position, seen, event)
             here = self._tied(here, event)
             self._map.require_unchanged()  # a place written to a deleted file would be lost
             worth = event.worth
             salience = replace(worth.salience, is_low=worth.reason is not None) if worth else None
-            place_id = self._map.add(here, seen, salience, self._recogniser.landmarks(event))
+            place_id = self._map.add(here, seen, salience, self._recogniser.encoder.pack_landmarks(picture))
             self.learnt += 1
             place = Place(place_id=place_id, source_image=here.name, position=here.position, quality=seen.quality)
             self._growing.add(place_id, here.position, seen.coarse, here.heading_deg)
@@ -101,7 +101,7 @@ class Learner:
         except MapError as error:
             self.trouble = str(error)
         if place:
-            self._recogniser.extend(self._growing.index, place.place_id, frame.t_mono_s)
+            self._recogniser.add_place(self._growing.index, place.place_id, frame.t_mono_s)
         return place
 
     def _placed(self, frame: Frame, vehicle: Vehicle | None) -> Frame:
@@ -136,13 +136,13 @@ class Learner:
         if frame.pose or frame.position is None or event.ranking is None or not recogniser.technique.spec.looks_down:
             return frame
         try:
-            found = named(event.ranking, recogniser.index, self._map, first=HEARD)
+            found = named(event.ranking, recogniser.index, self._map, first=MAX_PLACES_CHECKED)
         except PlaceError:  # the unreadable place is left out from now on; the frame can be learnt without it
             return frame
         if found[0].match.score < recogniser.technique.min_score:
             return frame
-        where = located(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the picture's middle
-        learnt = where and not where.objection and as_learnt(where, frame.position, GPS_SD_M)
+        where = locate(found, recogniser.technique.spec.cells, View(aside=(0.0, 0.0)))  # of the picture's middle
+        learnt = where and not where.objection and combine_with_recorded(where, frame.position, GPS_SD_M)
         return replace(frame, position=learnt[0], pose=learnt[1]) if learnt else frame
 
 

@@ -1,12 +1,9 @@
-"""The first step of recognising a frame: takes the distortion of its lens away, and levels the picture of a camera that
-looks straight down, as if the aircraft flew level. Also computes the position of a place from the picture's position on
-the ground (`laid`).
-
-A wrong height scales a picture wrongly; a technique with `height_ratios` recognises it nevertheless.
+"""Levelling: takes the distortion of a lens away, and warps the picture of a camera that looks straight down as if the
+aircraft flew level. A wrong height scales a picture wrongly; a technique with `height_ratios` recognises it anyway.
 """
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from edgevpr.core.arrays import Mask
 from edgevpr.core.config import SourceConfig
@@ -34,12 +31,13 @@ from edgevpr.places.layers import Layers
 GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
-UNTOLD_TILT = 0.04
+TILT_SD_WITHOUT_ATTITUDE = 0.04
 _FIELDS_AGREE_DEG = 5.0  # that of a data sheet is rounded
 
 _log = logging.getLogger(__name__)
 
 
+@dataclass(slots=True)
 class Levelling:
     """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they stay as they
     are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
@@ -49,24 +47,16 @@ class Levelling:
     level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
     """
 
-    def __init__(
-        self,
-        lens: Lens | None,
-        *,
-        below: bool = False,
-        on_gimbal: bool = False,
-        is_live: bool,
-        mount: Mount = STRAIGHT_DOWN,
-    ) -> None:
-        self.lens = lens
-        self._below, self._on_gimbal, self._is_live, self._mount = below, on_gimbal, is_live, mount
-        self._has_warned = False
+    lens: Lens | None
+    below: bool = field(default=False, kw_only=True)
+    on_gimbal: bool = field(default=False, kw_only=True)
+    is_live: bool = field(kw_only=True)
+    mount: Mount = field(default=STRAIGHT_DOWN, kw_only=True)
+    _has_warned: bool = field(default=False, init=False)
 
-    def looking(self, mount: Mount) -> "Levelling":
+    def with_mount(self, mount: Mount) -> "Levelling":
         """Return the same for a camera that is mounted otherwise."""
-        lens = self.lens and replace(self.lens, mount=mount)
-        how = {"below": self._below, "on_gimbal": self._on_gimbal, "is_live": self._is_live}
-        return Levelling(lens, **how, mount=mount)
+        return replace(self, lens=self.lens and replace(self.lens, mount=mount), mount=mount)
 
     def prepare(
         self,
@@ -81,30 +71,30 @@ class Levelling:
         False where the picture shows no ground (None: nowhere). Its longest side is scaled to a length on the ground,
         that of the places to look among by their `layers` (None: no scaling). It shows `scale` times as much ground as
         its height tells or, where that is unknown, as those of the map."""
-        if vehicle and not (self._is_live and vehicle.is_fresh_at(frame.t_mono_s)):
+        if vehicle and not (self.is_live and vehicle.is_fresh_at(frame.t_mono_s)):
             vehicle = None
-        if vehicle and self._on_gimbal:
+        if vehicle and self.on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self._mount)), scale)
+            return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self.mount)), scale)
         own_m = footprint_of(frame, vehicle, self.lens) if layers else None
         footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
-        picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self._below, scale=scale)
+        picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
             _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
         return picture
 
 
+@dataclass(frozen=True, slots=True)
 class Straightening:
     """Takes the distortion of a lens from the pictures of a camera that looks ahead, which are not levelled."""
 
-    def __init__(self, lens: CalibratedLens) -> None:
-        self._lens = lens
+    lens: CalibratedLens
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> Levelled:
         """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
-        return straightened(frame.image, overlay, UNKNOWN_VIEW, self._lens)
+        return straightened(frame.image, overlay, UNKNOWN_VIEW, self.lens)
 
 
 def levelling_of(
@@ -121,8 +111,7 @@ def levelling_of(
         _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
-    on_gimbal, is_live = config.gimbal, is_now(config)
-    return Levelling(lens, below=below, on_gimbal=on_gimbal, is_live=is_live, mount=mount)
+    return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_now(config), mount=mount)
 
 
 def lens_of(config: SourceConfig) -> Lens | None:
@@ -156,30 +145,28 @@ def is_now(config: SourceConfig) -> bool:
     return config.uri is not None and is_live(config.uri)
 
 
-def seen_as(frame: Frame, view: View) -> Frame:
+def with_picture_heading(frame: Frame, view: View) -> Frame:
     """Return the frame with the heading of the top of its levelled picture, for the hints, if that is known."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
-def laid(frame: Frame, view: View) -> Frame:
+def place_at_middle(frame: Frame, view: View) -> Frame:
     """Change a frame to what a place stores. Its heading becomes that of the levelled picture. If it has a position,
     this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
     with a known height and heading it gets a pose."""
-    frame = seen_as(frame, view)
+    frame = with_picture_heading(frame, view)
     if frame.position and view.lean_m:
         east_m, north_m = view.lean_m
-        lat_deg, lon_deg = moved(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
-        return replace(frame, position=Position(lat_deg, lon_deg, frame.position.alt_m))
+        middle = moved(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
+        return replace(frame, position=Position(*middle, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
-    variance_m2 = GPS_SD_M**2
-    position = frame.position
+    variance_m2, position = GPS_SD_M**2, frame.position
     if view.aside is None:
-        variance_m2 += (UNTOLD_TILT * view.footprint_m) ** 2
+        variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
         # The point `aside` is below the aircraft: the picture's middle is as far from it, in the opposite direction.
         off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
-        lat_deg, lon_deg = moved(position.lat_deg, position.lon_deg, *off_m.tolist())
-        position = Position(lat_deg, lon_deg, position.alt_m)
+        position = Position(*moved(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)

@@ -16,20 +16,21 @@ from edgevpr.core.geodesy import axes_of, moved, offset_m
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
-from edgevpr.runtime.recognise.levelling import UNTOLD_TILT
-from edgevpr.runtime.recognise.perspective import Lean, lean_shown
+from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
+from edgevpr.runtime.recognise.perspective import Lean, fit_lean
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
-_OF_VOTE, _OF_LANDMARKS = 0.016, 0.008
-_SCALE_SD, _TURN_SD = 0.03, 0.03  # of a place's pose, as shares of the length of a shift
-_OF_SCATTER = 0.25  # share of the covariance of single votes that their mean has
-_LIKE_THE_BEST = 0.5  # of the best score: matches with at least that score are used too
-_DISAGREES = 4.0  # standard deviations: places that differ by more are not used
-_CONTRADICTS = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
+_VOTE_SD_SHARE = 0.016
+_LANDMARK_SD_SHARE = 0.008
+_POSE_SD = 0.03  # of the scale and the rotation of a place's pose, as a share of the length of a shift
+_MEAN_VARIANCE_SHARE = 0.25  # of the covariance of single votes, which their mean has
+_MIN_SCORE_SHARE = 0.5  # of the best score: matches with at least that score are used too
+_MAX_DIFFERENCE_SD = 4.0  # places that differ by more are not used
+_CONTRADICTION_SHARE = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
 _OUTWEIGHS = 0.4  # share of the scores of agreeing places; contradicting ones with more make the position doubtful
-HEARD = 12  # places looked at; in a dense map so many show the same ground
-_SAYING = 5  # of these determine the position
+MAX_PLACES_CHECKED = 12  # in a dense map so many show the same ground
+_MAX_PLACES_AVERAGED = 5  # of these determine the position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,23 +66,24 @@ class Located:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Said:
+class _PlaceEstimate:
     """Position of the aircraft as computed from one place. `at_m` (2,) is metres east and north of the best place. It
     has two covariances (2, 2): `of_step` by the errors of the match, `of_pose` by those of the place's pose.
     `rotation_deg` and `height_ratio`, of the query on the place, are as in `FineMatch`."""
 
     place_id: int
+    score: float
     at_m: Doubles
     of_step: Doubles
     of_pose: Doubles
     rotation_deg: float
     height_ratio: float | None
 
-    def agrees_with(self, other: "_Said") -> bool:
+    def agrees_with(self, other: "_PlaceEstimate") -> bool:
         """Return True if both positions are about the same. Relative to each other, poses are known far better than on
         the Earth, so only half of the variance of each counts."""
         covariance = self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2
-        return in_sd(self.at_m - other.at_m, covariance) <= _DISAGREES
+        return in_sd(self.at_m - other.at_m, covariance) <= _MAX_DIFFERENCE_SD
 
 
 def at_place(position: Position, accuracy_m: float) -> Located:
@@ -89,10 +91,10 @@ def at_place(position: Position, accuracy_m: float) -> Located:
     return Located(position=position, covariance_m2=(accuracy_m**2, 0.0, accuracy_m**2))
 
 
-def located(
-    found: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, proof: Agreement | None = None
+def locate(
+    places: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, proof: Agreement | None = None
 ) -> Located | None:
-    """Return the position of the aircraft by the places `found`, best first; None if the best has no pose or its match
+    """Return the position of the aircraft by the `places` found, best first; None if the best has no pose or its match
     no shift. `cells` is the number of cells along the longest side of a picture (None: shifts cannot be converted to
     metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is unknown, it is
     about the middle. `proof` is the agreement of the landmarks of the best place, which gives another shift.
@@ -101,38 +103,38 @@ def located(
     and the first five with at least half of the best one's score determine the position. Those with such a score whose
     position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
     """
-    best, pose, aside, lean = found[0].place, found[0].place.pose, view.aside or (0.0, 0.0), None
-    first = _said(found[0], best, cells, aside)
+    best, pose, aside, lean = places[0].place, places[0].place.pose, view.aside or (0.0, 0.0), None
+    first = _estimate(places[0], best, cells, aside)
     if first is None or best.position is None or pose is None:
         return None
-    others = ((each.match.score, _said(each, best, cells, aside)) for each in found[1:])
-    said = [(found[0].match.score, first), *((score, each) for score, each in others if each)]
+    estimates = [first, *filter(None, (_estimate(place, best, cells, aside) for place in places[1:]))]
     if proof and proof.is_expected and proof.inliers >= CONFIRMED:
-        first = _said(found[0], best, cells, aside, proof) or first
-        said.insert(0, (found[0].match.score, first))
+        first = _estimate(places[0], best, cells, aside, proof) or first
+        estimates.insert(0, first)
         if proof.coinciding:
-            lean = lean_shown(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
-    least = _LIKE_THE_BEST * found[0].match.score
-    agreeing = [(score, each) for score, each in said if first.agrees_with(each)]
-    at_m, covariance = _joined([each for score, each in agreeing if score >= least][:_SAYING])
+            lean = fit_lean(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
+    least = _MIN_SCORE_SHARE * first.score
+    agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
+    at_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
     if view.lean_m is not None:
         at_m = at_m + view.lean_m
     elif view.aside is None:
-        covariance += (UNTOLD_TILT * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
-    objection, apart_m = None, [(score, float(np.hypot(*(each.at_m - first.at_m)))) for score, each in said]
-    against = [(score, off_m) for score, off_m in apart_m if score >= least and off_m > _CONTRADICTS * pose.footprint_m]
-    if sum(score for score, _ in against) > _OUTWEIGHS * sum(score for score, _ in agreeing):
+        covariance += (TILT_SD_WITHOUT_ATTITUDE * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
+    objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
+    apart = [(each.score, float(np.hypot(*(each.at_m - first.at_m)))) for each in estimates if each.score >= least]
+    against = [(score, off_m) for score, off_m in apart if off_m > far_m]
+    if sum(score for score, _ in against) > _OUTWEIGHS * sum(each.score for each in agreeing):
         objection = f"places of the same ground say positions that are {max(against)[1]:.0f} m apart"
-    lat_deg, lon_deg = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
+    here = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
-        position=Position(lat_deg, lon_deg, best.position.alt_m),
-        covariance_m2=triple(covariance),
+        position=Position(*here, best.position.alt_m),
+        covariance_m2=to_triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,
         footprint_m=footprint_m,
         height_m=view.focal and view.focal * footprint_m,
-        places=tuple(dict.fromkeys(each.place_id for _, each in agreeing)),
+        places=tuple(dict.fromkeys(each.place_id for each in agreeing)),
         objection=objection,
         lean=lean,
     )
@@ -148,45 +150,44 @@ def in_sd(step: Doubles, covariance: Doubles) -> float:
     return math.sqrt(step @ np.linalg.solve(covariance, step))
 
 
-def as_learnt(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
+def combine_with_recorded(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
     """Return position and pose of a new place. Two positions of it are combined: `recorded`, whose standard deviation
     along one axis is `recorded_sd_m`, and `where`, computed from the places around it. None if the two contradict each
     other, or `where` has no heading or footprint."""
     off_m = _off_m(recorded, where.position)
     by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
-    if in_sd(off_m, both) > _DISAGREES or where.heading_deg is None or where.footprint_m is None:
+    if in_sd(off_m, both) > _MAX_DIFFERENCE_SD or where.heading_deg is None or where.footprint_m is None:
         return None
     gain = by_record @ np.linalg.inv(both)
     covariance = gain @ by_places
     pose = Pose(
         up_deg=where.heading_deg,
         footprint_m=where.footprint_m,
-        covariance_m2=triple(covariance),
+        covariance_m2=to_triple(covariance),
         recorded=Position(recorded.lat_deg, recorded.lon_deg),
     )
-    lat_deg, lon_deg = moved(recorded.lat_deg, recorded.lon_deg, *(gain @ off_m).tolist())
-    return Position(lat_deg, lon_deg, recorded.alt_m), pose
+    return Position(*moved(recorded.lat_deg, recorded.lon_deg, *(gain @ off_m).tolist()), recorded.alt_m), pose
 
 
-def _joined(said: list[_Said]) -> tuple[Doubles, Doubles]:
+def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
     """Return the mean (2,) of the positions computed from several places, and its covariance (2, 2)."""
-    of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in said))
-    at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in said)
-    if len(said) > 1:
+    of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in estimates))
+    at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in estimates)
+    if len(estimates) > 1:
         # If places differ by more than their covariances allow, these are scaled up (Birge 1932).
-        off = sum((each.at_m - at_m) @ np.linalg.solve(each.of_step, each.at_m - at_m) for each in said)
-        of_step = of_step * max(1.0, float(off) / (2 * (len(said) - 1)))
+        off = sum((each.at_m - at_m) @ np.linalg.solve(each.of_step, each.at_m - at_m) for each in estimates)
+        of_step = of_step * max(1.0, float(off) / (2 * (len(estimates) - 1)))
     # Errors of the poses are common to neighbours: using several makes them no smaller.
-    return at_m, of_step + np.mean([each.of_pose for each in said], axis=0)
+    return at_m, of_step + np.mean([each.of_pose for each in estimates], axis=0)
 
 
-def _said(
+def _estimate(
     found: Candidate, best: Place, cells: int | None, aside: tuple[float, float], proof: Agreement | None = None
-) -> _Said | None:
+) -> _PlaceEstimate | None:
     """Compute the position of the aircraft from one place, by the shift of its match or, with `proof`, by the landmarks
     that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture is too far
-    away to show the same ground. `cells` is as in `located`, and `aside` as in `View`."""
+    away to show the same ground. `cells` is as in `locate`, and `aside` as in `View`."""
     match, place, pose = found.match, found.place, found.place.pose
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
@@ -197,12 +198,12 @@ def _said(
         return None
     if proof:
         rotation_deg, height_ratio, step = proof.rotation_deg or 0.0, proof.scale, np.array(proof.shift_share)
-        covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _OF_LANDMARKS**2 * np.eye(2)
+        covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _LANDMARK_SD_SHARE**2 * np.eye(2)
     else:
         rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
         # The match's covariance is that of single votes; their mean has a fraction of it.
         covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
-        covariance = covariance * _OF_SCATTER + _OF_VOTE**2 * np.eye(2)
+        covariance = covariance * _MEAN_VARIANCE_SHARE + _VOTE_SD_SHARE**2 * np.eye(2)
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
     right, up = aside
@@ -210,14 +211,11 @@ def _said(
     dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
     axes = axes_of(pose.up_deg)
     step_m = pose.footprint_m * (axes @ (dx, -dy))
-    length_m = float(np.hypot(*step_m))
-    towards = step_m / length_m if length_m else np.zeros(2)
-    aslant = np.array([-towards[1], towards[0]])
-    by_length = np.outer(towards, towards) * (_SCALE_SD * length_m) ** 2
-    by_length += np.outer(aslant, aslant) * (_TURN_SD * length_m) ** 2
+    by_length = (_POSE_SD * float(np.hypot(*step_m))) ** 2 * np.eye(2)
     upwards = covariance * [[1, -1], [-1, 1]]  # y up instead of down
-    return _Said(
+    return _PlaceEstimate(
         place_id=place.place_id,
+        score=match.score,
         at_m=off_m + step_m,
         of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
         of_pose=matrix_of(pose.covariance_m2),
@@ -231,6 +229,6 @@ def _off_m(origin: Position, position: Position) -> Doubles:
     return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 
-def triple(covariance: Doubles) -> Covariance:
+def to_triple(covariance: Doubles) -> Covariance:
     """Return a covariance matrix (2, 2) as (variance, covariance, variance), the inverse of `matrix_of`."""
     return float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])

@@ -19,19 +19,20 @@ from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
-from edgevpr.runtime.recognise.follow import Follower
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.hints import Prior, Told
+from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, is_now, levelling_of
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser, WalkSettings
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
 from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques.card import load_card
 
-_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
+_MAX_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
 _log = logging.getLogger(__name__)
 Settings = Mapping[str, int | float | str]  # parameters of a technique, by their names
 _ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
@@ -44,13 +45,14 @@ def open_recogniser(
     narrowed: bool = False,
     known: Collection[str] = (),
     follows: bool = False,
+    meter: QueryMeter | None = None,
 ) -> Recogniser:
     """Open the map, make its technique for the board, and load the index.
 
     With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
-    but for what is `known` of recorded ones (see `Told`). With `follows`, the queries are those of one flight, in order
-    (see `follow`). Raises an EdgevprError that names what does not fit together, such as a setting that the map was not
-    built with.
+    but for what is `known` of recorded ones (see `RecordedPrior`). With `follows`, the queries are those of one flight,
+    in order (see `place_filter`). `meter` measures the queries (None: by the clocks of this computer). Raises an
+    EdgevprError that names what does not fit together, such as a setting that the map was not built with.
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
@@ -67,10 +69,11 @@ def open_recogniser(
             index = place_map.ram.of(place_map.ram.tiles)
         else:
             index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
-        prior: Prior | Told | None = Told(known, technique.spec.heading_within_deg) if known else None
+        prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
-            prior = _in_flight(config, technique)
-        recogniser = _recogniser(config, board, technique, place_map, index, prior=prior, follows=follows)
+            prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+        meter = meter or meter_of(config, board)
+        recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
 
@@ -98,7 +101,9 @@ def searched_places(recogniser: Recogniser) -> int:
     return min(place_map.most_searched, in_ram) if isinstance(place_map, TileMap) else in_ram
 
 
-def open_learning(config: Config, board: Board, new_technique: str | None) -> tuple[Recogniser, GrowingIndex]:
+def open_learning(
+    config: Config, board: Board, new_technique: str | None, meter: QueryMeter | None = None
+) -> tuple[Recogniser, GrowingIndex]:
     """Open a map for adding places. Returns a recogniser for a flight, as `open_recogniser` does, and the index that
     takes new places, up to the memory budget. If there is no map, an empty one is made for the technique
     `new_technique` (None: a map must exist)."""
@@ -114,8 +119,9 @@ def open_learning(config: Config, board: Board, new_technique: str | None) -> tu
         technique = technique_of(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior, follows = _in_flight(config, technique), config.match.follow
-        recogniser = _recogniser(config, board, technique, place_map, growing.index, prior=prior, follows=follows)
+        prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+        meter, follows = meter or meter_of(config, board), config.match.follow
+        recogniser = _recogniser(config, technique, place_map, growing.index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
 
@@ -197,78 +203,63 @@ def technique_of(
     return technique
 
 
-def say_other_mask(place_map: ReadMap, mask: Mask | None) -> None:
-    """Warn if the places of a map, which remain usable, were made with another mask than `mask`."""
-    built_with = place_map.mask_sha256
-    if len(place_map) and built_with != (mask.sha256 if mask else None):
-        how = "without a mask" if built_with is None else "with another mask"
-        _log.warning("%s was built %s; more is recognised where map and frames have the same", place_map.path, how)
-
-
-def say_other_lens(place_map: ReadMap, lens: str | None) -> None:
-    """Say if pictures are straightened by the calibration `lens` and the places of a map were not, or the other way
-    round, which is right where one of the two cameras has no distortion."""
-    built_with = place_map.lens
-    if len(place_map) and built_with and not lens:
+def warn_of_other_pictures(place_map: ReadMap, mask: Mask | None, lens: str | None) -> None:
+    """Warn if the places of a map, which remain usable, were made with another `mask`; and say if pictures are
+    straightened by the calibration `lens` and those of the places were not, or the other way round, which is right
+    where one of the two cameras has no distortion."""
+    if not len(place_map):
+        return
+    path, built_mask, built_lens = place_map.path, place_map.mask_sha256, place_map.lens
+    if built_mask != (mask.sha256 if mask else None):
+        how = "without a mask" if built_mask is None else "with another mask"
+        _log.warning("%s was built %s; more is recognised where map and frames have the same", path, how)
+    if built_lens and not lens:
         _log.warning(
             "%s was built with `source.lens` (%s): name the calibration of this camera too, unless it distorts nothing",
-            place_map.path,
-            built_with,
+            path,
+            built_lens,
         )
-    elif len(place_map) and lens and not built_with:
-        _log.info("%s was built without `source.lens`: right if its pictures had no distortion", place_map.path)
-
-
-def _in_flight(config: Config, technique: Technique) -> Prior:
-    """Make what narrows the queries of a flight."""
-    return Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+    elif lens and not built_lens:
+        _log.info("%s was built without `source.lens`: right if its pictures had no distortion", path)
 
 
 def _recogniser(
     config: Config,
-    board: Board,
     technique: Technique,
     place_map: ReadMap,
     index: PlaceIndex,
+    meter: QueryMeter,
     *,
-    prior: Prior | Told | None,
+    prior: RecordedPrior,
     follows: bool,
 ) -> Recogniser:
-    match, length = config.match, length_of(technique.spec, config.match.sequence)
+    match, source, is_flight = config.match, config.source, isinstance(prior, Prior)
+    length, mask = length_of(technique.spec, match.sequence), mask_of(source.mask)
     rule = accept_rule(technique, match, length, calibration_of(place_map))
-    matcher = Matcher(technique, index, rule, search_of(length))
-    mask, is_live = mask_of(config.source.mask), is_now(config.source)
-    say_other_mask(place_map, mask)
-    say_other_lens(place_map, config.source.lens)
-    follower = None
+    warn_of_other_pictures(place_map, mask, source.lens)
+    place_filter = None
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and kinds_of(technique.spec):
-        follower = Follower(place_map, fastest_m_s=match.reach_m_s, is_live=is_live)
-    candidates = match.candidates or technique.candidates
-    levelling = levelling_of(config.source, technique)
+        place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_now(source))
+    levelling, gate = levelling_of(source, technique), gate_of(config.salience, meter.board.threads)
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
-    preparation = Preparation(
-        levelling=levelling,
-        mask=mask,
-        gate=gate_of(config.salience, board.threads),
-        strides=Strides() if isinstance(prior, Prior) and knows_scale else None,
-    )
     recogniser = Recogniser(
-        matcher,
+        FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
         place_map,
-        meter_of(config, board),
+        Matcher(index, rule, search_of(length)),
+        meter,
         WalkSettings(
-            candidates=candidates,
+            candidates=match.candidates or technique.candidates,
             verify=match.verify,
             min_accuracy_m=config.mavlink.min_accuracy_m,
         ),
-        preparation=preparation,
+        strides=Strides() if is_flight and knows_scale else None,
         # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
-        prior=None if matcher.search else prior,
-        follower=follower,
+        prior=prior if length == 1 else None,
+        place_filter=place_filter,
     )
-    if isinstance(prior, Prior):
-        place_map.wait_at_most(_WAIT_S)
+    if is_flight:
+        place_map.wait_at_most(_MAX_WAIT_S)
     return recogniser
 
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Array
-from edgevpr.core.geodesy import axes_of
+from edgevpr.core.geodesy import axes_of, fit_similarity
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.agreement import fitted
 
 _FEWEST = 12  # landmarks
 _POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
@@ -32,7 +31,7 @@ class Lean:
     sd: float
 
 
-def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | None:
+def fit_lean(asked: Array, known: Array, view: View, up_deg: float) -> Lean | None:
     """Return the lean that landmarks show; None if they are too few, or the view has no attitude or focal length.
 
     `asked` and `known`, complex (n,), are the landmarks of query and place that agree, as in `agreement`. `up_deg` is
@@ -44,7 +43,7 @@ def lean_shown(asked: Array, known: Array, view: View, up_deg: float) -> Lean | 
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
     # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
     ray = (asked - complex(view.aside[0], -view.aside[1])) / view.focal
-    turn_scale, _ = fitted(asked, known)
+    turn_scale, _ = fit_similarity(asked, known)
     by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
     # A slope of the ground stretches and shears the picture too, by a few per cent.
     linear = (asked, 1j * asked, asked.conj(), 1j * asked.conj())

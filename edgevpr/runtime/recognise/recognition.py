@@ -1,6 +1,5 @@
 """The event of one frame: everything that happened to it, in one value. Made by the recogniser, written to the log."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -9,20 +8,22 @@ from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost,
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.follow import Followed
+from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.place_filter import Followed
 from edgevpr.runtime.recognise.salience_gate import Worth
 from edgevpr.runtime.recognise.stride import Stride
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
-    """Result of one frame, which the recogniser fills in on the way. A field is None if its step was not reached.
+    """Result of one frame. A field is None if its stage was not reached.
 
-    The channel to the autopilot sets `fix` and `last_fix`: what became of the position, and of the one sent before.
+    `fix` and `last_fix` are what became of the position, and of the one sent before (None: the event was not yet given
+    to the channel to the autopilot).
     """
 
     frame: Frame | None
@@ -35,7 +36,7 @@ class Recognition:
     ranking: Ranking | None = None
     best: Candidate | None = None  # the first of the ranking
     proof: Agreement | None = None  # of the landmarks
-    evidence: Mapping[str, float] | None = None
+    evidence: Evidence | None = None
     confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
     followed: Followed | None = None  # the result together with the flight so far
     accepted: bool = False  # `best` is taken for the place
@@ -72,26 +73,23 @@ class Recognition:
         return self.descriptor is not None
 
 
-def unrounded_fields_of(event: Recognition) -> dict[str, Any]:
-    """Return the fields of `fields_of`, with the confidence as it is: six digits make 1 of what is nearly sure."""
-    return fields_of(event) | ({} if event.confidence is None else {"confidence": event.confidence})
-
-
-def fields_of(event: Recognition) -> dict[str, Any]:
-    """Return the event as a dict for the flight log (kind "query"). `edgevpr match --json` is made of it too.
+def fields_of(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
+    """Return the event as a dict for the flight log (kind "query"), or with an `exact` confidence, of which six digits
+    would make 1 where it is nearly sure. `edgevpr match`, its page and the status of a flight are made of it too.
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
     if nothing was accepted), costs. Only if known: view (how the picture lies on the ground), salience, stride,
     landmarks, confidence, evidence, followed.
     """
+    evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.worth and event.worth.salience.rounded(),
         "stride": event.stride and event.stride.fields(),
         "landmarks": event.proof and _landmarks(event.proof),
-        "confidence": _rounded(event.confidence, 6),
-        "evidence": event.evidence and {key: round(value, 3) for key, value in event.evidence.items()},
+        "confidence": event.confidence if exact else _rounded(event.confidence, 6),
+        "evidence": evidence,
         "followed": event.followed and _followed(event.followed),
     }
     return {

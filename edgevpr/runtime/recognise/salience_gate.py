@@ -59,7 +59,7 @@ class Gate:
         self._until_detection = 0
         self._static: Mask | None = None
 
-    def look(self, image: Image) -> Worth:
+    def judge(self, image: Image) -> Worth:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
         scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
@@ -71,7 +71,7 @@ class Gate:
         return worth_of(scores, self.config, usual)
 
     def scores(self, image: Image) -> Salience:
-        """Return the scores of a frame. Raises ModelError as `look` does."""
+        """Return the scores of a frame. Raises ModelError as `judge` does."""
         if self._detector:
             if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
                 self._static, self._until_detection = None, self.config.detect_every  # None, if the detector fails

@@ -7,12 +7,10 @@ from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
-from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.techniques import create
 
 SIDE_PX = 256
@@ -41,7 +39,7 @@ def mapped(path, **settings):
     technique = create("cohog", {"w1": 256, **settings})
     frames = (frame(place, MAPPED_DEG, MAPPED_DEG) for place in range(PLACES))
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(frames, technique, place_map, meter_of(load_config(None), load_board("this")))
+        build_map(frames, FrameEncoder(technique=technique), place_map)
     return path
 
 

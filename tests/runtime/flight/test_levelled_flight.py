@@ -8,15 +8,13 @@ from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
-from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight import watching
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -39,7 +37,7 @@ def place_map(tmp_path_factory):
         for place in range(PLACES)
     )
     with PlaceMap.create(path, technique.spec) as made:
-        build_map(frames, technique, made, meter_of(load_config(None), load_board("this")))
+        build_map(frames, FrameEncoder(technique=technique), made)
     return path
 
 

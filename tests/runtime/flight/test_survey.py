@@ -79,8 +79,7 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
             (int(t_s),),
             replace(SEEN, up_deg=told_deg),
         )
-        event.located = replace(event.located, heading_deg=heading_deg % 360)
-        yield event
+        yield replace(event, located=replace(event.located, heading_deg=heading_deg % 360))
 
 
 def surveyed(way, seconds, mount=STRAIGHT_DOWN, **how):
@@ -167,8 +166,8 @@ def test_a_position_that_may_be_ours_is_not_gps():
         late = moved(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
         ours = moved(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
         gps = receiver_at(late, GPS_SD_M, event.frame.t_mono_s)
-        event.vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
-        sightings.take(event)
+        vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
+        sightings.take(replace(event, vehicle=vehicle))
     found = sightings.result()
     assert np.abs(wrong_m(found)).max() < 2.5 * found.off_m.sd
     assert found.ahead_deg.value[0] == pytest.approx(AHEAD_DEG, abs=found.ahead_deg.sd)
@@ -201,7 +200,8 @@ class Flown:
             for event in flight:
                 clock.now_s = event.frame.t_mono_s
                 if self.mounts:
-                    event.located = replace(event.located, position=levelled(event, self.mounts[-1], beside))
+                    located = replace(event.located, position=levelled(event, self.mounts[-1], beside))
+                    event = replace(event, located=located)
                 watch.tell(event)
                 surveyor.tell(event)
             self.last = clock.now_s
@@ -236,8 +236,7 @@ def right(way=lanes, seconds=900):
     rng = np.random.default_rng(2)
     for event in events(way, seconds):
         at = Position(*moved(event.vehicle.lat_deg, event.vehicle.lon_deg, *rng.normal(0, FIX_SD_M, 2)))
-        event.located = replace(event.located, position=at)
-        yield event
+        yield replace(event, located=replace(event.located, position=at))
 
 
 def test_a_map_and_a_camera_that_are_right_are_not_talked_of(tmp_path):
@@ -255,8 +254,7 @@ def led(law, flight):
         vehicle = event.vehicle
         there = moved(vehicle.lat_deg, vehicle.lon_deg, away_m, 0.0)
         gps = replace(vehicle.gps, lat_deg=there[0], lon_deg=there[1])
-        event.vehicle = replace(vehicle, lat_deg=there[0], lon_deg=there[1], gps=gps)
-        yield event
+        yield replace(event, vehicle=replace(vehicle, lat_deg=there[0], lon_deg=there[1], gps=gps))
 
 
 @pytest.mark.parametrize("way", [eight, circle])

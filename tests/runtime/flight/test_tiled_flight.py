@@ -29,7 +29,8 @@ from edgevpr.runtime.flight import tiles as tiles_of_flight
 from edgevpr.runtime.flight.flight import fly
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise import opening
-from edgevpr.runtime.recognise.opening import meter_of, open_recogniser, places_in_ram, searched_places
+from edgevpr.runtime.recognise.encoder import FrameEncoder
+from edgevpr.runtime.recognise.opening import open_recogniser, places_in_ram, searched_places
 from edgevpr.techniques import create
 
 SIDE_PX, PLACES, ZOOM = 256, 24, 17  # a tile has a side of 197 m at this latitude: one or two places, 111 m apart
@@ -47,7 +48,7 @@ def tiles(tmp_path_factory):
     """A row of places from south to north, each tile of the ground in a file of its own."""
     folder = tmp_path_factory.mktemp("tiles")
     with PlaceMap.create(folder / "whole.gpkg", TECHNIQUE.spec) as place_map:
-        build_map(map(frame, range(PLACES)), TECHNIQUE, place_map, meter_of(load_config(None), load_board("this")))
+        build_map(map(frame, range(PLACES)), FrameEncoder(technique=TECHNIQUE), place_map)
     keys = keys_at(50 + np.arange(PLACES) * STEP_DEG, np.full(PLACES, 8.0), ZOOM)
     for key in set(keys.tolist()):
         there = (np.flatnonzero(keys == key) + 1).tolist()

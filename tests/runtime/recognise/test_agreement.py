@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement, held_against, onto
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement, compare_near, compose_overlays
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.techniques import create
 
@@ -65,7 +65,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     assert np.array(match.shift_cells) / 32 == pytest.approx(found.shift_share, abs=1.5 / 32)
 
     expected = Overlay((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
-    guided = held_against(asked(query), kept(place), expected)
+    guided = compare_near(asked(query), kept(place), expected)
     assert guided.is_expected
     assert guided.inliers >= PROVEN
     assert guided.shift_share == pytest.approx(found.shift_share, abs=0.005)
@@ -83,7 +83,7 @@ def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(la
     query, place = asked(cut(landscape, 860, 560)), kept(cut(landscape, 800, 600))
     wrong = Overlay((-0.2, 0.1), 90.0)
     assert agreement(query, place, wrong).inliers < CONFIRMED
-    found = held_against(query, place, wrong)
+    found = compare_near(query, place, wrong)
     assert not found.is_expected
     assert np.array(found.shift_share) * WIDE == pytest.approx((60, -40), abs=2)
 
@@ -98,7 +98,7 @@ def test_what_stands_still_may_be_a_display(landscape):
 def test_pictures_of_other_ground_do_not_agree(landscape, seed):
     other = textured(100 + seed, HIGH, WIDE)
     expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
-    found = held_against(asked(other), kept(cut(landscape, 800, 600)), expected)
+    found = compare_near(asked(other), kept(cut(landscape, 800, 600)), expected)
     assert found.inliers < CONFIRMED
     assert found.is_expected
 
@@ -135,11 +135,11 @@ def test_how_two_places_lie_on_each_other_follows_from_one_query_on_both(landsca
     for place in (first, second):
         found = agreement(query, kept(place))
         ways.append(Overlay(found.shift_share, found.rotation_deg, found.scale))
-    truth, told = agreement(asked(first), kept(second)), onto(*ways)
+    truth, told = agreement(asked(first), kept(second)), compose_overlays(*ways)
     assert truth.inliers >= PROVEN
     assert told.shift_share == pytest.approx(truth.shift_share, abs=0.01)
     assert abs((told.rotation_deg - truth.rotation_deg + 180) % 360 - 180) < 1.5
     assert told.scale == pytest.approx(truth.scale, rel=0.03)
     assert agreement(kept(first), kept(second), told).inliers >= CONFIRMED
-    unscaled = onto(Overlay(ways[0].shift_share, ways[0].rotation_deg), ways[1])
+    unscaled = compose_overlays(Overlay(ways[0].shift_share, ways[0].rotation_deg), ways[1])
     assert unscaled.scale is None, "where one height is unknown, that of both is"

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
-from edgevpr.runtime.recognise.motion import moved
+from edgevpr.runtime.recognise.place_filter import limit_motion
 
 PLACES, SPACING_M = 100, 20.0
 IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
 IN_METRES = MapScale(spacing=SPACING_M, near=30.0)
-STEP = moved(1.0, 3.0)  # within three places of the query before
+STEP = limit_motion(1.0, 3.0)  # within three places of the query before
 SURE = 0.999
 
 
@@ -150,7 +150,7 @@ def over(track_m, belief, odometry, p=0.8):
         said = odometry(at - track_m[n - 1]) if n else None
         beside = at + np.array([300.0 * np.cos(7 * n), 300.0 * np.sin(7 * n)])
         query = seen([at, beside], [p, (1 - p) / 2], sd=4.0, heading_deg=350.0 if n % 2 else 10.0)
-        posteriors.append(belief.update(query, moved(1.0, 40.0, said), PLACES))
+        posteriors.append(belief.update(query, limit_motion(1.0, 40.0, said), PLACES))
     return posteriors
 
 
@@ -188,7 +188,7 @@ def test_heading_and_covariance_are_those_of_what_is_near():
 
 def test_tracks_that_cross_are_told_apart():
     places_m = 20.0 * np.array([[n, 0] for n in range(-10, 11)] + [[0, n] for n in range(-10, 11)])
-    belief, by = Belief(IN_METRES), moved(1.0, 40.0, (0.0, 20.0))
+    belief, by = Belief(IN_METRES), limit_motion(1.0, 40.0, (0.0, 20.0))
     for n in range(21):
         # The other track looks the same, place for place.
         posterior = belief.update(seen(places_m[[n, 21 + n]], [0.4, 0.55], sd=4.0), by, len(places_m))
@@ -223,25 +223,25 @@ def test_any_numbers_at_all_pass(ground, places):
         query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
         velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
         elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
-        posterior = belief.update(query, moved(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
+        posterior = belief.update(query, limit_motion(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
         assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
         assert not posterior.mass or np.linalg.eigvalsh(posterior.covariance)[0] > 0
 
 
 def test_odometry_says_how_far_even_at_twice_the_highest_speed():
-    motion = moved(2.0, 30.0, (3.0, -4.0))
+    motion = limit_motion(2.0, 30.0, (3.0, -4.0))
     np.testing.assert_allclose(motion.by, [6, -8])
     assert (motion.reach, motion.elapsed_s) == (60, 2)
-    assert moved(1.0, 30.0, (60.0, 0.0)).by is not None
+    assert limit_motion(1.0, 30.0, (60.0, 0.0)).by is not None
 
 
 @pytest.mark.parametrize("elapsed_s", [None, -1.0, 0.0, float("nan"), -float("inf")])
 def test_a_time_that_makes_no_sense_is_the_usual_one_and_says_nothing_of_the_way(elapsed_s):
-    motion = moved(elapsed_s, 30.0, (3.0, 4.0))
+    motion = limit_motion(elapsed_s, 30.0, (3.0, 4.0))
     assert (motion.by, motion.reach, motion.elapsed_s) == (None, 30, 1.0)
 
 
 @pytest.mark.parametrize("velocity", [None, (np.nan, 1.0), (np.inf, 0.0), (61.0, 0.0)])
 def test_a_velocity_that_cannot_be_is_none(velocity):
-    motion = moved(2.0, 30.0, velocity)
+    motion = limit_motion(2.0, 30.0, velocity)
     assert (motion.by, motion.reach) == (None, 60)

@@ -23,6 +23,7 @@ from edgevpr.runtime.recognise.confidence import model_of, prior
 from edgevpr.runtime.recognise.evidence import (
     OF_MAP,
     OF_PLACE,
+    Evidence,
     MapCalibration,
     calibration_of,
     calibration_text,
@@ -171,7 +172,8 @@ def test_joined_maps_accept_nothing_that_one_of_them_refuses(kind, bare):
     every = [Sureness(each.models if each else {kind: prior(kind)}, 0.999) for each in maps]
     of_joined, accepted, refused = Sureness(joined.models, 0.999), 0, 0
     for _ in range(3000):
-        seen = {name: float(rng.normal(1.5, 3)) for name in sorted({*OF_MAP[kind], *OF_PLACE[kind]})} | {"tried": 1.0}
+        figures = {name: float(rng.normal(1.5, 3)) for name in sorted({*OF_MAP[kind], *OF_PLACE[kind]})}
+        seen = Evidence(agree=0.0, **figures)
         each_accepts = [one.confidence(seen) >= one.threshold(seen) for one in every]
         if of_joined.confidence(seen) >= of_joined.threshold(seen):
             assert all(each_accepts)

@@ -17,11 +17,9 @@ from edgevpr.runtime.recognise.evidence import (
     DOWN_BARE,
     OF_MAP,
     OF_PLACE,
-    described,
-    evidence_of,
-    kind_of,
+    gather_evidence,
     kinds_of,
-    proven,
+    log_times_more,
     require_usable,
 )
 from edgevpr.techniques import create
@@ -46,24 +44,24 @@ def ahead(score, back=0.2, likeness=0.7, log_rank=0.0):
 
 
 def looked_ahead(matches):
-    return evidence_of(ranked(matches), INDEX, NEIGHBOUR_M, None, (), down=False)
+    return gather_evidence(ranked(matches), INDEX, NEIGHBOUR_M, None, (), down=False)
 
 
 def looked_down(matches, proof=None, same=()):
-    return evidence_of(ranked(matches), INDEX, NEIGHBOUR_M, proof, same, down=True)
+    return gather_evidence(ranked(matches), INDEX, NEIGHBOUR_M, proof, same, down=True)
 
 
 def test_evidence_has_the_names_that_models_ask_for():
     down = {5: FineMatch(0.2, coverage=0.3)}
     for kind, evidence in (
         (AHEAD, looked_ahead({5: ahead(0.2)})),
-        (AHEAD_PROVEN, looked_ahead({5: ahead(0.2)}) | {"proof": 0.1}),
+        (AHEAD_PROVEN, replace(looked_ahead({5: ahead(0.2)}), proof=0.1)),
         (DOWN, looked_down(down, agreed(12))),
         (DOWN_BARE, looked_down(down)),
     ):
-        assert kind_of(evidence) == kind
-        assert set(evidence) >= {*OF_MAP[kind], *OF_PLACE[kind]}
-        assert described(evidence)
+        assert evidence.kind == kind
+        assert set(evidence.figures()) >= {*OF_MAP[kind], *OF_PLACE[kind]}
+        assert evidence.describe()
 
 
 def test_a_technique_has_the_kinds_of_its_camera():
@@ -74,25 +72,25 @@ def test_a_technique_has_the_kinds_of_its_camera():
 
 def test_the_lead_is_over_places_elsewhere_and_not_over_neighbours():
     far, near = (looked_ahead({5: ahead(0.2), other: ahead(0.15)}) for other in (20, 6))
-    assert far["lead"] == pytest.approx(math.log(math.sqrt(0.2 / 0.15)))
-    assert near["lead"] > far["lead"], "only chance is elsewhere"
+    assert far.lead == pytest.approx(math.log(math.sqrt(0.2 / 0.15)))
+    assert near.lead > far.lead, "only chance is elsewhere"
     down = looked_down({5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.1, coverage=0.3)})
-    assert down["lead"] == pytest.approx(math.log(2))
+    assert down.lead == pytest.approx(math.log(2))
 
 
 def test_a_place_elsewhere_whose_regions_agree_better_is_seen():
     rival = ahead(0.15, log_rank=0.5)
     found = looked_ahead({5: ahead(0.2, log_rank=0.9), 20: rival})
-    assert found["rank_gap"] == pytest.approx(0.4)
-    assert looked_ahead({5: ahead(0.2, log_rank=0.9), 20: ahead(0.15, log_rank=2.0)})["rank_gap"] == 0.0
+    assert found.rank_gap == pytest.approx(0.4)
+    assert looked_ahead({5: ahead(0.2, log_rank=0.9), 20: ahead(0.15, log_rank=2.0)}).rank_gap == 0.0
 
 
 @pytest.mark.parametrize(("inliers", "rival", "times"), [(32, 0, 4), (32, 16, 2), (32, 40, 1), (7, 3, 1), (0, 250, 1)])
 def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_and_by_chance(inliers, rival, times):
-    proof = proven(inliers, rival)
+    proof = log_times_more(inliers, rival)
     assert proof == pytest.approx(math.log(times))
-    known = looked_ahead({5: ahead(0.2)}) | {"proof": proof}
-    assert described(known).endswith(f"and {times}.00 times as many landmarks" if proof else "of the place agrees")
+    known = replace(looked_ahead({5: ahead(0.2)}), proof=proof)
+    assert known.describe().endswith(f"and {times}.00 times as many landmarks" if proof else "of the place agrees")
 
 
 @pytest.mark.parametrize(
@@ -106,28 +104,28 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
 )
 def test_landmarks_count_where_they_are_expected_and_have_moved(proof, counts):
     evidence = looked_down({5: FineMatch(0.2, coverage=0.3)}, proof)
-    assert evidence["landmarks"] == pytest.approx(math.log1p(counts))
+    assert evidence.landmarks == pytest.approx(math.log1p(counts))
 
 
 def test_a_place_of_the_same_ground_is_not_elsewhere():
     matches = {5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.19, coverage=0.3), 28: FineMatch(0.05, coverage=0.3)}
     index = type(INDEX)(**(dict(INDEX.arrays) | {"place_ids": np.arange(101, 131)}), mean=INDEX.mean)
-    apart = evidence_of(ranked(matches), index, NEIGHBOUR_M, None, (), down=True)
-    together = evidence_of(ranked(matches), index, NEIGHBOUR_M, None, (121,), down=True)
-    assert (apart["lead"], together["lead"]) == (pytest.approx(math.log(0.2 / 0.19)), pytest.approx(math.log(4)))
+    apart = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), down=True)
+    together = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (121,), down=True)
+    assert (apart.lead, together.lead) == (pytest.approx(math.log(0.2 / 0.19)), pytest.approx(math.log(4)))
 
 
 @pytest.mark.parametrize("score", [0.0, 1e-9, 1.0])
 def test_no_share_makes_evidence_infinite(score):
     matches = {5: ahead(score, back=0.0), 20: ahead(0.0, back=0.0)}
-    assert all(map(math.isfinite, looked_ahead(matches).values()))
-    assert all(map(math.isfinite, looked_down({5: FineMatch(score), 20: FineMatch(0.0)}).values()))
+    assert all(map(math.isfinite, looked_ahead(matches).figures().values()))
+    assert all(map(math.isfinite, looked_down({5: FineMatch(score), 20: FineMatch(0.0)}).figures().values()))
 
 
 def test_where_nothing_was_compared_there_is_no_evidence():
     empty = Ranking(slots=np.array([3]), scores=np.array([0.2], np.float32), compared={})
     for down in (True, False):
-        assert evidence_of(empty, INDEX, NEIGHBOUR_M, None, (), down=down) is None
+        assert gather_evidence(empty, INDEX, NEIGHBOUR_M, None, (), down=down) is None
     assert looked_ahead({5: FineMatch(0.2)}) is None, "a technique that gives no support"
 
 
@@ -146,7 +144,7 @@ def test_a_model_of_other_evidence_cannot_be_used():
 def test_with_a_known_heading_as_much_evidence_comes_less_often_by_chance():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
     all_of_them, known = (
-        evidence_of(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreed(3), (), down=True)
+        gather_evidence(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreed(3), (), down=True).figures()
         for tried in (1.0, 1 / 8)
     )
     model = prior(DOWN)

@@ -13,9 +13,9 @@ from walks import map_of, walk_over
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
@@ -43,10 +43,10 @@ class Walk:
 
     def __init__(self, place_map, rule=None, follows=True):
         self.confidence, self._t_s = 0.88, 0.0
-        follower = Follower(place_map, fastest_m_s=None, is_live=False) if follows else None
+        place_filter = PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None
         rule = rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1)
         settings = WalkSettings(candidates=42)
-        self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, follower=follower)
+        self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, place_filter=place_filter)
 
     def see(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
         self._t_s += elapsed_s
@@ -153,10 +153,10 @@ def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map)
 
 def test_an_index_that_changes_in_flight_is_followed(flight):
     whole = flight.recogniser.index
-    flight.recogniser.take(Matcher(TECHNIQUE, whole.first(0), flight.recogniser.rule))
+    flight.recogniser.change(matcher=Matcher(whole.first(0), flight.recogniser.rule))
     assert flight.see(1).reason.endswith("no place yet")
     for place in range(4, 28, STRIDE):
         index = whole.first(place + 3)
-        flight.recogniser.take(Matcher(TECHNIQUE, index, flight.recogniser.rule))
+        flight.recogniser.change(matcher=Matcher(index, flight.recogniser.rule))
         event = flight.see(place)
     assert event.accepted

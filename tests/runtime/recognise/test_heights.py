@@ -12,7 +12,6 @@ from edgevpr.frames.level import Lens
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.preparation import Preparation
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -107,7 +106,7 @@ def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_he
     fov_deg = math.degrees(2 * math.atan(0.5))  # the footprint is the height
     levelling = Levelling(Lens(fov_deg), is_live=False) if height_m else None
     noting, prior = Noting(**technique.spec.parameters), Prior(None, None, is_live=False)
-    walk = walk_over(place_map, noting, preparation=Preparation(levelling=levelling), prior=prior)
+    walk = walk_over(place_map, noting, encoder={"levelling": levelling}, prior=prior)
     for place, ratio in ((1, 1.5), (3, 1.5), (2, 1.0), (0, 1.0)):
         del looked[:]
         asked = replace(frame(place, ratio), height_m=height_m and ratio * height_m)

@@ -8,7 +8,7 @@ import pytest
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, expected_of
+from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, to_expectation
 from edgevpr.runtime.recognise.locate import Located
 
 HOME = Position(50.0, 8.0)
@@ -73,7 +73,7 @@ def hints_at(now_s, index, autopilot=None, fix=None, reach_m_s=10.0, heading_deg
     """The hints for a frame at this time, `fix` being our own position and its time (None: there is none)."""
     prior = Prior(reach_m_s, None if heading_deg is None else WITHIN_DEG, is_live=True)
     if fix:
-        prior.learn(found(fix[0]), True, fix[1])
+        prior.update(found(fix[0]), True, fix[1])
     frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=now_s, heading_deg=heading_deg)
     return prior.hints(frame, autopilot, index, 50.0)
 
@@ -94,18 +94,18 @@ def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old(index):
 
 
 def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
-    expected = expected_of(Hints(Reach(north(120), 90.0)), 1.0, index)
+    expected = to_expectation(Hints(Reach(north(120), 90.0)), 1.0, index)
     assert expected.in_reach.tolist() == [False, True, True, False, False]
     assert expected.turned_deg is None
     assert hints_at(10.0, index, vehicle(north(5000), 10.0)) is None, "no place is in reach: all are searched"
-    everywhere = expected_of(None, 1.0, index)
+    everywhere = to_expectation(None, 1.0, index)
     assert (everywhere.in_reach, everywhere.turned_deg) == (None, None)
 
 
 def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
     hints = hints_at(10.0, index, heading_deg=5.0)
-    assert expected_of(hints, 1.0, index).in_reach is None
-    np.testing.assert_array_equal(expected_of(hints, 1.0, index).turned_deg, [5, 355, 345, np.nan, 15])
+    assert to_expectation(hints, 1.0, index).in_reach is None
+    np.testing.assert_array_equal(to_expectation(hints, 1.0, index).turned_deg, [5, 355, 345, np.nan, 15])
     index.heading_deg[:] = np.nan
     assert hints_at(10.0, index, heading_deg=5.0) is None
     assert hints_at(10.0, index, vehicle(HOME, 10.0), heading_deg=5.0) == Hints(Reach(HOME, 50.0))
@@ -142,7 +142,7 @@ def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can
         # The autopilot knows where it is to within 100 m, so that hints are there for every query.
         frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number))
         seen.append(prior.hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
-        prior.learn(found(metres), accepted, float(number))
+        prior.update(found(metres), accepted, float(number))
     assert seen == [True, False, True, False, True, True, False]
 
 
@@ -155,7 +155,7 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
         hints = prior.hints(frame, vehicle(near, float(number)), index, 100.0)
         seen.append(hints and (hints.reach is not None, hints.heading_deg is not None))
         metres, turned_deg = answer or (50, 0.0)
-        prior.learn(found(metres, 0.0, turned_deg), answer is not None, float(number))
+        prior.update(found(metres, 0.0, turned_deg), answer is not None, float(number))
     both, area, heading = (True, True), (True, False), (False, True)
     assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
@@ -163,13 +163,13 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
 def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_index):
     prior, frame = Prior(None, None, is_live=True), Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=10.0)
     there = Located(position=north(2000), covariance_m2=(9.0, 0.0, 16.0))
-    prior.follow(there, 0.98, 10.0)
-    prior.follow(None, 1.0, 10.0)
+    prior.update_area(there, 0.98, 10.0)
+    prior.update_area(None, 1.0, 10.0)
     assert prior.hints(frame, None, long_index, 50.0) is None
-    prior.follow(there, 0.99, 10.0)
+    prior.update_area(there, 0.99, 10.0)
     assert prior.hints(frame, None, long_index, 50.0) == Hints(Reach(north(2000), 320.0))
     assert prior.hints(frame, None, long_index, 100.0) == Hints(Reach(north(2000), 520.0)), "five places on every side"
-    prior.follow(there, 0.5, 12.0)
+    prior.update_area(there, 0.5, 12.0)
     assert prior.hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == Hints(Reach(north(2000), 440.0))
     assert prior.hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
@@ -179,7 +179,7 @@ def test_the_next_picture_is_scaled_to_a_height_that_is_tried():
 
     def learn(ratio, accepted=True):
         best = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio))
-        prior.learn(best, accepted, 0.0, prior.scale(tried))
+        prior.update(best, accepted, 0.0, prior.scale(tried))
         return prior.height_ratio, prior.scale(tried)
 
     assert learn(0.7, accepted=False) == (1.0, 1.0)
@@ -198,5 +198,5 @@ def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights(
     again = []
     for accepted in (False, False, False, True, True, False, False):
         again.append(prior.looks_again)
-        prior.learn(found(), accepted, 0.0)
+        prior.update(found(), accepted, 0.0)
     assert again == [True, False, True, False, True, True, False]

@@ -14,8 +14,8 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.text import nines
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE
-from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, is_hardly_ahead, judge
+from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -35,7 +35,7 @@ def test_a_technique_without_a_confidence_is_judged_by_its_limits():
     assert "elsewhere" in judged((0.2, 0.19)).reason
 
 
-CLEAR = {"agree": -1.6, "lead": 0.7, "coverage": -0.5}
+CLEAR = Evidence(agree=-1.6, lead=0.7, coverage=-0.5)
 
 
 @pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
@@ -55,7 +55,7 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
 )
 def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
     sure = told(lambda evidence: confidence, lambda evidence: of_map)
-    assert sure.is_open(CLEAR | {"lead": lead}) == is_open
+    assert sure.is_open(replace(CLEAR, lead=lead)) == is_open
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
 @pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
 def test_no_flight_makes_sure_what_a_place_elsewhere_beats_in_the_same_picture(lead, accepted):
     rule = sure_rule(lambda evidence: 0.5)
-    verdict = judged(rule=rule, evidence=CLEAR | {"lead": lead}, by_flight=0.9999)
+    verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), by_flight=0.9999)
     assert verdict.accepted is accepted
     assert verdict.reason.startswith("a place elsewhere agrees better: ") is not accepted
 
@@ -105,7 +105,7 @@ def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precisio
     """Whatever the shipped models say."""
     config = load_config(None, {"match.accept_precision": precision}).match
     sure = accept_rule(create("cohog", {"camera": "nadir"}), config).sure
-    evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 5.0) | {"lead": 0.04}
+    evidence = Evidence(agree=0.0, **dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 5.0) | {"lead": 0.04})
     assert sure.confidence(evidence) <= 0.5 < sure.threshold(evidence)
 
 
@@ -151,7 +151,7 @@ def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation
 )
 def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
-    evidence = {"agree": -2.0, "lead": lead, "coverage": -0.5} | counted
+    evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
     verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=agreed(inliers), evidence=evidence)
     assert verdict.accepted is accepted
     assert f"{inliers} landmarks agree, and {rival} with a place elsewhere" in verdict.reason
@@ -162,8 +162,8 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
 
 
 def test_a_place_that_is_clearly_ahead_needs_no_landmarks_to_be_told_from_others():
-    assert is_hardly_ahead({"lead": 0.1})
-    assert not is_hardly_ahead({"lead": 0.5})
+    assert replace(CLEAR, lead=0.1).is_hardly_ahead
+    assert not replace(CLEAR, lead=0.5).is_hardly_ahead
 
 
 @pytest.mark.parametrize(

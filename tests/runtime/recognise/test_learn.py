@@ -14,12 +14,14 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.follow import Followed
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.recogniser import Matcher, Recogniser
+from edgevpr.runtime.recognise.place_filter import Followed
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
@@ -37,9 +39,11 @@ class Bench:
         self.map = PlaceMap.create(path, TECHNIQUE.spec)
         self.growing = GrowingIndex(self.map, TECHNIQUE, budget_bytes=10**6, room=places_in_ram)
         self.recogniser = Recogniser(
-            Matcher(TECHNIQUE, self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
+            FrameEncoder(technique=TECHNIQUE),
             self.map,
+            Matcher(self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
             meter_of(load_config(None), load_board("this")),
+            WalkSettings(),
         )
         self.learner = Learner(
             self.recogniser, self.growing, spacing_m=SPACING_M, gap_m=GAP_M, utc_clock=self.clock.utc_s

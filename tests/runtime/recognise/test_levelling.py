@@ -19,12 +19,9 @@ from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.power.boards import load_board
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.hints import Prior
-from edgevpr.runtime.recognise.levelling import Levelling, laid, levelling_of
-from edgevpr.runtime.recognise.opening import meter_of
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
+from edgevpr.runtime.recognise.levelling import Levelling, levelling_of, place_at_middle
 from edgevpr.techniques import create
 
 CAMERA = Camera(noise_sigma=0)
@@ -69,16 +66,16 @@ def place_map(ground, technique, tmp_path_factory):
     path = tmp_path_factory.mktemp("levelled") / "m.gpkg"
     poses = ({"heading_deg": 90.0}, {"pitch_deg": 8.0}, {"heading_deg": 200.0, "pitch_deg": -6.0}, {})
     frames = [frame(ground, place, **pose) for place, pose in enumerate(poses)]
-    preparation = Preparation(levelling=Levelling(LENS, below=True, is_live=False))
-    with PlaceMap.open(map_of(path, technique, frames, preparation)) as opened:
+    levelling = Levelling(LENS, below=True, is_live=False)
+    with PlaceMap.open(map_of(path, technique, frames, levelling=levelling)) as opened:
         yield opened
 
 
 @pytest.fixture
 def walk(place_map, technique):
     def of(levelling, prior=None, mask=None):
-        preparation = Preparation(levelling=levelling, mask=mask)
-        return walk_over(place_map, technique, settings=WalkSettings(), preparation=preparation, prior=prior)
+        encoder = {"levelling": levelling, "mask": mask}
+        return walk_over(place_map, technique, settings=WalkSettings(), encoder=encoder, prior=prior)
 
     return of
 
@@ -97,23 +94,19 @@ HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 @pytest.mark.slow
 def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, ground):
     as_it_is = walk(None).step(frame(ground, 1, **HARD))
-    walker = walk(scaling())
-    walker.meter = meter_of(load_config(None), load_board("this"))
-    event = walker.step(frame(ground, 1, **HARD))
+    event = walk(scaling()).step(frame(ground, 1, **HARD))
     assert recognised(event, 1)
     assert event.best.match.score > as_it_is.best.match.score
     assert event.view.up_deg == 0.0
     assert event.view.footprint_m == pytest.approx(FOOTPRINT_M)
     off_m = 45 * math.tan(math.radians(20))
     assert math.hypot(*event.view.aside) * FOOTPRINT_M == pytest.approx(off_m)
-    assert event.steps.prepare.wall_s > 0
-    assert event.cost.t_encode_s == pytest.approx((event.steps.prepare + event.steps.gate + event.steps.encode).wall_s)
 
 
 def test_pictures_are_scaled_to_the_places_that_are_searched_now(walk, ground):
     recogniser, other_m = walk(scaling()), 0.8 * FOOTPRINT_M
     of_other_tile = Layers(other_m, (other_m,), np.zeros(0, int), np.zeros(0, int))
-    recogniser.take(Matcher(recogniser.technique, recogniser.index, recogniser.rule, layers=of_other_tile))
+    recogniser.change(matcher=Matcher(recogniser.index, recogniser.rule, layers=of_other_tile))
     assert recogniser.step(frame(ground, 1, **HARD)).view.footprint_m == pytest.approx(other_m)
 
 
@@ -170,19 +163,21 @@ def test_a_tilt_that_a_picture_does_not_bear_is_said_once(walk, ground, caplog):
 
 def test_a_place_has_the_position_of_the_middle_of_its_picture():
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
-    east = laid(at, View(up_deg=90.0, footprint_m=100.0, aside=(0.0, -0.3)))  # the aircraft is west of the middle
+    east = place_at_middle(
+        at, View(up_deg=90.0, footprint_m=100.0, aside=(0.0, -0.3))
+    )  # the aircraft is west of the middle
     assert east.position.lon_deg == pytest.approx(8.0 + 30 / (M_PER_DEG * math.cos(math.radians(50))), abs=1e-7)
     assert east.position.lat_deg == pytest.approx(50.0, abs=1e-9)
     assert (east.position.alt_m, east.heading_deg) == (300.0, 90.0)
     assert (east.pose.up_deg, east.pose.footprint_m, east.pose.covariance_m2) == (90.0, 100.0, (25.0, 0.0, 25.0))
-    untold = laid(at, View(up_deg=0.0, footprint_m=100.0))
+    untold = place_at_middle(at, View(up_deg=0.0, footprint_m=100.0))
     assert (untold.position, untold.pose.covariance_m2) == (at.position, (41.0, 0.0, 41.0)), "its tilt is unknown"
 
 
 @pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, aside=(0.1, 0.1))])
 def test_without_height_or_heading_a_place_has_no_pose(view):
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0), heading_deg=70.0)
-    found = laid(at, view)
+    found = place_at_middle(at, view)
     assert (found.pose, found.position) == (None, at.position)
     assert found.heading_deg == (70.0 if view.up_deg is None else view.up_deg)
 
@@ -231,7 +226,7 @@ def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_noth
 def test_a_place_of_an_unknown_lens_lies_where_the_picture_looks():
     here = Position(50.0, 8.0, 300.0)
     frame = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=here, heading_deg=70.0)
-    placed = laid(frame, View(lean_m=(30.0, -40.0)))
+    placed = place_at_middle(frame, View(lean_m=(30.0, -40.0)))
     assert offset_m(50.0, 8.0, placed.position.lat_deg, placed.position.lon_deg) == pytest.approx((-30.0, 40.0))
     assert (placed.position.alt_m, placed.heading_deg, placed.pose) == (300.0, 70.0, None)
 
@@ -269,7 +264,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
     wrong_m = []
     recogniser = walk(Levelling(replace(LENS, mount=Mount(9.0)), is_live=False))
     for mount in (Mount(9.0), STRAIGHT_DOWN, Mount(9.0)):
-        recogniser.preparation = recogniser.preparation.looking(mount)
+        recogniser.change(mount=mount)
         event = recogniser.step(seen)
         assert recognised(event, 1)
         at = event.located.position

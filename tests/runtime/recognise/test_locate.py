@@ -10,7 +10,7 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.locate import as_learnt, at_place, located
+from edgevpr.runtime.recognise.locate import at_place, combine_with_recorded, locate
 
 ORIGIN = Position(50.0, 8.0, 120.0)
 CELLS, FOOTPRINT_M = 32, 64.0
@@ -42,14 +42,14 @@ def off_m(position):
     ],
 )
 def test_a_step_in_the_picture_is_one_on_the_ground(shift, up_deg, there):
-    found = located([candidate(shift=shift, up_deg=up_deg)], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(aside=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
 
 @pytest.mark.parametrize(("up_deg", "turned_deg", "heading_deg"), [(0, 0, 0), (90, 30, 120), (300, 90, 30)])
 def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg, heading_deg):
-    found = located([candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
+    found = locate([candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
     assert found.heading_deg == pytest.approx(heading_deg)
 
 
@@ -63,21 +63,21 @@ def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg,
     ],
 )
 def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, aside, there):
-    found = located([candidate(turned_deg=turned_deg)], CELLS, View(aside=aside))
+    found = locate([candidate(turned_deg=turned_deg)], CELLS, View(aside=aside))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
 
 
 def test_what_is_aside_of_a_query_from_higher_up_is_farther():
     proof = agreed(20, (0.0, 0.0), scale=2.0)
-    found = located([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
+    found = locate([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_landmarks_are_heard_before_the_vote():
     proof = agreed(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
-    by_vote = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
-    found = located([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
+    by_vote = locate([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says
     assert off_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.5)
     assert math.dist(off_m(found.position), between) > 0.5
@@ -88,21 +88,21 @@ def test_landmarks_are_heard_before_the_vote():
 
 def test_places_of_the_same_ground_are_heard_together():
     one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
-    found = located([one, other], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([one, other], CELLS, View(aside=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
     assert found.places == (1, 2)
-    assert found.accuracy_m < located([one], CELLS, View(aside=(0.0, 0.0))).accuracy_m
+    assert found.accuracy_m < locate([one], CELLS, View(aside=(0.0, 0.0))).accuracy_m
     assert found.accuracy_m >= 2.0, "what is wrong with the map does not become less by hearing more of it"
     assert found.objection is None
 
 
 def test_places_that_contradict_each_other_are_refused():
-    found = located([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(aside=(0.0, 0.0)))
     assert "positions" in found.objection
 
 
 def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
-    found = located([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, View(aside=(0.0, 0.0)))
     assert found.places == (1,)
     assert found.objection is None
     assert off_m(found.position) == pytest.approx((8, 0), abs=0.01)
@@ -116,20 +116,20 @@ def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
     ],
 )
 def test_what_does_not_show_the_same_ground_is_not_heard(other):
-    found = located([candidate(1, shift=(4, 0)), other], CELLS)
+    found = locate([candidate(1, shift=(4, 0)), other], CELLS)
     assert (found.places, found.objection) == ((1,), None)
 
 
 def test_without_a_pose_or_a_step_there_is_nothing_to_say():
     bare = Place(place_id=1, source_image="1", position=ORIGIN)
-    assert located([Candidate(bare, candidate().match)], CELLS) is None
-    assert located([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
-    assert located([candidate()], None) is None, "ahead, a step says nothing about metres"
+    assert locate([Candidate(bare, candidate().match)], CELLS) is None
+    assert locate([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
+    assert locate([candidate()], None) is None, "ahead, a step says nothing about metres"
     assert at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
 
 
 def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
-    found = located([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(aside=(0.0, 0.0)))
     var_east, cov, var_north = found.covariance_m2
     assert var_east > 100 > 10 > var_north > 1
     assert abs(cov) < 0.1
@@ -137,13 +137,13 @@ def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
 
 
 def test_a_new_place_lies_between_what_was_recorded_and_what_its_neighbours_say():
-    where = located([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, View(aside=(0.0, 0.0)))
+    where = locate([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, View(aside=(0.0, 0.0)))
     recorded = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 6.0, 0.0), 130.0)
-    position, pose = as_learnt(where, recorded, 5.0)
+    position, pose = combine_with_recorded(where, recorded, 5.0)
     east_m, _ = off_m(position)
     assert 2.0 < east_m < 4.0
     assert (pose.up_deg, pose.footprint_m, position.alt_m) == (pytest.approx(15.0), FOOTPRINT_M, 130.0)
     assert (pose.recorded.lat_deg, pose.recorded.lon_deg) == (recorded.lat_deg, recorded.lon_deg)
     assert pose.covariance_m2[0] < 25
     far = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 60.0, 0.0))
-    assert as_learnt(where, far, 5.0) is None
+    assert combine_with_recorded(where, far, 5.0) is None

@@ -13,8 +13,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, ModelError
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.recogniser import Matcher, WalkSettings
 from edgevpr.techniques import create
 
 PLACES = 6
@@ -115,7 +115,7 @@ def test_a_stop_is_no_exception_of_a_frame(walk):
 
 def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
     assert walk.step(frame(3, 100.0)).accepted
-    walk.extend(walk.index, 4, 100.0)
+    walk.add_place(walk.index, 4, 100.0)
     event = walk.step(frame(3, 129.9))
     assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
     assert "learnt" in event.reason
@@ -127,20 +127,20 @@ def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
 
 def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
     nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
-    walk.take(Matcher(walk.technique, nothing, walk.rule))
+    walk.change(matcher=Matcher(nothing, walk.rule))
     event = walk.step(frame(3))
     assert (event.failed, event.accepted, event.reason, event.best) == (False, False, "the map has no place yet", None)
 
 
 def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
-    event = walk.unread(ValueError("cut"))
+    event = walk.report_unread(ValueError("cut"))
     assert (event.frame, event.failed, event.is_query) == (None, True, False)
     assert "cut" in event.reason
 
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
-    walk.take(Matcher(walk.technique, walk.index, walk.rule))
+    walk.change(matcher=Matcher(walk.index, walk.rule))
     assert walk.accuracy_m == 20.0
     assert load_config(None).mavlink.min_accuracy_m == 5.0
 

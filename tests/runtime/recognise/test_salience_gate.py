@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from edgevpr.core.config import load_config
+from edgevpr.core.contract import Descriptor
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.frames.images import cv2
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.mapmaking.mapping import Gaps
+from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import as_map
-from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import (
     MOST_ENTROPY,
     Gate,
@@ -90,10 +92,10 @@ def test_in_bad_light_less_entropy_is_asked_for():
     day = [texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
     by_day, at_night = Gate(asked(entropy=0.4)), Gate(asked(entropy=0.4))
-    assert all(by_day.look(picture).reason is None for picture in day)
-    passed = [at_night.look(picture).reason is None for picture in night]
+    assert all(by_day.judge(picture).reason is None for picture in day)
+    passed = [at_night.judge(picture).reason is None for picture in night]
     assert sum(passed) >= 36
-    assert at_night.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy"
+    assert at_night.judge(np.full((120, 160), 3, np.uint8)).lacks == "entropy"
 
 
 def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
@@ -101,16 +103,16 @@ def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
     little = texture()
     while not 0.2 < scores_of(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
-    assert [gate.look(little).reason for _ in range(4)] == [None] * 4
-    assert all(gate.look(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
+    assert [gate.judge(little).reason for _ in range(4)] == [None] * 4
+    assert all(gate.judge(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
 
 
 def test_a_long_stretch_without_information_does_not_become_usual():
     gate = Gate(asked(entropy=0.4))
     for _ in range(30):
-        assert gate.look(texture()).reason is None
+        assert gate.judge(texture()).reason is None
     empty = np.full((120, 160), 77, np.uint8)
-    assert all(gate.look(empty).lacks == "entropy" for _ in range(70))
+    assert all(gate.judge(empty).lacks == "entropy" for _ in range(70))
 
 
 def test_the_detector_looks_at_every_kth_frame_only():
@@ -124,9 +126,9 @@ def test_the_detector_looks_at_every_kth_frame_only():
     detector = Counting()
     gate = Gate(asked(staticity=0.6, detect_every=4), detector=detector)
     for _ in range(9):
-        gate.look(texture())
+        gate.judge(texture())
     assert detector.looks == 3
-    gate.look(texture(60, 80))  # of another size: what was found does not fit it
+    gate.judge(texture(60, 80))  # of another size: what was found does not fit it
     assert detector.looks == 4
 
 
@@ -142,8 +144,11 @@ NORTH_M = 1 / 111_195  # degrees
 def event(number, short_by=0.0, north_m=None):
     position = None if north_m is None else Position(50 + north_m * NORTH_M, 8.0)
     lacks = "entropy" if short_by else None
-    return Recognition(
-        frame=Frame(image=np.zeros((8, 8), np.uint8), name=str(number), t_mono_s=float(number), position=position),
+    image = np.zeros((8, 8), np.uint8)
+    return EncodedFrame(
+        frame=Frame(image=image, name=str(number), t_mono_s=float(number), position=position),
+        picture=Levelled(image, None, UNKNOWN_VIEW),
+        descriptor=Descriptor(coarse=np.zeros(1)),
         worth=Worth(Salience(None, None, 0.4 - short_by), short_by, lacks, lacks and "not memorable"),
     )
 

@@ -7,7 +7,7 @@ from walks import map_of, walk_over
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.hints import Told
+from edgevpr.runtime.recognise.hints import RecordedPrior
 from edgevpr.techniques import create
 
 LIKE_A_BRIDGE = 2  # the place that looks the same from its other end
@@ -26,7 +26,7 @@ def frame(place, shift_px=0, heading_deg=None):
 def walk(tmp_path_factory):
     technique, frames = create("cohog", {"camera": "nadir"}), (frame(place, heading_deg=0.0) for place in range(4))
     with PlaceMap.open(map_of(tmp_path_factory.mktemp("turned") / "m.gpkg", technique, frames)) as place_map:
-        yield walk_over(place_map, technique, prior=Told(("heading",), technique.spec.heading_within_deg))
+        yield walk_over(place_map, technique, prior=RecordedPrior(("heading",), technique.spec.heading_within_deg))
 
 
 def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):

@@ -19,12 +19,11 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.agreement import Verification
+from edgevpr.runtime.recognise.decide import WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
-from edgevpr.runtime.recognise.preparation import Preparation
-from edgevpr.runtime.recognise.recogniser import WalkSettings
 from edgevpr.runtime.recognise.recognition import fields_of
+from edgevpr.runtime.recognise.verify import Verifier
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -104,7 +103,7 @@ def proof_of(path, confidence, of_map=1.0, moved_px=(10, -16)):
     event = asked(path, create("cohog"), wide(1, *moved_px), rule)
     assert event.proof is None, "they never speak against a match"
     assert event.best.place.place_id == 2
-    return event.evidence["proof"]
+    return event.evidence.proof
 
 
 def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(mapped_ahead):
@@ -141,9 +140,9 @@ def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mappe
 def test_landmarks_are_evidence_where_they_are_asked_and_have_moved(mapped, technique):
     assert asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS).accepted
     bare = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS, verify=False)
-    assert (bare.accepted, "landmarks" in bare.evidence) == (False, False)
+    assert (bare.accepted, bare.evidence.landmarks) == (False, None)
     still = asked(mapped, technique, frame(1), BY_LANDMARKS)
-    assert (still.accepted, still.evidence["landmarks"]) == (False, 0.0), "what has not moved may be a display"
+    assert (still.accepted, still.evidence.landmarks) == (False, 0.0), "what has not moved may be a display"
 
 
 def behind_figures(image):
@@ -206,8 +205,8 @@ def same_ground(path, technique, query):
     with PlaceMap.open(path) as place_map:
         walk = walk_over(place_map, technique, BY_LANDMARKS, settings=WalkSettings())
         event = walk.step(query)
-        looked = Verification(technique.spec, event.picture, walk.index, place_map)
-        return event, int(walk.index.place_ids[event.ranking.slots[0]]), set(looked.same_ground(event.ranking))
+        looked = Verifier(walk.encoder, event.picture, walk.index, place_map)
+        return event, int(walk.index.place_ids[event.ranking.slots[0]]), set(looked.find_same_ground(event.ranking))
 
 
 def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, technique):
@@ -215,7 +214,7 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
         event, best, same = same_ground(overlapping, technique, query)
         assert {best, *same} == {1, 5, 8}
         assert event.accepted
-        assert event.evidence["lead"] > math.log(1.5), "places of the same ground are no rivals"
+        assert event.evidence.lead > math.log(1.5), "places of the same ground are no rivals"
 
 
 def test_places_without_landmarks_are_not_the_same_ground(overlapping, technique, tmp_path):
@@ -251,12 +250,12 @@ def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, techn
 def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
-    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], Preparation(mask=Mask(allowed, "half")))
+    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=Mask(allowed, "half"))
     with PlaceMap.open(path) as place_map:
         there = unpacked(place_map.landmarks_of(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0
 
 
-def test_a_sequence_is_not_held_against_landmarks(mapped, technique):
+def test_a_sequence_is_not_compared_by_landmarks(mapped, technique):
     assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).proof is None

@@ -1,39 +1,46 @@
 """Follows a flight from query to query: turns the result of each query into proposals for a belief (see `belief`).
 
-A *look* is one search of the map for one query. Its best place has a confidence. The rest of the probability that the
-query shows ground of the map at all is spread over the other places compared. The recogniser uses `Follower`.
+The best place of a *search pass*, one search of the map for one query, has a confidence. The rest of the probability
+that the query shows ground of the map at all is spread over the other places compared.
 """
 
 import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.core.geodesy import moved as moved_by
-from edgevpr.core.geodesy import offset_m
+from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
-from edgevpr.runtime.recognise.confidence import Evidence
-from edgevpr.runtime.recognise.evidence import has_twin, share_of
+from edgevpr.runtime.recognise.belief import (
+    DEFAULT_MAX_SPEED_M_S,
+    Belief,
+    MapScale,
+    Motion,
+    Proposals,
+)
+from edgevpr.runtime.recognise.evidence import Evidence, share_of
 from edgevpr.runtime.recognise.judge import Sureness
-from edgevpr.runtime.recognise.locate import Located, matrix_of, triple
-from edgevpr.runtime.recognise.motion import FASTEST_M_S, Moved, moved
+from edgevpr.runtime.recognise.locate import Located, matrix_of, to_triple
 from edgevpr.runtime.recognise.stride import Stride
 
-_LIKE_THE_BEST = 0.5  # share of the best place's votes from which on its twins are as likely, as in `has_twin`
+_TWIN_SHARE = 0.5  # share of the best place's votes from which on its twins are as likely, as in `Evidence.has_twin`
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
-_OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
-_PROPOSED = 20  # most places that one query proposes
+_RIGHT_AMONG_OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
+_MAX_PROPOSED = 20  # most places that one query proposes
 # Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
-_NEAR_PLACES, _NEAR_FOOTPRINT, _HALF = 3.0, 0.25, 0.5
+_NEAR_PLACES = 3.0
+_NEAR_FOOTPRINT = 0.25
+_HALF = 0.5
 _PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
-_LEAST_SPACING_M = 5.0
+_MAX_ELAPSED_S = 3600.0
+_MIN_SPACING_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,11 +73,11 @@ class _Survey:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
             spacing_m, footprint_m = index.spacing_m() or 0.0, layers_of(place_map).median_m
-            self.spread = max(_LEAST_SPACING_M, spacing_m)
+            self.spread = max(_MIN_SPACING_M, spacing_m)
             near_m = _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread
             self.scale = MapScale(
-                spacing=max(_LEAST_SPACING_M, footprint_m / 2 if footprint_m else spacing_m),
-                near=max(_LEAST_SPACING_M, near_m),
+                spacing=max(_MIN_SPACING_M, footprint_m / 2 if footprint_m else spacing_m),
+                near=max(_MIN_SPACING_M, near_m),
             )
 
     def is_outdated(self, index: PlaceIndex) -> bool:
@@ -87,50 +94,50 @@ class _Survey:
         return np.stack(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg), 1).astype(float)
 
 
-class Follower:
-    """Follows one flight over one map. Call `went_on` for each frame, then `heard` for each look for it, then `settle`
-    to keep the belief of the last look.
+class PlaceFilter:
+    """Follows one flight over one map. For each frame call `predict`, then `update` for each search pass, then `commit`
+    to keep the belief of the last pass.
 
-    `fastest_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for recorded frames, whose
+    `max_speed_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for recorded frames, whose
     times are those of the recording.
     """
 
-    def __init__(self, place_map: ReadMap, *, fastest_m_s: float | None, is_live: bool) -> None:
-        self._map, self._fastest_m_s, self._is_live = place_map, fastest_m_s or FASTEST_M_S, is_live
+    def __init__(self, place_map: ReadMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
+        self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live
         self._survey: _Survey | None = None  # of the map, once it has a place
         self._belief: Belief | None = None
-        self._next: Belief | None = None  # the belief after the last look, until `settle`
+        self._next: Belief | None = None  # the belief after the last pass, until `commit`
         self._arrived: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
         self._arriving: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
-        self._t_settled_s: float | None = None
+        self._t_committed_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
         self._stride: Stride | None = None
 
-    def went_on(self, frame: Frame, vehicle: Vehicle | None, stride: Stride | None = None) -> None:
-        """Note the time since the last settled look, and the motion since then, if they are known: the `stride` from
+    def predict(self, frame: Frame, vehicle: Vehicle | None, stride: Stride | None = None) -> None:
+        """Take the time since the last committed pass, and the motion since then, if they are known: the `stride` from
         the frame before or, without one, by the velocity that the autopilot reports."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
-        before_s, self._t_now_s = self._t_settled_s, now_s
+        before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if vehicle and is_fresh else None
         self._stride = stride if stride and stride.from_s == before_s else None
 
-    def heard(
+    def update(
         self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: Sureness, where: Located | None
     ) -> Followed:
-        """Return the result of one look together with the flight so far; nothing is kept before `settle`. `evidence` is
+        """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
         that of the best place of the `ranking`, and `sure` turns it into probabilities. `where` is the position of the
         aircraft computed from the best place (None: the position of the place itself is taken)."""
         if self._survey is None or self._belief is None or self._survey.is_outdated(index):
             self._survey = _Survey(self._map, index)
             self._belief = Belief(self._survey.scale)
         survey, near = self._survey, self._survey.scale.near
-        slots, proposed = _proposals(ranking, index, survey, sure, evidence, where)
+        slots, proposed = _propose(ranking, index, survey, sure, evidence, where)
         self._next = copy.copy(self._belief)
-        posterior = self._next.update(proposed, self._moved(survey), len(index))
+        posterior = self._next.update(proposed, self._motion(survey), len(index))
         slot, confidence = None, 0.0
         if len(slots) and posterior.p.max() > 0:
             best = int(posterior.p.argmax())
@@ -138,39 +145,39 @@ class Follower:
             is_near = np.hypot(*(proposed.at - at).T) <= near
             confidence = float(posterior.p[is_near].sum())
             if confidence > _HALF and np.hypot(*(posterior.at - at)) <= near:
-                confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this look
-            confidence = self._not_by_repetition(at, confidence, float(proposed.p[is_near].sum()))
+                confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this pass
+            confidence = self._limit_repetition(at, confidence, float(proposed.p[is_near].sum()))
         estimate = None
         if survey.origin and posterior.mass:
-            position = Position(*moved_by(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
-            covariance_m2, heading_deg = triple(posterior.covariance), posterior.heading_deg
+            position = Position(*moved(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
+            covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)
 
-    def saw_nothing(self, index: PlaceIndex) -> None:
-        """Note a picture that shows too little: it does not tell whether the aircraft is over the map."""
+    def update_without_match(self, index: PlaceIndex) -> None:
+        """Take a picture that shows too little: it does not tell whether the aircraft is over the map."""
         if self._survey and self._belief:
             self._next = copy.copy(self._belief)
-            self._next.update(None, self._moved(self._survey), len(index))
-            self.settle()
+            self._next.update(None, self._motion(self._survey), len(index))
+            self.commit()
 
-    def settle(self) -> None:
-        """Keep the belief of the last look; without a look since the last call the belief stays as it is."""
+    def commit(self) -> None:
+        """Keep the belief of the last pass; without a pass since the last call the belief stays as it is."""
         self._belief, self._next = self._next or self._belief, None
-        self._arrived, self._t_settled_s = self._arriving, self._t_now_s
+        self._arrived, self._t_committed_s = self._arriving, self._t_now_s
 
-    def _moved(self, survey: _Survey) -> Moved:
+    def _motion(self, survey: _Survey) -> Motion:
         if survey.scale.is_ordinal or self._elapsed_s is None:
-            return moved(None, _PLACES_A_QUERY * survey.scale.spacing)
+            return limit_motion(None, _PLACES_A_QUERY * survey.scale.spacing)
         if self._stride and self._elapsed_s > 0:
             east_m, north_m = self._stride.moved_m
             velocity_m_s = east_m / self._elapsed_s, north_m / self._elapsed_s
-            return moved(self._elapsed_s, self._fastest_m_s, velocity_m_s, is_seen=True)
-        return moved(self._elapsed_s, self._fastest_m_s, self._velocity_m_s)
+            return limit_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_seen=True)
+        return limit_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
-    def _not_by_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
+    def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
         """Return `confidence` or, if position `at` is over the same ground as the query before, of which repeated
-        pictures prove nothing new, at most that after the first picture there, or that of this look `by_itself`."""
+        pictures prove nothing new, at most that after the first picture there, or that of this pass `by_itself`."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence
@@ -179,11 +186,25 @@ class Follower:
         return min(confidence, max(arrived[1], by_itself))
 
 
-def _proposals(
+def limit_motion(
+    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_seen: bool = False
+) -> Motion:
+    """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
+    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
+    unknown), which is not used without a time or if it is too high to be true; for `is_seen` see `Motion`."""
+    if elapsed_s is None or not elapsed_s > 0:
+        return Motion(reach=speed_max, elapsed_s=1.0)
+    elapsed_s, by = min(elapsed_s, _MAX_ELAPSED_S), None
+    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
+        by = elapsed_s * np.asarray(velocity, float)
+    return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by, is_seen=is_seen)
+
+
+def _propose(
     ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
 ) -> tuple[Ints, Proposals]:
-    """Return what the query proposes to the belief, as in `Follower.heard`: the slots, int (K,), and the proposals."""
-    slots: Ints = np.array(ranking.compared_slots[:_PROPOSED])
+    """Return what the query proposes to the belief, as in `PlaceFilter.update`: the slots, int (K,), and these."""
+    slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
     at = survey.positions(slots, index)
     # Of a match that is not worth locating the place is known, and not where in its picture the aircraft is.
     spread = survey.spread if where else max(survey.spread, survey.scale.near)
@@ -193,7 +214,7 @@ def _proposals(
     if where and survey.origin:
         here, there = survey.origin, where.position
         at[0] = offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
-        if not has_twin(evidence):  # of places that are equally likely none may be known better than the others
+        if not evidence.has_twin:  # of places that are equally likely none may be known better than the others
             covariance[0] = matrix_of(where.covariance_m2)
         heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
@@ -203,12 +224,12 @@ def _proposals(
     confidence = sure.confidence(evidence)
     left = max(0.0, sure.of_map(evidence) - confidence)
     p = np.zeros(len(slots))
-    if has_twin(evidence):  # more votes only mean that it was pictured from nearer by
-        votes = np.minimum(votes, _LIKE_THE_BEST * votes.max(initial=0))
-        p[~same] = (confidence + _OTHERS * left) * _shares(votes[~same])
+    if evidence.has_twin:  # more votes only mean that it was pictured from nearer by
+        votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))
+        p[~same] = (confidence + _RIGHT_AMONG_OTHERS * left) * _shares(votes[~same])
     else:
         p[near & ~same] = confidence * _shares(votes[near & ~same])
-        p[~near & ~same] = _OTHERS * left * _shares(votes[~near & ~same])
+        p[~near & ~same] = _RIGHT_AMONG_OTHERS * left * _shares(votes[~near & ~same])
     # The probability of a place without a position is given to no other place.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(

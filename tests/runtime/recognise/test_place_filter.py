@@ -14,8 +14,9 @@ from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
-from edgevpr.runtime.recognise.follow import Follower
+from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.stride import Stride
 
 PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
@@ -46,8 +47,8 @@ IN_ORDER, IN_METRES = index_of([None] * PLACES), index_of([at(place) for place i
 class Flight:
     """A follower over a real map, and the looks of one flight: `look` hears one and keeps it."""
 
-    def __init__(self, place_map: PlaceMap, index: PlaceIndex, fastest_m_s: float | None = None) -> None:
-        self.follower = Follower(place_map, fastest_m_s=fastest_m_s, is_live=True)
+    def __init__(self, place_map: PlaceMap, index: PlaceIndex, max_speed_m_s: float | None = None) -> None:
+        self.follower = PlaceFilter(place_map, max_speed_m_s=max_speed_m_s, is_live=True)
         self.place_map, self.index, self.t_s = place_map, index, 1000.0
         self.has_poses = layers_of(place_map).median_m is not None
 
@@ -56,7 +57,7 @@ class Flight:
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
         stride = moved_m and Stride(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
-        self.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
+        self.follower.predict(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def hear(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
         """A look whose best place is this one (a number between two is one between two places). 80 landmarks agree with
@@ -66,21 +67,21 @@ class Flight:
         slots = np.array([best, *others], int)
         scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.25 if rival else 0.2] * len(others), np.float32)
         compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
-        evidence = {"agree": -1.0, "lead": lead, "coverage": -1.0}
-        evidence |= {"landmarks": math.log1p(80), "rival": math.log1p(rival)}
+        counts = {"landmarks": math.log1p(80), "rival": math.log1p(rival)}
+        evidence = Evidence(agree=-1.0, lead=lead, coverage=-1.0, **counts)
         sure = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
         where = None
         if self.has_poses:
             number = int(self.index.place_ids[best])
             where = Located(position=at(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
-        return self.follower.heard(
+        return self.follower.update(
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, sure, where
         )
 
     def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
         self.go_on(elapsed_s, velocity_m_s, moved_m)
         followed = self.hear(place, p, **more)
-        self.follower.settle()
+        self.follower.commit()
         assert_sound(followed)
         return followed
 
@@ -177,9 +178,9 @@ def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
     ranking = Ranking(
         slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
     )
-    follower = Follower(posed_map, fastest_m_s=None, is_live=True)
+    follower = PlaceFilter(posed_map, max_speed_m_s=None, is_live=True)
     sure = told(lambda evidence: 0.6, lambda evidence: 0.9)
-    followed = follower.heard(ranking, IN_METRES, {"lead": 1.0}, sure, where)
+    followed = follower.update(ranking, IN_METRES, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), sure, where)
     assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
     assert followed.lost == pytest.approx(0.4)
 
@@ -190,20 +191,20 @@ def test_what_the_autopilot_said_long_ago_is_not_its_velocity(posed_map):
         for flight, velocity_m_s in zip(flights, (None, (20.0, -20.0)), strict=True):
             flight.go_on()
             said = vehicle_at(50.0, 8.0, flight.t_s - 30.0, velocity_m_s=velocity_m_s)
-            flight.follower.went_on(Frame(image=NOTHING, name="", t_mono_s=flight.t_s), said)
+            flight.follower.predict(Frame(image=NOTHING, name="", t_mono_s=flight.t_s), said)
         ignorant, told_late = (flight.hear(place, 0.8) for flight in flights)
         assert ignorant == told_late
         for flight in flights:
-            flight.follower.settle()
+            flight.follower.commit()
 
 
 @pytest.mark.parametrize("t_utc_s", [None, float("nan")])
 def test_a_recording_without_times_is_followed_too(flight, t_utc_s):
-    follower = flight.follower = Follower(flight.place_map, fastest_m_s=None, is_live=False)
+    follower = flight.follower = PlaceFilter(flight.place_map, max_speed_m_s=None, is_live=False)
     for place in range(10, 70, STRIDE):
-        follower.went_on(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
+        follower.predict(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
         followed = flight.hear(place, 0.9)
-        follower.settle()
+        follower.commit()
     assert followed.slot == 67
     assert followed.confidence > 0.95
 
@@ -215,7 +216,7 @@ def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
         each.go_on()
     flight.hear(90, 0.9)
     assert flight.hear(40, 0.9) == other.hear(40, 0.9)
-    flight.follower.settle(), other.follower.settle()
+    flight.follower.commit(), other.follower.commit()
     assert flight.look(43) == other.look(43)
 
 

@@ -1,0 +1,93 @@
+"""The first stage of recognition: from a frame to what is searched for. Maps are made and calibrated by it, too."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+
+from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.types import Frame, Vehicle
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, Mount, View, enlarged
+from edgevpr.frames.mask import Mask
+from edgevpr.places.layers import Layers
+from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, OF_PLACE, Landmarks, describe, packed
+from edgevpr.runtime.recognise.levelling import Levelling, Straightening
+from edgevpr.runtime.recognise.salience_gate import Gate, Worth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodedFrame:
+    """A frame that was prepared and described. `vehicle`: the autopilot's report when it was taken (None: unknown).
+    `worth`: judgement of the salience gate (None: there is no gate)."""
+
+    frame: Frame
+    vehicle: Vehicle | None = None
+    picture: Levelled
+    worth: Worth | None = None
+    descriptor: Descriptor
+
+    @property
+    def view(self) -> View:
+        """The way in which the picture lies on the ground."""
+        return self.picture.view
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameEncoder:
+    """Levels or straightens the picture of a frame (`levelling`), leaves parts of it out (`mask`), judges whether it is
+    memorable (`gate`; None: each is not done), and describes it by the `technique`."""
+
+    technique: Technique
+    levelling: Levelling | Straightening | None = None
+    mask: Mask | None = None
+    gate: Gate | None = None
+
+    def prepare(
+        self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
+    ) -> Levelled:
+        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
+        mask = self.mask.fitted(frame.image) if self.mask else None
+        if self.levelling is None:
+            return enlarged(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
+        return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
+
+    def encode(
+        self,
+        frame: Frame,
+        vehicle: Vehicle | None = None,
+        *,
+        layers: Layers | None = None,
+        scale: float = 1.0,
+        metered: Callable[[str], AbstractContextManager[None]] = lambda step: nullcontext(),
+    ) -> EncodedFrame:
+        """Prepare, judge and describe a frame; `metered` is entered with the name of each step. Raises what the
+        technique and the gate raise."""
+        with metered("prepare"):
+            picture = self.prepare(frame, vehicle, layers=layers, scale=scale)
+        with metered("gate"):
+            worth = self.gate.judge(frame.image) if self.gate else None
+        with metered("encode"):
+            descriptor = self.technique.encode(picture.image, picture.mask)
+        return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, worth=worth, descriptor=descriptor)
+
+    def detect_landmarks(self, picture: Levelled, count: int = OF_PLACE) -> Landmarks:
+        """Find the `count` best landmarks of a picture, of the size at which those of places are found."""
+        longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
+        return describe(picture.image, picture.mask, count, longest_px)
+
+    def pack_landmarks(self, picture: Levelled) -> bytes | None:
+        """Return the landmarks to store for a place; None if the technique has no use for them."""
+        return packed(self.detect_landmarks(picture)) if self.technique.spec.cells else None
+
+    def with_mount(self, mount: Mount) -> "FrameEncoder":
+        """Return the same for a camera that looks straight down but for `mount`."""
+        if not isinstance(self.levelling, Levelling):
+            return self
+        return replace(self, levelling=self.levelling.with_mount(mount))
+
+
+def describe_error(error: Exception) -> str:
+    """Return an error as a sentence. An error that is not edgevpr's own is a fault of a technique or of a library."""
+    if isinstance(error, EdgevprError):
+        return str(error)
+    return f"an unforeseen {type(error).__name__} ({error}): report it, with the output of --debug"
