@@ -91,7 +91,7 @@ def walk(
         candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
     )
     encoder = FrameEncoder(technique=technique, levelling=levelling)
-    return Recogniser(encoder, place_map, Matcher(index, rule, search), meter(), settings, **more)
+    return Recogniser(encoder, place_map, Matcher(index, rule, search), meter(), settings=settings, **more)
 
 
 def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:

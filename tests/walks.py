@@ -51,4 +51,4 @@ def walk_over(
     rule = rule or accept_rule(technique, load_config(None).match)
     matcher = Matcher(load_index(place_map, technique, 10**7), rule, search)
     of_frames = FrameEncoder(technique=technique, **(encoder or {}))
-    return Recogniser(of_frames, place_map, matcher, query_meter(clock), settings, **more)
+    return Recogniser(of_frames, place_map, matcher, query_meter(clock), settings=settings, **more)

@@ -139,7 +139,7 @@ def looked_for(
     shows no ground (None: it shows ground everywhere)."""
     encoder = FrameEncoder(technique=technique, mask=None if shown is None else Mask(shown, sha256=""))
     settings = WalkSettings(candidates=technique.candidates, all_evidence=True)
-    walk = Recogniser(encoder, place_map, matcher, meter, settings)
+    walk = Recogniser(encoder, place_map, matcher, meter, settings=settings)
     return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
 

@@ -171,7 +171,7 @@ def _looks(
 
     def without(passes: Collection[int]) -> Recogniser:
         matcher = Matcher(index.only(~np.isin(flight, list(passes))), rule, layers=layers)
-        return Recogniser(encoder, place_map, matcher, meter, settings, prior=at_its_height)
+        return Recogniser(encoder, place_map, matcher, meter, settings=settings, prior=at_its_height)
 
     for number in range(len(ground.began_s)):
         here = np.flatnonzero(ground.flight == number).tolist()

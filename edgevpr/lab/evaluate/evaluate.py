@@ -56,7 +56,7 @@ class MatchOptions:
     """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
     flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
     are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
-    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, see `hints.RecordedPrior`).
+    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, `hints.RecordedPrior`).
     """
 
     candidates: int | None = bounded(1, 1_000_000, default=None)
@@ -137,7 +137,7 @@ def answer_queries(
                 place_map,
                 Matcher(index, rule, search_of(length)),
                 meter,
-                WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
+                settings=WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
                 prior=prior,
                 place_filter=PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None,
             )

@@ -112,6 +112,6 @@ class MirrorWatch:
         assert event.frame is not None
         now, settings = self._recogniser, WalkSettings(candidates=self._recogniser.candidates)
         matcher = Matcher(now.index, now.rule, follows=False)
-        alone = Recogniser(now.encoder, now.place_map, matcher, self._meter, settings)
+        alone = Recogniser(now.encoder, now.place_map, matcher, self._meter, settings=settings)
         frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
         return alone.step(frame, event.vehicle).accepted

@@ -20,7 +20,7 @@ from edgevpr.runtime.flight.frozenwatch import FrozenWatch
 from edgevpr.runtime.flight.herald import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
 from edgevpr.runtime.flight.world import Crew
-from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 _HEALTH_S, _MINUTE_S = 1.0, 60.0
 _START_S = 10.0  # from the start to a camera's first picture, if nothing is to be said of it
@@ -205,14 +205,6 @@ def _so_far(status: dict[str, Any]) -> str:
 
 def _seen(event: Recognition) -> dict[str, Any]:
     """Return the fields of the status about a query (None: unknown)."""
-    best = event.best
-    return {
-        "query": event.name,
-        "accepted": event.accepted,
-        "reason": event.reason,
-        "place": best.place.place_id if best else None,
-        "reference_image": best.place.source_image if best else None,
-        "score": best.match.score if best else None,
-        "confidence": confidence_of(event),
-        "accuracy_m": event.accuracy_m,
-    }
+    fields = fields_of(event)
+    names = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")
+    return {name: fields[name] for name in names} | {"confidence": confidence_of(event)}

@@ -184,7 +184,7 @@ class _Bench:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
         matcher, settings = Matcher(index, rule, search_of(self.sequence)), WalkSettings(candidates=candidates)
-        return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings)
+        return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
 
 
 def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:

@@ -1,19 +1,33 @@
-"""The later stages of recognition: verify the best place of a ranking, locate the aircraft by it, and decide."""
+"""The later stages of recognition: verify the best place of a ranking by landmarks, which had no part in finding it,
+locate the aircraft by it, and decide."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-from edgevpr.core.contract import Technique
+import numpy as np
+
+from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Candidate
+from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.retrieve import NOTHING, Query, Ranking, named, unmoved_elsewhere
+from edgevpr.places.retrieve import NOTHING, Expectation, Query, Ranking, elsewhere, named, unmoved_elsewhere
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.encoder import EncodedFrame
+from edgevpr.runtime.recognise.agreement import (
+    CONFIRMED,
+    Agreement,
+    Overlay,
+    agreement,
+    compare_near,
+    compose_overlays,
+)
+from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     Evidence,
     gather_evidence,
@@ -28,14 +42,15 @@ from edgevpr.runtime.recognise.judge import (
     NEW_FOR_S,
     AcceptRule,
     Findings,
-    Sureness,
     Verdict,
     is_at_rest,
     judge,
 )
-from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, Located, at_place, locate
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpacked
+from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, at_place, locate
 from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
-from edgevpr.runtime.recognise.verify import Verifier
+
+_MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,49 +81,120 @@ class WalkSettings:
     min_accuracy_m: float = 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Examined:
-    """The best place of a ranking, the rule for it, and what landmarks (`proof`; None: not compared) and the places
-    around it say: the position of the aircraft (None: unknown), and the evidence (None: the rule needs none)."""
+class Verifier:
+    """Compares the landmarks of one query, which are computed when first needed, with those of places. All methods
+    raise PlaceError if the landmarks of a place cannot be read; the place is then left out."""
 
-    ranking: Ranking
-    best: Candidate
-    rule: AcceptRule
-    proof: Agreement | None
-    where: Located | None
-    evidence: Evidence | None
+    def __init__(self, encoder: FrameEncoder, picture: Levelled, index: PlaceIndex, place_map: ReadMap) -> None:
+        self._encoder, self._spec = encoder, encoder.technique.spec
+        self._picture, self._index, self._map = picture, index, place_map
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """Landmarks of the query."""
+        return self._encoder.detect_landmarks(self._picture, OF_QUERY if self._spec.looks_down else OF_QUERY // 2)
+
+    def compare_best(self, ranking: Ranking) -> Agreement | None:
+        """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that its
+        match gives. None if the place has no landmarks, or its match no shift or rotation."""
+        expected, known = self._place(ranking, int(ranking.slots[0]))
+        return compare_near(self.landmarks, known, expected) if expected and known is not None else None
+
+    def count_inliers(self, ranking: Ranking) -> int:
+        """Return the number of landmarks of the query and of the best place that agree on the overlay of its match: 0
+        if those of the place are unknown, or if they are at rest, as a display is."""
+        expected, known = self._place(ranking, int(ranking.slots[0]))
+        found = None if known is None else agreement(self.landmarks, known, expected)
+        return 0 if found is None or found.is_at_rest else found.inliers
+
+    def count_rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int] = ()) -> int:
+        """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
+        that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
+        landmarks are unknown. Places with the numbers `same` are not elsewhere."""
+        away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
+        if not len(away):
+            return 0
+        expected, known = self._place(ranking, int(away[0]))
+        return OF_PLACE if known is None else agreement(self.landmarks, known, expected).inliers
+
+    def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
+        """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
+        landmarks of both agree, on the overlay that follows from their matches. Empty if the best place has a position,
+        since distances then tell the same."""
+        slots = ranking.compared_slots[:_MAX_SAME_GROUND]
+        if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
+            return ()
+        expected, known = self._place(ranking, slots[0])
+        if expected is None or known is None:
+            return ()
+        others = {int(self._index.place_ids[slot]): self._place(ranking, slot) for slot in slots[1:]}
+        return tuple(
+            place_id
+            for place_id, (other, landmarks) in others.items()
+            if other
+            and landmarks
+            and agreement(known, landmarks, compose_overlays(expected, other)).inliers >= CONFIRMED
+        )
+
+    def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
+        """Return the overlay of the query on the place in row `slot`, by its match, and the place's landmarks (None:
+        unknown). Both are None if the match has no shift."""
+        match, cells = ranking.compared.get(slot), self._spec.cells
+        if match is None or match.shift_cells is None or cells is None:
+            return None, None
+        width, height = self._sides
+        dx, dy = match.shift_cells
+        shift_share = dx * width / cells, dy * height / cells
+        expected = Overlay(shift_share, match.rotation_deg or 0.0, match.height_ratio)
+        try:
+            blob = self._map.landmarks_of(int(self._index.place_ids[slot]))
+        except PlaceError as error:
+            self._map.left_out.setdefault(error.place_id, error.problem)
+            raise
+        with suppress(ValueError):
+            return expected, None if blob is None else unpacked(blob)
+        return expected, None
 
     @property
-    def confidence(self) -> float | None:
-        """Probability, by the evidence, that the match is right (None: it is judged by limits)."""
-        return self.rule.sure.confidence(self.evidence) if self.rule.sure and self.evidence else None
+    def _sides(self) -> tuple[float, float]:
+        """Width and height of the picture that a technique has made a square of, as shares of its longest side."""
+        if self._spec.looks_down:  # its picture was put into the square, and not stretched
+            return 1.0, 1.0
+        height, width = self._picture.image.shape[:2]
+        return width / max(height, width), height / max(height, width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """Verdict on the place that was `examined`, and what the flight so far says of it (None: it is not followed)."""
+    """Verdict on a query, and what it was made by: the `hints` that narrowed the search, the `best` place with its
+    `findings` and the probability by its evidence that the match is right, and what the flight so far says of it.
+    None: there was no search, the match is judged by limits, or the flight is not followed."""
 
     verdict: Verdict
-    examined: Examined
-    followed: Followed | None
+    hints: Hints | None = None
+    best: Candidate | None = None
+    findings: Findings | None = None
+    confidence: float | None = None
+    followed: Followed | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
     """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix, and
     `learnt_s` has the times at which places were learnt in this flight, by their numbers."""
 
-    def __init__(
-        self,
-        place_map: ReadMap,
-        technique: Technique,
-        matcher: Matcher,
-        settings: WalkSettings,
-        meter: QueryMeter,
-        accuracy_m: float,
-        learnt_s: Mapping[int, float],
-    ) -> None:
-        self._map, self._technique, self._spec, self._matcher = place_map, technique, technique.spec, matcher
-        self._settings, self._meter, self._accuracy_m, self._learnt_s = settings, meter, accuracy_m, learnt_s
+    place_map: ReadMap
+    technique: Technique
+    matcher: Matcher
+    settings: WalkSettings
+    meter: QueryMeter
+    accuracy_m: float
+    learnt_s: Mapping[int, float]
+
+    def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
+        """Return the query of a descriptor to the places of the matcher."""
+        technique, place_map, index = self.technique, self.place_map, self.matcher.index
+        return Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
 
     def decide(
         self,
@@ -120,61 +206,62 @@ class Decider:
     ) -> Decision:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
         flight makes another place more likely, judge that one."""
-        index, followed = self._matcher.index, None
-        found = self._examine(ranking, query, verifier)
-        if place_filter and found.rule.sure and found.evidence:
-            with self._meter.step("locate"):
-                followed = place_filter.update(ranking, index, found.evidence, found.rule.sure, found.where)
+        index, search, followed = self.matcher.index, self.matcher.search, None
+        rule, (best, found) = self._find_rule(ranking), self._examine(ranking, query, verifier)
+        if place_filter and rule.sure and found.evidence:
+            with self.meter.step("locate"):
+                followed = place_filter.update(ranking, index, found.evidence, rule.sure, found.where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
-                found = self._examine(ranking.led_by(followed.slot), query, verifier)
-        age_s = query.frame.t_mono_s - self._learnt_s.get(found.best.place.place_id, -math.inf)
-        findings = Findings(
-            found.ranking,
-            is_new=age_s <= NEW_FOR_S,
-            proof=found.proof,
-            where=found.where,
-            evidence=found.evidence,
-            by_flight=followed.confidence if followed else None,
-        )
-        verdict = judge(findings, index, found.rule, self._matcher.search)
-        if verdict.accepted and self._spec.looks_down and self._matcher.search is None:
-            heading_deg = found.best.place.heading_deg
+                ranking = ranking.led_by(followed.slot)
+                rule, (best, found) = self._find_rule(ranking), self._examine(ranking, query, verifier)
+        age_s = query.frame.t_mono_s - self.learnt_s.get(best.place.place_id, -math.inf)
+        found = replace(found, is_new=age_s <= NEW_FOR_S, by_flight=followed.confidence if followed else None)
+        verdict = judge(found, index, rule, search)
+        if verdict.accepted and self.technique.spec.looks_down and search is None:
+            heading_deg = best.place.heading_deg
             is_heading_known = hints is not None and hints.heading_deg is not None and heading_deg is not None
-            findings = replace(
-                findings,
-                at_rest_elsewhere=self._share_at_rest_elsewhere(found, query),
-                ahead_of_turned=None if is_heading_known else self._lead_over_turned(found, query),
+            found = replace(
+                found,
+                at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
+                ahead_of_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
             )
-            verdict = judge(findings, index, found.rule, self._matcher.search)
-        return Decision(verdict=verdict, examined=found, followed=followed)
+            verdict = judge(found, index, rule, search)
+        confidence = rule.sure.confidence(found.evidence) if rule.sure and found.evidence else None
+        return Decision(
+            verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, followed=followed
+        )
 
-    def _examine(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> Examined:
+    def _find_rule(self, ranking: Ranking) -> AcceptRule:
+        """Return the rule for the best place of a ranking."""
+        matcher = self.matcher
+        return matcher.rule_of(int(matcher.index.place_ids[ranking.slots[0]])) if matcher.rule_of else matcher.rule
+
+    def _examine(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
         """Verify the best place of a ranking by landmarks, locate the aircraft by it, and gather the evidence."""
-        index, spec, step = self._matcher.index, self._spec, self._meter.step
+        index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self._find_rule(ranking)
         with step("compare"):
-            (best,) = named(ranking, index, self._map, first=1)
-        rule = self._matcher.rule_of(best.place.place_id) if self._matcher.rule_of else self._matcher.rule
+            (best,) = named(ranking, index, self.place_map, first=1)
         where = proof = evidence = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
-        verifies = is_worth_it and self._settings.verify and self._matcher.search is None and spec.cells is not None
+        verifies = is_worth_it and self.settings.verify and self.matcher.search is None and spec.cells is not None
         if verifies and spec.looks_down:
             with step("verify"):
                 proof = verifier.compare_best(ranking)
         if is_worth_it:
             with step("locate"):
-                places = named(ranking, index, self._map, first=MAX_PLACES_CHECKED if spec.looks_down else 1)
+                places = named(ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1)
                 where = locate(places, spec.cells, query.view, proof)
                 if where is None and best.place.position:
-                    where = at_place(best.place.position, self._accuracy_m)
+                    where = at_place(best.place.position, self.accuracy_m)
         same: Collection[int] = where.places if where else ()
         if proof and not same:
             with step("verify"):
                 same = verifier.find_same_ground(ranking)
         if rule.sure:
             evidence = gather_evidence(ranking, index, rule.neighbour_m, proof, same, spec.looks_down)
-        # Ahead, landmarks only speak for a match: they are compared where they can decide.
-        if rule.sure and evidence and verifies and not spec.looks_down and self._can_decide(rule.sure, evidence):
+        is_ahead = verifies and not spec.looks_down  # landmarks then only speak for a match, where they can decide
+        if is_ahead and rule.sure and evidence and (self.settings.all_evidence or rule.sure.is_open(evidence)):
             with step("verify"):
                 inliers, rival = verifier.count_inliers(ranking), verifier.count_rival(ranking, rule.neighbour_m)
             evidence = replace(evidence, proof=log_times_more(inliers, rival))
@@ -182,35 +269,25 @@ class Decider:
             with step("verify"):
                 rival = verifier.count_rival(ranking, rule.neighbour_m, same)
             evidence = replace(evidence, rival=log_count(rival))
-        return Examined(ranking=ranking, best=best, rule=rule, proof=proof, where=where, evidence=evidence)
+        return best, Findings(ranking, proof=proof, where=where, evidence=evidence)
 
-    def _can_decide(self, sure: Sureness, evidence: Evidence) -> bool:
-        return self._settings.all_evidence or sure.is_open(evidence)
-
-    def _lead_over_turned(self, found: Examined, query: EncodedFrame) -> float | None:
+    def _lead_over_turned(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
         """Return the lead, as in the evidence, over the same place if the picture is turned otherwise (None: no
         evidence is needed)."""
-        if found.evidence is None:
+        if evidence is None:
             return None
-        with self._meter.step("compare"):
-            fine, _ = self._map.fine_part(found.best.place.place_id)
-            turned = self._technique.turned(query.descriptor, fine, found.best.match)
-            return found.evidence.agree - log_share(share_of(turned))
+        with self.meter.step("compare"):
+            fine, _ = self.place_map.fine_part(best.place.place_id)
+            return evidence.agree - log_share(share_of(self.technique.turned(query.descriptor, fine, best.match)))
 
-    def _share_at_rest_elsewhere(self, found: Examined, encoded: EncodedFrame) -> float:
+    def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not
         at rest, or there are none)."""
-        best = found.best.match
+        best = candidate.match
         if not is_at_rest(best):
             return 0.0
-        query = Query(
-            technique=self._technique,
-            descriptor=encoded.descriptor,
-            place_map=self._map,
-            index=self._matcher.index,
-            expected=NOTHING,
-        )
-        with self._meter.step("compare"):
-            matches = unmoved_elsewhere(query, int(found.ranking.slots[0]), self._accuracy_m)
+        with self.meter.step("compare"):
+            query = self.make_query(encoded.descriptor, NOTHING)
+            matches = unmoved_elsewhere(query, int(ranking.slots[0]), self.accuracy_m)
         least = LIKE_AT_REST * share_of(best)
         return sum(is_at_rest(match) and share_of(match) >= least for match in matches) / max(len(matches), 1)

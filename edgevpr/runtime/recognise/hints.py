@@ -80,18 +80,12 @@ class Hints:
 
 class RecordedPrior:
     """Makes the hints for each recorded query from its own frame, whatever became of the query before. `known` are
-    members of `KNOWN_FIELDS`; what a frame lacks of them is not known of this query.
-
-    `heading_within_deg` is that of `Prior`, as are the public attributes, for the query of the last `hints`.
-    `map_height_m` is the height at which the map was made, metres. None: it or the heights of all queries are unknown,
-    and `height` means that each was taken at the map's height.
+    members of `KNOWN_FIELDS`; what a frame lacks of them is not known of it. The rest is as in `Prior`. `map_height_m`
+    is the height at which the map was made (None: it or those of the queries are unknown; `height` means the map's).
     """
 
     def __init__(
-        self,
-        known: Collection[str] = (),
-        heading_within_deg: float | None = None,
-        map_height_m: float | None = None,
+        self, known: Collection[str] = (), heading_within_deg: float | None = None, map_height_m: float | None = None
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
         self.footprint_m: float | None = None
@@ -100,8 +94,7 @@ class RecordedPrior:
         self.looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame. The aircraft is within `RECORDED_REACH_M` metres of its recorded position. The
-        arguments `vehicle` and `margin_m`, of a flight, do not count."""
+        """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, do not count."""
         ratio: float | None = 1.0
         if self._map_height_m is not None:
             ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
@@ -125,15 +118,13 @@ class RecordedPrior:
 class Prior(RecordedPrior):
     """Makes the hints for each query of a flight, and decides whether hints are to be trusted.
 
-    `height_ratio` is the height of the camera, relative to that of the map's pictures (see `FineMatch`), by the last
-    accepted match (until there is one, that of the map); where heights are known, and pictures scaled by them, it is
-    how far they are wrong. `footprint_m` is that of the layer of the map in which the last match was, by which the next
-    picture is found best (None: unknown, or its height tells it); the height ratio is relative to it.
-    `area` is where the aircraft was at the last query, as far as it is known: a wider one than narrows the search.
-    `looks_again` tells whether a query that is not accepted there is searched at all other heights. `reach_m_s` is the
-    highest speed of the aircraft, m/s (None: positions give no hint). `heading_within_deg` is the largest error of a
-    known heading, degrees (None: headings give no hint; see `TechniqueSpec`). `is_live` is False for recorded frames,
-    for which the autopilot's reports do not hold.
+    `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; where
+    pictures are scaled by known heights, it is how far these are wrong. `footprint_m` is that of the layer in which the
+    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `area` is where the
+    aircraft was at the last query, a wider one than narrows the search. `looks_again`: a query that is not accepted
+    there is searched at all other heights. `reach_m_s` is the highest speed, m/s (None: positions give no hint),
+    `heading_within_deg` the largest error of a known heading (None: headings give no hint). `is_live` is False for
+    recorded frames, for which the autopilot's reports do not hold.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:

@@ -27,12 +27,12 @@ NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the positio
 # Trajectories at other speeds are many, so one of them scores well by chance: half the margin over them is enough. With
 # it, no wrong sequence of the corridor set was accepted from hog, seqslam or cohog, flown as it was mapped, twice as
 # fast, or the other way. At half the speed cohog accepted places three away from the right one.
-_OF_MARGIN_AT_OTHER_SPEEDS = 0.5
-_LONGEST = 10
+_MARGIN_SHARE_AT_OTHER_SPEEDS = 0.5
+_MAX_INDEPENDENT = 10
 
 # Looking down, if more than this share of a few places elsewhere agree without any shift or rotation, as the best one
 # does, all share what is drawn over every frame. They count with this share of its votes or more: behind a display or
-# figures nearly all have .15 to .9 of them, on smooth, generated ground some are at rest by chance with up to .065.
+# figures nearly all have 0.15 to 0.9 of them, on smooth ground some are at rest by chance with up to 0.065.
 _DISPLAY_SHARE = 0.4
 LIKE_AT_REST = 0.15
 _AT_REST_CELLS = 0.75
@@ -41,21 +41,25 @@ _AT_REST_HEIGHT = 0.2
 
 # A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had six or more.
 # Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
-_CLEAR_SCORE, _LEAST_INLIERS, _LANDMARKS_ENOUGH = 0.2, 5, 100
+_CLEAR_SCORE = 0.2
+_MIN_INLIERS = 5
+_ENOUGH_LANDMARKS = 100
 # Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
-_OF_SCORE_WHEN_PROVEN = 0.5
+_MIN_SCORE_SHARE_WITH_LANDMARKS = 0.5
 # The least lead over the same place with the picture turned otherwise. Over sat_marash's ground, heading unknown, 273
 # of 276 right matches have more, and two of three wrong ones less: a bridge taken for its other end.
-_AHEAD_OF_TURNED = math.log(1.75)
+_MIN_LEAD_OVER_TURNED = math.log(1.75)
 # Probabilities: the highest where a place elsewhere agrees as well; the least for accepting, at any precision, by the
 # match alone, and by the flight so far.
-_EVEN, _LEAST_SURE, _SURE_BY_FLIGHT = 0.5, 0.9, 0.99
+_MAX_WITH_TWIN = 0.5
+_MIN_CONFIDENCE = 0.9
+_MIN_BY_FLIGHT = 0.99
 # How many times the flight must raise the odds of a match for the precision to be enough. By itself a match often needs
 # more, since of many matches the luckiest wrong one must be refused; the queries before do not share its luck. In seven
 # manners of flying along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures each, nothing
-# more was wrong; of nordland_tiny's queries .59 instead of .47 are accepted.
-_RAISED = 10.0
-_LEAST_FOLLOWED = 0.5  # least probability by the flight so far, for a match that is sure by itself
+# more was wrong; of nordland_tiny's queries 0.59 instead of 0.47 are accepted.
+_MIN_ODDS_RAISED = 10.0
+_MIN_FOLLOWED = 0.5  # least probability by the flight so far, for a match that is sure by itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class Sureness:
     def confidence(self, evidence: Evidence) -> float:
         """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees about as well."""
         confidence = self.models[evidence.kind].confidence(evidence.figures())
-        return confidence if evidence.leads else min(confidence, _EVEN)
+        return confidence if evidence.leads else min(confidence, _MAX_WITH_TWIN)
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
@@ -78,7 +82,7 @@ class Sureness:
     def is_open(self, evidence: Evidence) -> bool:
         """Return True if more evidence of the place can still decide: the match leads, its query is likely to show
         ground of the map, and it is not sure yet."""
-        is_likely = evidence.leads and self.of_map(evidence) >= _EVEN
+        is_likely = evidence.leads and self.of_map(evidence) >= _MAX_WITH_TWIN
         return is_likely and self.confidence(evidence) < self.threshold(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
@@ -87,7 +91,7 @@ class Sureness:
 
     def needed(self, kind: str) -> float:
         """Return the confidence needed to accept a match with evidence of this kind."""
-        return max(_LEAST_SURE, self.models[kind].threshold(self.precision))
+        return max(_MIN_CONFIDENCE, self.models[kind].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,17 +151,14 @@ def accept_rule(
     technique: Technique, config: MatchConfig, length: int = 1, calibration: MapCalibration | None = None
 ) -> AcceptRule:
     """Return the rule for a technique: by confidence if a model of its evidence exists, else by its own limits. Limits
-    in the configuration come first. `calibration` is that of the map (None: the shipped models are used).
-
-    A technique's margin is meant for one query. The mean score of `length` queries varies less, so the margin for a
-    sequence is divided by the root of its length. Lengths above ten count as ten, because queries that show the same
-    ground are not independent. A sequence is always judged by limits.
-    """
+    in the configuration come first. `calibration` is that of the map (None: the shipped models are used). A sequence of
+    `length` queries is judged by limits; its margin is that of one query, over the root of its length (10 at most:
+    queries that show the same ground are not independent)."""
     kinds = kinds_of(technique.spec) if length == 1 else ()
     # The flight may know better than one match which of two places it is: no lead is needed for its sake.
     own_score, own_margin = (0.0, -math.inf) if kinds else (technique.min_score, technique.min_margin)
     if own_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either
-        own_margin /= math.sqrt(min(length, _LONGEST))
+        own_margin /= math.sqrt(min(length, _MAX_INDEPENDENT))
     own = calibration.models if calibration else {}
     models = {kind: own.get(kind) or prior(kind) for kind in kinds}
     return AcceptRule(
@@ -166,16 +167,13 @@ def accept_rule(
         neighbour_m=config.neighbour_m,
         min_quality=technique.min_quality,
         sure=Sureness(models, config.accept_precision) if kinds else None,
-        worth_a_look=_OF_SCORE_WHEN_PROVEN * technique.min_score,
+        worth_a_look=_MIN_SCORE_SHARE_WITH_LANDMARKS * technique.min_score,
     )
 
 
 def says_nothing(query: Descriptor, min_quality: float) -> str | None:
-    """Return the reason if a picture shows too little to be recognised, None if its quality is at least `min_quality`.
-
-    Examples are screens without a signal, displays on a dark ground, bare sky, or a covered lens. Few regions of such a
-    picture hold information, so that the share of them that agrees on a place can exceed any limit by chance.
-    """
+    """Return the reason if a picture shows too little to be recognised, as a covered lens or bare sky does, None if its
+    quality is at least `min_quality`. The few regions that hold information can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
     return f"the picture says nothing: {query.quality:.0%} of it holds information, {min_quality:.0%} are needed"
@@ -241,9 +239,9 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
         return Verdict(False, figures)
     if evidence.lead < 0 and not by_itself:
         return Verdict(False, f"a place elsewhere agrees better: {figures}")
-    if followed is not None and followed < _LEAST_FOLLOWED:
+    if followed is not None and followed < _MIN_FOLLOWED:
         return Verdict(False, f"the flight so far speaks against it: {figures}")
-    if findings.ahead_of_turned is not None and findings.ahead_of_turned < _AHEAD_OF_TURNED:
+    if findings.ahead_of_turned is not None and findings.ahead_of_turned < _MIN_LEAD_OVER_TURNED:
         return Verdict(False, f"the same place agrees nearly as well if the picture is turned otherwise; {figures}")
     return Verdict(True, figures)
 
@@ -251,16 +249,16 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
 def _is_sure_by_flight(followed: float, confidence: float, needed: float, precision: float) -> bool:
     """Return True if a place's probability by the flight so far, `followed`, is enough. By itself its match has this
     `confidence` of the one `needed`."""
-    is_raised = followed * (1 - confidence) >= _RAISED * confidence * (1 - followed)
-    return followed >= max(_SURE_BY_FLIGHT, min(needed, precision) if is_raised else needed)
+    is_raised = followed * (1 - confidence) >= _MIN_ODDS_RAISED * confidence * (1 - followed)
+    return followed >= max(_MIN_BY_FLIGHT, min(needed, precision) if is_raised else needed)
 
 
 def _disproves(proof: Agreement, score: float) -> str | None:
     """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
     if not proof.is_expected:
         return f"its landmarks lie otherwise than its regions: {proof.inliers} agree on another step"
-    if score >= _CLEAR_SCORE and proof.inliers < _LEAST_INLIERS and proof.possible >= _LANDMARKS_ENOUGH:
-        return f"its landmarks do not agree: {proof.inliers} do, and {_LEAST_INLIERS} are needed where so much does"
+    if score >= _CLEAR_SCORE and proof.inliers < _MIN_INLIERS and proof.possible >= _ENOUGH_LANDMARKS:
+        return f"its landmarks do not agree: {proof.inliers} do, and {_MIN_INLIERS} are needed where so much does"
     return None
 
 
@@ -284,6 +282,6 @@ def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: S
     if not search.goes_on(~away, rule.min_score):
         return "the newest queries no longer see what those before them saw"
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))
-    if not ahead_of_rivals >= _OF_MARGIN_AT_OTHER_SPEEDS * rule.min_margin:
+    if not ahead_of_rivals >= _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin:
         return f"only {ahead_of_rivals:.3f} ahead of a place elsewhere that is passed at another speed"
     return None

@@ -37,7 +37,7 @@ _FIELDS_AGREE_DEG = 5.0  # that of a data sheet is rounded
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Levelling:
     """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they stay as they
     are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
@@ -47,11 +47,11 @@ class Levelling:
     level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
     """
 
-    lens: Lens | None
-    below: bool = field(default=False, kw_only=True)
-    on_gimbal: bool = field(default=False, kw_only=True)
-    is_live: bool = field(kw_only=True)
-    mount: Mount = field(default=STRAIGHT_DOWN, kw_only=True)
+    lens: Lens | None = field(kw_only=False)
+    below: bool = False
+    on_gimbal: bool = False
+    is_live: bool
+    mount: Mount = STRAIGHT_DOWN
     _has_warned: bool = field(default=False, init=False)
 
     def with_mount(self, mount: Mount) -> "Levelling":

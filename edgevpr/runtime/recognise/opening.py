@@ -57,7 +57,13 @@ def open_recogniser(
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
     if is_tiled := Path(config.map).is_dir():
-        _require_flight(config, narrowed)
+        if not narrowed:
+            raise UsageError(
+                f"{config.map} is a folder, over whose maps `edgevpr run` flies: elsewhere name one map of them, or "
+                "make one of a part by `edgevpr map subset`."
+            )
+        if config.match.sequence is not None:
+            raise UsageError(f"{config.map} is a folder of maps, in which no sequences are matched: leave them out.")
     place_map = TileMap.open(config.map) if is_tiled else PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
@@ -76,17 +82,6 @@ def open_recogniser(
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
-
-
-def _require_flight(config: Config, is_flight: bool) -> None:
-    """Raise UsageError if what is opened cannot be recognised in a folder of maps, but in one map only."""
-    if not is_flight:
-        raise UsageError(
-            f"{config.map} is a folder, over whose maps `edgevpr run` flies: elsewhere name one map of them, or make "
-            "one of a part by `edgevpr map subset`."
-        )
-    if config.match.sequence is not None:
-        raise UsageError(f"{config.map} is a folder of maps, in which no sequences are matched: leave them out.")
 
 
 def places_in_ram(recogniser: Recogniser) -> int:
@@ -204,9 +199,8 @@ def technique_of(
 
 
 def warn_of_other_pictures(place_map: ReadMap, mask: Mask | None, lens: str | None) -> None:
-    """Warn if the places of a map, which remain usable, were made with another `mask`; and say if pictures are
-    straightened by the calibration `lens` and those of the places were not, or the other way round, which is right
-    where one of the two cameras has no distortion."""
+    """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
+    straightened by a calibration and those to come are not (`lens` None)."""
     if not len(place_map):
         return
     path, built_mask, built_lens = place_map.path, place_map.mask_sha256, place_map.lens
@@ -219,8 +213,6 @@ def warn_of_other_pictures(place_map: ReadMap, mask: Mask | None, lens: str | No
             path,
             built_lens,
         )
-    elif lens and not built_lens:
-        _log.info("%s was built without `source.lens`: right if its pictures had no distortion", path)
 
 
 def _recogniser(
@@ -248,7 +240,7 @@ def _recogniser(
         place_map,
         Matcher(index, rule, search_of(length)),
         meter,
-        WalkSettings(
+        settings=WalkSettings(
             candidates=match.candidates or technique.candidates,
             verify=match.verify,
             min_accuracy_m=config.mavlink.min_accuracy_m,

@@ -176,8 +176,8 @@ class PlaceFilter:
         return limit_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
     def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Return `confidence` or, if position `at` is over the same ground as the query before, of which repeated
-        pictures prove nothing new, at most that after the first picture there, or that of this pass `by_itself`."""
+        """Return `confidence`: over the same ground as the query before, of which repeated pictures prove nothing new,
+        at most that after the first picture there, or that of this pass `by_itself`."""
         arrived = self._arrived
         if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
             self._arriving = at, confidence

@@ -6,39 +6,29 @@ take several, at different heights.
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
-from edgevpr.core.contract import Descriptor, Technique, nearest_height
+from edgevpr.core.contract import Descriptor, nearest_height
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, scan, together
+from edgevpr.places.retrieve import Expectation, Ranking, compare, scan, together
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
-from edgevpr.runtime.recognise.hints import Hints, Reach, RecordedPrior, to_expectation
-from edgevpr.runtime.recognise.judge import NEW_FOR_S, AcceptRule, Verdict, says_nothing
+from edgevpr.runtime.recognise.hints import Reach, RecordedPrior, to_expectation
+from edgevpr.runtime.recognise.judge import NEW_FOR_S, Verdict, says_nothing
 from edgevpr.runtime.recognise.levelling import with_picture_heading
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.stride import Stride, Strides
-from edgevpr.runtime.recognise.verify import Verifier
 
 _log = logging.getLogger(__name__)
 _LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height but the first
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Answer:
-    """Verdict on a query, and what it was made by (None: there was no search)."""
-
-    verdict: Verdict
-    hints: Hints | None = None
-    decision: Decision | None = None
 
 
 class Recogniser:
@@ -55,14 +45,14 @@ class Recogniser:
         place_map: ReadMap,
         matcher: Matcher,
         meter: QueryMeter,
-        settings: WalkSettings,
         *,
+        settings: WalkSettings,
         strides: Strides | None = None,
         prior: RecordedPrior | None = None,
         place_filter: PlaceFilter | None = None,
     ) -> None:
         self.encoder, self.place_map, self.meter = encoder, place_map, meter
-        self.candidates = settings.candidates
+        self.technique, self.candidates = encoder.technique, settings.candidates
         self._settings, self._strides, self._place_filter = settings, strides, place_filter
         self._prior = prior or RecordedPrior()
         self._left_out_reported = 0  # places
@@ -76,19 +66,20 @@ class Recogniser:
         """Recognise with another matcher, number of candidates or mount of the camera from the next frame on (None: it
         stays). Call it between two frames, from the thread that recognises."""
         if matcher is not None:
-            self.matcher, self._layers = matcher, matcher.layers or self._layers
+            self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
+            self._layers = matcher.layers or self._layers
             # Places nearer to each other show the same ground: neither is a rival of the other.
             self._footprint_m = max(self._layers.footprints_m, default=0.0)
             # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
             self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
             self._decider = Decider(
-                self.place_map,
-                self.technique,
-                matcher,
-                self._settings,
-                self.meter,
-                self.accuracy_m,
-                self._learnt_s,
+                place_map=self.place_map,
+                technique=self.technique,
+                matcher=matcher,
+                settings=self._settings,
+                meter=self.meter,
+                accuracy_m=self.accuracy_m,
+                learnt_s=self._learnt_s,
             )
         if candidates is not None:
             self.candidates = candidates
@@ -101,21 +92,6 @@ class Recogniser:
         self._learnt_s = {new: t_s for new, t_s in self._learnt_s.items() if t_mono_s - t_s <= NEW_FOR_S}
         self._learnt_s[place_id] = t_mono_s
         self.change(matcher=replace(self.matcher, index=index))
-
-    @property
-    def technique(self) -> Technique:
-        """The technique that describes and compares pictures."""
-        return self.encoder.technique
-
-    @property
-    def index(self) -> PlaceIndex:
-        """The index that is searched."""
-        return self.matcher.index
-
-    @property
-    def rule(self) -> AcceptRule:
-        """The rule for accepting a match."""
-        return self.matcher.rule
 
     @property
     def sequence(self) -> int:
@@ -138,16 +114,16 @@ class Recogniser:
         Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason.
         """
         self.meter.begin()
-        query = stride = answer = failure = None
+        query = stride = decision = failure = None
         try:
             query = self.encoder.encode(frame, vehicle, layers=self._layers, scale=self._scale, metered=self.meter.step)
             verifier = Verifier(self.encoder, query.picture, self.index, self.place_map)
             stride = self._measure_stride(frame, query.view, verifier)
-            answer = self._answer(query, verifier, stride)
+            decision = self._decide(query, verifier, stride)
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
             failure = error
-        return self._event(frame, vehicle, query, stride, answer, failure)
+        return self._event(frame, vehicle, query, stride, decision, failure)
 
     def measure_motion(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Measure the motion from the frame before to this one, and nothing else. Never raises an Exception."""
@@ -174,14 +150,13 @@ class Recogniser:
         vehicle: Vehicle | None,
         query: EncodedFrame | None = None,
         stride: Stride | None = None,
-        answer: _Answer | None = None,
+        decision: Decision | None = None,
         failure: Exception | None = None,
     ) -> Recognition:
         """Return the event of a frame; `failure` is the error that ended it (None: none did)."""
-        verdict = answer.verdict if answer else Verdict(False, describe_error(failure) if failure else "")
-        decision = answer.decision if answer else None
-        found, followed = (decision.examined, decision.followed) if decision else (None, None)
-        where = found.where if found and verdict.accepted else None
+        decision = decision or Decision(verdict=Verdict(False, describe_error(failure) if failure else ""))
+        found, accepted = decision.findings, decision.verdict.accepted
+        where = found.where if found and accepted else None
         left_out = tuple(islice(self.place_map.left_out.items(), self._left_out_reported, None))
         self._left_out_reported += len(left_out)
         return Recognition(
@@ -191,15 +166,15 @@ class Recogniser:
             worth=query.worth if query else None,
             descriptor=query.descriptor if query else None,
             stride=stride,
-            hints=answer.hints if answer else None,
+            hints=decision.hints,
             ranking=found.ranking if found else None,
-            best=found.best if found else None,
+            best=decision.best,
             proof=found.proof if found else None,
             evidence=found.evidence if found else None,
-            confidence=found.confidence if found else None,
-            followed=followed,
-            accepted=verdict.accepted,
-            reason=verdict.reason,
+            confidence=decision.confidence,
+            followed=decision.followed,
+            accepted=accepted,
+            reason=decision.verdict.reason,
             says_nothing=query is not None and says_nothing(query.descriptor, self.rule.min_quality) is not None,
             failed=failure is not None,
             map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
@@ -222,35 +197,34 @@ class Recogniser:
         with self.meter.step("stride"):
             return self._strides.to(frame.t_mono_s, view, verifier.landmarks)
 
-    def _answer(self, query: EncodedFrame, verifier: Verifier, stride: Stride | None) -> _Answer:
-        """Search the map for an encoded frame, and learn from the answer what the next query needs."""
+    def _decide(self, query: EncodedFrame, verifier: Verifier, stride: Stride | None) -> Decision:
+        """Search the map for an encoded frame, and learn from the decision what the next query needs."""
         place_filter = self._place_filter if self.matcher.follows else None
-        objection = says_nothing(query.descriptor, self.rule.min_quality) or (
-            query.worth.reason if query.worth else None
-        )
+        objection = says_nothing(query.descriptor, self.rule.min_quality)
+        if not objection and query.worth:
+            objection = query.worth.reason
         if place_filter:
             place_filter.predict(query.frame, query.vehicle, stride)
         if not len(self.index):
-            return _Answer(verdict=Verdict(False, "the map has no place yet"))
+            return Decision(verdict=Verdict(False, "the map has no place yet"))
         if objection and self.matcher.search is None:  # a sequence needs every query
             if place_filter:
                 place_filter.update_without_match(self.index)
-            return _Answer(verdict=Verdict(False, objection))
-        hints, decision = self._find(query, verifier, place_filter)
+            return Decision(verdict=Verdict(False, objection))
+        decision = self._find(query, verifier, place_filter)
         if place_filter:
             place_filter.commit()
-        verdict = Verdict(False, objection) if objection else decision.verdict
-        best, t_mono_s, followed = decision.examined.best, query.frame.t_mono_s, decision.followed
-        self._prior.update(best, verdict.accepted, t_mono_s, self._scale, query.view.footprint_m, self._layers)
-        if followed:
+        if objection:
+            decision = replace(decision, verdict=Verdict(False, objection))
+        t_mono_s, accepted, footprint_m = query.frame.t_mono_s, decision.verdict.accepted, query.view.footprint_m
+        if decision.best:
+            self._prior.update(decision.best, accepted, t_mono_s, self._scale, footprint_m, self._layers)
+        if followed := decision.followed:
             self._prior.update_area(followed.estimate, followed.mass, t_mono_s)
-        return _Answer(verdict=verdict, hints=hints, decision=decision)
+        return decision
 
-    def _find(
-        self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None
-    ) -> tuple[Hints | None, Decision]:
-        """Search for a query as expected and, if nothing is accepted, at all other heights. Returns what was expected
-        and the decision."""
+    def _find(self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None) -> Decision:
+        """Search for a query as expected and, if nothing is accepted, at all other heights."""
         prior, search, height_ratios = self._prior, self.matcher.search, self.technique.spec.height_ratios
         margin_m = max(self.accuracy_m, self.rule.neighbour_m)
         hints = prior.hints(with_picture_heading(query.frame, query.view), query.vehicle, self.index, margin_m)
@@ -262,24 +236,18 @@ class Recogniser:
             ranking = search.follow(ranking, self.index, query.frame.t_mono_s)
         decision = self._decider.decide(ranking, query, hints, verifier, place_filter)
         if decision.verdict.accepted or search or not height_ratios or not prior.looks_again:
-            return hints, decision
+            return decision
         first = nearest_height(height_ratios, height_ratio)
         for ratio in height_ratios:
             if ratio != first:
                 other = self._search(query.descriptor, replace(expected, height_ratio=ratio), _LATER_PASS_SHARE)
                 ranking = together(ranking, other)
         # Matches of all passes are judged together: each can speak against the best one.
-        return hints, self._decider.decide(ranking, query, hints, verifier, place_filter)
+        return self._decider.decide(ranking, query, hints, verifier, place_filter)
 
     def _search(self, descriptor: Descriptor, expected: Expectation, share: float = 1.0) -> Ranking:
         """Search the map once for a query, with this `share` of the candidates. Raises as `compare` does."""
-        query = Query(
-            technique=self.technique,
-            descriptor=descriptor,
-            place_map=self.place_map,
-            index=self.index,
-            expected=expected,
-        )
+        query = self._decider.make_query(descriptor, expected)
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
             scanned = scan(query)

@@ -14,9 +14,11 @@ from edgevpr.runtime.recognise.agreement import agreement
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
 
 # Over ground that repeats, as furrows do, landmarks match at many shifts: few of the matches agree on one.
-_FEWEST, _LEAST_SHARE = 30, 0.4
-_MOST_TURN_DEG, _MOST_SCALE = 8.0, 1.15  # two levelled pictures lie on each other turned and scaled by no more
-_LONGEST_S = 30.0
+_MIN_INLIERS = 30
+_MIN_INLIER_SHARE = 0.4
+_MAX_TURN_DEG = 8.0  # two levelled pictures lie on each other turned and scaled by no more
+_MAX_SCALE = 1.15
+_MAX_ELAPSED_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +56,7 @@ class Strides:
     def to(self, t_s: float, view: View, landmarks: Landmarks) -> Stride | None:
         """Return the stride to a frame taken at `t_s`; None if it is not known. The next one begins there."""
         before, self._before = self._before, (t_s, view, landmarks.best(OF_PLACE))
-        if before is None or not 0 < t_s - before[0] <= _LONGEST_S:
+        if before is None or not 0 < t_s - before[0] <= _MAX_ELAPSED_S:
             return None
         from_s, start, known = before
         if start.aside is None or view.aside is None or start.up_deg is None or view.up_deg is None:
@@ -62,20 +64,24 @@ class Strides:
         if start.footprint_m is None or view.footprint_m is None:
             return None
         found = agreement(landmarks, known)
-        if found.inliers < max(_FEWEST, _LEAST_SHARE * found.matched):
+        if found.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * found.matched):
             return None
         if found.shift_share is None or found.rotation_deg is None or found.scale is None:
             return None
         turned_deg = shorter_deg(found.rotation_deg - (view.up_deg - start.up_deg))
         stretched = found.scale * start.footprint_m / view.footprint_m
-        if abs(turned_deg) > _MOST_TURN_DEG or not 1 / _MOST_SCALE < stretched < _MOST_SCALE:
+        if abs(turned_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < stretched < _MAX_SCALE:
             return None
         # The point under the camera, in the picture before: that of this picture, turned, scaled and shifted.
         factor = found.scale * complex(math.cos(turn := math.radians(found.rotation_deg)), math.sin(turn))
         step = factor * complex(view.aside[0], -view.aside[1]) + complex(*found.shift_share)
         step -= complex(start.aside[0], -start.aside[1])
         east_m, north_m = start.footprint_m * axes_of(start.up_deg) @ (step.real, -step.imag)
-        sd_m = start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0])
-        moved_m = float(east_m), float(north_m)
-        zoom = math.log(stretched)
-        return Stride(from_s=from_s, to_s=t_s, moved_m=moved_m, sd_m=sd_m, inliers=found.inliers, zoom=zoom)
+        return Stride(
+            from_s=from_s,
+            to_s=t_s,
+            moved_m=(float(east_m), float(north_m)),
+            sd_m=start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0]),
+            inliers=found.inliers,
+            zoom=math.log(stretched),
+        )

@@ -16,7 +16,6 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
-from edgevpr.runtime.recognise.recognition import fields_of
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -106,19 +105,6 @@ def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, a
     assert event.followed.confidence > 0.5
     if event.position:
         assert event.position.lat_deg == pytest.approx(50 + TWICE[1] * 0.0002)
-
-
-def test_the_log_says_what_the_flight_knows(flight, alone):
-    event = flight.see(4)
-    said = fields_of(event)["followed"]
-    assert said["confidence"] == pytest.approx(event.followed.confidence, abs=1e-6)
-    assert said["lost"] == pytest.approx(event.followed.lost, abs=1e-6)
-    assert ("lat_deg" in said) == (event.followed.estimate is not None) == (event.best.place.position is not None)
-    if "lat_deg" in said:
-        assert said["lat_deg"] == pytest.approx(50 + 4 * 0.0002, abs=1e-4)
-        assert len(said["covariance_m2"]) == 3
-        assert said["heading_deg"] is None
-    assert "followed" not in fields_of(alone.see(4))
 
 
 def test_an_aircraft_that_hovers_or_creeps_over_a_place_goes_on_recognising_it(whole_map):

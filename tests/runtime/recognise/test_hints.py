@@ -111,11 +111,6 @@ def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
     assert hints_at(10.0, index, vehicle(HOME, 10.0), heading_deg=5.0) == Hints(Reach(HOME, 50.0))
 
 
-def test_what_the_log_says():
-    assert Hints(Reach(HOME, 61.26), 90.0).fields() == {"reach_m": 61.3, "heading": True}
-    assert Hints(heading_deg=0.0).fields() == {"reach_m": None, "heading": True}
-
-
 @pytest.mark.parametrize(
     ("hints", "candidate", "agrees"),
     [

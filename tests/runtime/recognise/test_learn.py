@@ -10,7 +10,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
@@ -43,7 +43,7 @@ class Bench:
             self.map,
             Matcher(self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
             meter_of(load_config(None), load_board("this")),
-            WalkSettings(),
+            settings=WalkSettings(),
         )
         self.learner = Learner(
             self.recogniser, self.growing, spacing_m=SPACING_M, gap_m=GAP_M, utc_clock=self.clock.utc_s
@@ -206,11 +206,3 @@ def test_a_flight_that_could_never_know_where_it_is_is_refused(tmp_path):
         check_positions(config(**{"source.uri": "/dev/video0"}))
     check_positions(config(**{"mavlink.link": "udpout:127.0.0.1:9"}))
     check_positions(config())
-
-
-def test_what_is_learnt_of_a_levelled_picture_lies_where_its_middle_is(tmp_path):
-    bench = Bench(tmp_path / "m.gpkg")
-    place = bench.see(view=View(up_deg=0.0, footprint_m=100.0, aside=(0.0, -0.3)))
-    assert place.position.lat_deg == pytest.approx(50 + 30 * METRE_DEG, abs=1e-7), "the aircraft is south of it"
-    (stored,) = bench.map.places()
-    assert (stored.heading_deg, stored.pose.up_deg, stored.pose.footprint_m) == (0.0, 0.0, 100.0)

@@ -127,15 +127,6 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
     assert recognised(event, 2)
 
 
-def test_hints_go_on_to_work_for_a_picture_that_was_turned(walk, ground, technique):
-    event = walk(scaling(), Prior(None, technique.spec.heading_within_deg, is_live=False)).step(
-        frame(ground, 2, heading_deg=75.0)
-    )
-    assert event.hints.heading_deg == 0.0
-    assert recognised(event, 2)
-    assert min(event.best.match.rotation_deg, 360 - event.best.match.rotation_deg) <= 15
-
-
 @pytest.mark.slow
 def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
     seen = frame(ground, 1, heading_deg=180.0)
@@ -221,14 +212,6 @@ def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_noth
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
     assert Levelling(None, is_live=False).prepare(frame, None, None).view.reason.split()[-2:] == ["50", "degrees"]
     assert Levelling(None, is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
-
-
-def test_a_place_of_an_unknown_lens_lies_where_the_picture_looks():
-    here = Position(50.0, 8.0, 300.0)
-    frame = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=here, heading_deg=70.0)
-    placed = place_at_middle(frame, View(lean_m=(30.0, -40.0)))
-    assert offset_m(50.0, 8.0, placed.position.lat_deg, placed.position.lon_deg) == pytest.approx((-30.0, 40.0))
-    assert (placed.position.alt_m, placed.heading_deg, placed.pose) == (300.0, 70.0, None)
 
 
 def test_a_gimbal_keeps_the_camera_level_whatever_the_airframe_does():

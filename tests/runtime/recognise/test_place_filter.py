@@ -168,10 +168,6 @@ def test_positions_are_those_of_the_places(posed_map, bare_map):
     assert found.estimate.sd_m > SPACING_M / 4, "a place says no better where the aircraft is than it is apart"
 
 
-def test_a_map_in_order_has_no_estimate(bare_map):
-    assert Flight(bare_map, IN_ORDER).over(range(5))[-1].estimate is None
-
-
 def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
     where = Located(position=at(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
@@ -183,19 +179,6 @@ def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
     followed = follower.update(ranking, IN_METRES, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), sure, where)
     assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
     assert followed.lost == pytest.approx(0.4)
-
-
-def test_what_the_autopilot_said_long_ago_is_not_its_velocity(posed_map):
-    flights = Flight(posed_map, IN_METRES), Flight(posed_map, IN_METRES)
-    for place in range(10, 40, STRIDE):
-        for flight, velocity_m_s in zip(flights, (None, (20.0, -20.0)), strict=True):
-            flight.go_on()
-            said = vehicle_at(50.0, 8.0, flight.t_s - 30.0, velocity_m_s=velocity_m_s)
-            flight.follower.predict(Frame(image=NOTHING, name="", t_mono_s=flight.t_s), said)
-        ignorant, told_late = (flight.hear(place, 0.8) for flight in flights)
-        assert ignorant == told_late
-        for flight in flights:
-            flight.follower.commit()
 
 
 @pytest.mark.parametrize("t_utc_s", [None, float("nan")])
@@ -228,16 +211,6 @@ def test_a_map_that_grows_is_measured_again(bare_map):
         followed = flight.look(place, 0.95, elapsed_s=1.0, others=(0,))
         assert off_m(followed, place) < 2 * SPACING_M
     assert followed.estimate.sd_m > SPACING_M / 2
-
-
-def test_places_that_get_positions_are_surveyed_again(bare_map):
-    flight = Flight(bare_map, IN_ORDER)
-    assert flight.over(range(10))[-1].estimate is None
-    flight.index = IN_METRES
-    first = flight.look(10, 0.8)
-    assert first.confidence == pytest.approx(0.8), "what was believed of places in order is nothing in metres"
-    assert off_m(first, 10) < 1.0
-    assert off_m(flight.over(range(13, 40, STRIDE))[-1], 37) < SPACING_M
 
 
 def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, bare_map):

@@ -14,7 +14,6 @@ from edgevpr.mapmaking.mapping import Gaps
 from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import as_map
 from edgevpr.runtime.recognise.salience_gate import (
-    MOST_ENTROPY,
     Gate,
     Worth,
     best_of,
@@ -55,16 +54,6 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     alone = scores_of(picture)
     assert (alone.memorability, alone.staticity) == (None, None)
     assert alone.entropy > scores.entropy
-
-
-def test_a_large_picture_and_one_of_a_single_pixel_have_scores():
-    assert scores_of(np.zeros((900, 1200, 3), np.uint8), Half()).memorability == pytest.approx(0.5, abs=0.02)
-    for shape in ((1, 700), (1, 1)):
-        assert scores_of(np.zeros(shape, np.uint8)).entropy == 0
-
-
-def test_no_picture_has_more_entropy_than_its_disc_has_pixels():
-    assert scores_of(RNG.integers(0, 256, (200, 200), np.uint8)).entropy < MOST_ENTROPY < 0.793
 
 
 @pytest.mark.parametrize(
@@ -185,12 +174,3 @@ def test_the_best_of_a_gap_are_those_that_pass_after_the_fewest_steps_and_are_ma
     events = [event(0), *(event(number, 0.2) for number in range(1, 21))]
     events[7], events[12] = event(7, 0.07), event(12, 0.08)
     assert kept(Gaps(20), [*events, event(21, 0.2)]) == [(0, False), (7, True), (12, True)]
-
-
-def test_of_a_short_recording_in_which_nothing_passes_the_best_is_kept():
-    assert kept(Gaps(20), [event(0, 0.2), event(1, 0.05), event(2, 0.3)]) == [(1, True)]
-
-
-def test_without_a_gate_every_frame_is_kept():
-    bare = replace(event(3), worth=None)
-    assert list(Gaps(2).take(bare)) == [(bare, None)]

@@ -19,11 +19,10 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import Mask
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.decide import WalkSettings
+from edgevpr.runtime.recognise.decide import Verifier, WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
 from edgevpr.runtime.recognise.recognition import fields_of
-from edgevpr.runtime.recognise.verify import Verifier
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -113,12 +112,6 @@ def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(ma
     assert proof_of(mapped_ahead, 0.5, moved_px=(0, 0)) == 0, "a display drawn over every picture agrees as well"
 
 
-def test_looking_ahead_a_map_without_landmarks_is_a_map(mapped_ahead, tmp_path):
-    path = Path(shutil.copy(mapped_ahead, tmp_path))
-    keep(path, None, None)
-    assert proof_of(path, 0.5) == 0
-
-
 def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
     others = packed(describe(frame(77).image))
     keep(mapped, others, zlib.crc32(others))
@@ -135,14 +128,6 @@ def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mappe
     event = asked(mapped, technique, frame(1, 20, -10))
     assert not event.accepted
     assert event.reason.startswith("its landmarks lie otherwise")
-
-
-def test_landmarks_are_evidence_where_they_are_asked_and_have_moved(mapped, technique):
-    assert asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS).accepted
-    bare = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS, verify=False)
-    assert (bare.accepted, bare.evidence.landmarks) == (False, None)
-    still = asked(mapped, technique, frame(1), BY_LANDMARKS)
-    assert (still.accepted, still.evidence.landmarks) == (False, 0.0), "what has not moved may be a display"
 
 
 def behind_figures(image):
@@ -215,14 +200,6 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
         assert {best, *same} == {1, 5, 8}
         assert event.accepted
         assert event.evidence.lead > math.log(1.5), "places of the same ground are no rivals"
-
-
-def test_places_without_landmarks_are_not_the_same_ground(overlapping, technique, tmp_path):
-    path = shutil.copy(overlapping, tmp_path / "m.gpkg")
-    with closing(sqlite3.connect(path)) as db, db:
-        db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id IN (1, 5)")
-    _, best, same = same_ground(path, technique, bare(1, 0, 20))
-    assert (best, same) == (8, set())
 
 
 @pytest.mark.parametrize("blob", [None, b"", b"\x09of a newer form", packed(describe(np.zeros((9, 9), np.uint8)))])
