@@ -1,6 +1,7 @@
 """`edgevpr calibrate-camera`: the calibration of a lens with distortion, from pictures of a chequerboard."""
 
 import re
+import time
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from edgevpr.core.types import Frame
     from edgevpr.frames.chequerboard import CalibratedCamera
 
-_FILM_STEP_S = 0.3  # between two pictures of a video that are looked at
+_FILM_STEP_S = 0.3  # between two pictures of a video that are searched
+_READ_S = 0.25
 
 
 def add(commands: Any) -> None:
@@ -43,22 +45,22 @@ def add(commands: Any) -> None:
 def calibrate_camera(args: Namespace) -> int:
     """Run `calibrate-camera`: write the calibration of a camera, and say how good it is."""
     from edgevpr.core.files import require_folder
-    from edgevpr.frames.chequerboard import BoardViews, calibrated, write_lens
+    from edgevpr.frames.chequerboard import BoardViews, calibrate, write_lens
 
     require_folder(Path(args.out))
     views, unusable = BoardViews(args.board), list[ImageError]()
     for frame in _frames(args, unusable):
         try:
-            views.look(frame)
+            views.add(frame)
         except ImageError as error:
             leave_out(error, unusable)
         if views.are_enough():
             break
         where = views.empty_cells()
-        waiting(f"{len(views.found)} views that differ" + (f", none in the {where[0]}" if where else ""))
+        waiting(f"{len(views.found)} views that differ" + (f", none in {where[0]}" if where else ""))
     waiting("")
     with at_work("calibrating"):
-        camera = calibrated(views, args.out, args.fisheye)
+        camera = calibrate(views, args.out, args.fisheye)
     write_lens(camera)
     show(camera, args.json, _text(camera))
     return exit_code(unusable)
@@ -76,25 +78,25 @@ def _board(text: str) -> tuple[int, int]:
 
 def _frames(args: Namespace, unusable: list[ImageError]) -> "Iterator[Frame]":
     """Yield the frames of a recording to its end, or of a live source for as long as is asked for."""
-    from edgevpr.frames.chequerboard import live_frames
     from edgevpr.frames.source import open_source, read_to_end
 
     with closing(open_source(args.source, step_s=_FILM_STEP_S, live=True)) as source:
         source.twins.stop()
-        if source.is_live:
-            yield from live_frames(source, args.seconds)
-        else:
+        if not source.is_live:
             frames = read_to_end(source, lambda error: leave_out(error, unusable))
             yield from filter(None, progress(frames, source.total, "looking for the board"))
+        end_s = time.monotonic() + args.seconds
+        while not source.ended and time.monotonic() < end_s:
+            if frame := source.read(_READ_S):
+                yield frame
 
 
 def _text(camera: "CalibratedCamera") -> Iterator[str]:
-    lens, cells = camera.lens, camera.corners
-    width, height = lens.size_px
-    yield f"{lens.path}: of pictures of {width}x{height} pixels, or of another size and the same shape"
-    yield f"  views       {camera.views} used, of {camera.pictures} pictures"
-    yield f"  error       {camera.error_px:.2f} pixels, root mean square"
+    lens, cells, (width, height) = camera.lens, camera.corners, camera.lens.size_px
     rows = (" ".join(map(str, cells[start : start + 3])) for start in (0, 3, 6))
+    yield f"{lens.path}: of pictures of {width}x{height} pixels, or of another size and the same shape"
+    yield f"  views       {camera.views} that differ, of {camera.pictures} pictures"
+    yield f"  error       {camera.error_px:.2f} pixels, root mean square"
     yield f"  corners     {' / '.join(rows)}, in the nine parts of the picture"
     yield f"  lens        {camera.field_deg:.0f} degrees across, moves pixels by up to {camera.distortion_px:.0f}"
     yield from (f"  better      {sentence}" for sentence in camera.advice)

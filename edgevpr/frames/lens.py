@@ -2,7 +2,7 @@
 pixels shows what.
 
 A *straightened* picture is the one that a lens without distortion would take from the same place, along the same axis.
-Its longest side shows as much as the calibrated lens does (at most `_WIDEST_DEG`), so everything that is reckoned with
+Its longest side shows as much as the calibrated lens does (at most `_WIDEST_DEG`), so everything that is computed with
 a field of view holds for it. A *ray* is a direction from the lens, as its tangents to the right and down.
 """
 
@@ -22,17 +22,17 @@ from edgevpr.core.files import read_file
 from edgevpr.core.yamlfile import parsed_yaml
 from edgevpr.frames.images import shrunk
 
-_MOST_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
+_MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
 # What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
-_OPENCVS_OWN = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
+_NO_YAML = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
 _COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
-_FISHEYE, _NEITHER = "equidistant", "none"
+_FISHEYE, _NO_DISTORTION = "equidistant", "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
-_MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NEITHER)
+_MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
 _WIDEST_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
-_MOST_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
+_MAX_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
 _NARROWEST_DEG = 5.0  # as of `source.fov_deg`
-_FARTHEST_DEG, _STEP_DEG = 85.0, 0.25  # up to which angle from its axis a lens is looked at, and how finely
+_FARTHEST_DEG, _STEP_DEG = 85.0, 0.25  # up to which angle from its axis a lens is sampled, and how finely
 _AROUND_DEG = range(0, 360, 15)
 _RIGHT, _DOWN, _LEFT, _UP = (_AROUND_DEG.index(degrees) for degrees in (0, 90, 180, 270))
 # Pixels are computed for every eighth pixel of a picture and interpolated, which is wrong by less than a tenth of one.
@@ -53,22 +53,28 @@ class CalibratedLens:
     is_fisheye: bool
     size_px: tuple[int, int]
 
+    def matrix(self) -> Doubles:
+        """Return the camera matrix (3, 3) of OpenCV."""
+        (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
+        return np.array([[focal_x, 0, column], [0, focal_y, row], [0, 0, 1]])
+
     def projected(self, rays: Doubles) -> Doubles:
         """Return the pixels (N, 2) of the rays (N, 2)."""
-        matrix = np.array(
-            [[self.focal_px[0], 0, self.centre_px[0]], [0, self.focal_px[1], self.centre_px[1]], [0, 0, 1]]
-        )
         points = np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]))[:, None]
         project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
-        pixels, _ = project(points, np.zeros(3), np.zeros(3), matrix, np.array(self.coefficients))
+        pixels, _ = project(points, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.coefficients))
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     def of_size(self, size_px: tuple[int, int]) -> "CalibratedLens":
         """Return the calibration for pictures of another size, of the same part of the sensor."""
-        ways = [each / own for each, own in zip(size_px, self.size_px, strict=True)]
-        focal = [way * each for way, each in zip(ways, self.focal_px, strict=True)]
-        centre = [way * (each + 0.5) - 0.5 for way, each in zip(ways, self.centre_px, strict=True)]
-        return replace(self, focal_px=(focal[0], focal[1]), centre_px=(centre[0], centre[1]), size_px=size_px)
+        scale_x, scale_y = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
+        (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
+        centre_px = scale_x * (column + 0.5) - 0.5, scale_y * (row + 0.5) - 0.5
+        return replace(self, focal_px=(scale_x * focal_x, scale_y * focal_y), centre_px=centre_px, size_px=size_px)
+
+    def refuse(self, why: str) -> ConfigError:
+        """Return the error of a calibration that can be of no lens."""
+        return ConfigError(f"{self.path} is the calibration of no lens ({why}): calibrate the camera again.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +138,7 @@ class Remap:
 
     def overlay(self, overlay: Mask) -> Mask:
         """Warp a mask, bool, of the camera's picture."""
-        return _remapped(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
+        return _remap(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
 
     def picture(self, image: Image) -> Image:
         """Warp the camera's picture. Outside of it its edge is repeated, so that no gradient arises."""
@@ -141,12 +147,12 @@ class Remap:
             pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
             pixels *= np.array([small.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
-        return _remapped(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        return _remap(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
-def _remapped(image: Image, pixels: Singles, how: int, border: int) -> Image:
+def _remap(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
     # None: of the two arrays of a map the first has both coordinates. OpenCV's types ask for a second one.
-    return cv2.remap(image, pixels, None, how, borderMode=border)  # type: ignore
+    return cv2.remap(image, pixels, None, interpolation, borderMode=border)  # type: ignore
 
 
 @lru_cache(maxsize=8)
@@ -155,11 +161,11 @@ def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
     shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
     (width, height), (own_width, own_height), (column, row) = size_px, lens.size_px, lens.centre_px
     if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
-        raise _impossible(lens, "a value is no number")
+        raise lens.refuse("a value is no number")
     if min(lens.focal_px) <= 0:
-        raise _impossible(lens, "a focal length is not above zero")
+        raise lens.refuse("a focal length is not above zero")
     if not (0 < column < own_width and 0 < row < own_height):
-        raise _impossible(lens, "its centre lies outside of the picture")
+        raise lens.refuse("its centre lies outside of the picture")
     if abs(height - width * own_height / own_width) > 1 and abs(width - height * own_width / own_height) > 1:
         raise ImageError(
             f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {own_width}x{own_height}: "
@@ -179,19 +185,18 @@ def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
         known = slice(steady[direction] + 1)
         along_px, to_edge_px = np.abs(off_px[direction, known, axis]), abs(edge_px - lens.centre_px[axis])
         if along_px[-1] < to_edge_px and steady[direction] < len(tangents) - 1:
-            raise _impossible(lens, "pixels before the edge of the picture have no direction of their own")
+            raise lens.refuse("pixels before the edge of the picture have no direction of their own")
         return float(np.interp(to_edge_px, along_px, tangents[known]))
 
     right, left = reach(_RIGHT, 0, width - 0.5), reach(_LEFT, 0, -0.5)
     lower, upper = reach(_DOWN, 1, height - 0.5), reach(_UP, 1, -0.5)
     widest = math.tan(math.radians(_WIDEST_DEG / 2))
     half, farthest = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
-    ends = (right, left) if width >= height else (lower, upper)
-    field_deg = math.degrees(sum(map(math.atan, ends)))
+    field_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
     if math.hypot(*half) > farthest:
-        raise _impossible(lens, "pixels towards the corners of the picture have no direction of their own")
+        raise lens.refuse("pixels towards the corners of the picture have no direction of their own")
     if field_deg < _NARROWEST_DEG:
-        raise _impossible(lens, f"it sees {field_deg:.1f} degrees")
+        raise lens.refuse(f"it sees {field_deg:.1f} degrees")
     return LensSight(lens, half, farthest, field_deg)
 
 
@@ -199,13 +204,13 @@ def read_lens(path: str) -> CalibratedLens:
     """Read a calibration from a file of OpenCV (YAML, XML or JSON of its FileStorage), of ROS (camera_info) or of
     Kalibr (camchain, the camera cam0). Raises ConfigError for any other file, and for one that can be of no lens."""
     try:
-        data = read_file(path, _MOST_FILE_BYTES)
+        data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    said = _of_xml(data, path) if data.lstrip().startswith(b"<") else parsed_yaml(_OPENCVS_OWN.sub(b"", data), path)
-    fields = {str(name).lower(): value for name, value in said.items()}  # old files of OpenCV have capitals
+    content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parsed_yaml(_NO_YAML.sub(b"", data), path)
+    fields = {str(name).lower(): value for name, value in content.items()}  # old files of OpenCV have capitals
     try:
-        lens = _of_kalibr(fields["cam0"], path) if "cam0" in fields else _of_matrix(fields, path)
+        lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         lacking = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is not whole"
         raise ConfigError(
@@ -215,47 +220,43 @@ def read_lens(path: str) -> CalibratedLens:
     return lens
 
 
-def _of_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
+def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
     """Make the lens of a file of OpenCV or ROS: they name their fields alike."""
     matrix, coefficients = _numbers(fields["camera_matrix"]), _numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
         raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and nine are needed.")
-    if abs(matrix[1]) > _MOST_SKEW * abs(matrix[0]):
+    if abs(matrix[1]) > _MAX_SKEW * abs(matrix[0]):
         raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without it.")
     model = fields.get("distortion_model", _FISHEYE if int(fields.get("fisheye_model") or 0) else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
-    return _lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
+    return _make_lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
 
 
-def _of_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
+def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
     if (model := camera["camera_model"]) != "pinhole":
         raise ConfigError(f"{path} is of the camera model `{model}`: calibrate with the model `pinhole`.")
-    focal_x, focal_y, column, row = _numbers(camera["intrinsics"])
     coefficients = _numbers(camera.get("distortion_coeffs") or ())
-    width, height = camera["resolution"]
-    of_pinhole = (focal_x, focal_y, column, row)
-    return _lens(path, of_pinhole, camera["distortion_model"], coefficients, (int(width), int(height)))
+    width, height = map(int, camera["resolution"])
+    pinhole = _numbers(camera["intrinsics"])
+    return _make_lens(path, pinhole, camera["distortion_model"], coefficients, (width, height))
 
 
-def _lens(
-    path: str,
-    pinhole: tuple[float, float, float, float],
-    model: str,
-    coefficients: tuple[float, ...],
-    size_px: tuple[int, int],
+def _make_lens(
+    path: str, pinhole: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
 ) -> CalibratedLens:
     """Make a lens of a distortion model by its name; `pinhole`: focal lengths and centre. Raises ConfigError for a
     model that is not known."""
+    focal_x, focal_y, column, row = pinhole
     if model not in _MODELS:
         raise ConfigError(f"{path} is of the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
-    if model == _NEITHER or not coefficients:
+    if model == _NO_DISTORTION or not coefficients:
         model, coefficients = "", (0.0,) * 4
     if len(coefficients) not in (_COEFFICIENTS[:1] if model == _FISHEYE else _COEFFICIENTS):
         raise ConfigError(f"{path} has {len(coefficients)} coefficients, which fit no model that edgevpr knows.")
     return CalibratedLens(
         path=path,
-        focal_px=pinhole[:2],
-        centre_px=pinhole[2:],
+        focal_px=(focal_x, focal_y),
+        centre_px=(column, row),
         coefficients=coefficients,
         is_fisheye=model == _FISHEYE,
         size_px=size_px,
@@ -267,7 +268,7 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return tuple(map(float, value["data"] if isinstance(value, dict) else value))
 
 
-def _of_xml(data: bytes, path: str) -> dict[str, Any]:
+def _read_xml(data: bytes, path: str) -> dict[str, Any]:
     """Read the fields of an XML file of OpenCV, matrices as in files of ROS."""
     from xml.etree import ElementTree  # hardly any calibration is XML
 
@@ -276,7 +277,3 @@ def _of_xml(data: bytes, path: str) -> dict[str, Any]:
     except (ElementTree.ParseError, ValueError) as error:
         raise ConfigError(f"{path} is not valid XML ({error}): give the calibration as OpenCV wrote it.") from error
     return {each.tag: {"data": (each.findtext("data") or "").split()} if len(each) else each.text for each in root}
-
-
-def _impossible(lens: CalibratedLens, why: str) -> ConfigError:
-    return ConfigError(f"{lens.path} is the calibration of no lens ({why}): calibrate the camera again.")
