@@ -61,18 +61,17 @@ class Taken(NamedTuple):
 
 
 class StampedTime:
-    """Estimates when pictures were taken, from the stream's time stamps.
+    """Estimates when pictures were taken, from the stream's time stamps, which count from an unknown zero.
 
-    The stamps count from an unknown zero. The delay of a picture is its arrival time minus its stamp. The least delay
-    so far is assumed to be that of a picture that arrives at once; a picture with a longer delay is older by the
-    difference. A larger value replaces the least delay only if delays have been steady for five seconds, as after a
-    pause of the sender; in a congested network they vary. `is_live`: True once the pictures that were buffered before
-    the opening have been fetched.
+    The delay of a picture is its arrival time minus its stamp. One with a longer delay than the least so far is older
+    by the difference. A larger value replaces the least delay only if delays have been steady for five seconds, as
+    after a pause of the sender; in a congested network they vary. `is_live`: the pictures that were buffered before the
+    opening have been fetched.
 
     A camera that delivers fewer pictures than its stamps say makes the delay grow, and so does a link that carries less
-    than is sent. Both can grow in a straight line. But in a full link a large picture takes longer than a small one;
-    from a camera, all come at the same intervals. In the first case pictures get older. In the second, stamps are
-    multiplied by the `rate` that the least delays show. Where neither is certain, the time is unknown."""
+    than is sent. But in a full link a large picture takes longer than a small one, and pictures get older; from a
+    camera, all come at the same intervals, and stamps are multiplied by the `rate` that the least delays show. Where
+    neither is certain, the time is unknown."""
 
     def __init__(self) -> None:
         self._logged_rate = 1.0
@@ -91,8 +90,8 @@ class StampedTime:
         self._seen = array("d")  # rows of five, see `_judge`
 
     def arrived(self, stamp_s: float, order_s: float, t_mono_s: float, size_bytes: int = 0) -> None:
-        """Record the arrival at `t_mono_s` of a picture with the stamp `stamp_s`. `order_s` is its decoding time stamp,
-        which differs only in streams that send pictures in another order than they were taken. All in seconds."""
+        """Record the arrival of a picture with the stamp `stamp_s`. `order_s`: its decoding time stamp, which differs
+        in streams that send pictures in another order than they were taken. All in seconds."""
         held_up_s = t_mono_s - self._came_s - self.rate * (order_s - self._order_s)
         if order_s < self._order_s or abs(held_up_s) > _RESTART_S:
             self._begin_anew()
@@ -138,8 +137,7 @@ class StampedTime:
         del self._seen[: -pictures * _COLUMNS]
 
     def _leak(self, passed_s: float) -> None:
-        """Let the least delay grow as that of a clock that is slow by as much as is usual: a network that is never
-        steady would make its pictures older for ever."""
+        """Let the least delay grow as by a slow clock: a network that is never steady would age pictures for ever."""
         self._least_s += _CLOCK_ERROR * passed_s
         self._least_order_delay_s += _CLOCK_ERROR * passed_s
 

@@ -2,26 +2,27 @@
 does not. Imported only when a stream or video file is opened, because the library takes memory.
 """
 
+import errno
 import logging
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
 
 import av
 import av.logging
 
 from edgevpr.core.arrays import Image
-from edgevpr.frames.causes import explain_failure
 from edgevpr.frames.images import jpeg_is_whole
 from edgevpr.frames.pixels import PixelConverter
 from edgevpr.frames.shot import OpeningError, Refusal, StreamFacts
 
 if TYPE_CHECKING:
-    from _typeshed import SupportsRead
     from av.container import InputContainer
     from av.packet import Packet
     from av.video.frame import VideoFrame
+
+    from edgevpr.frames.webpictures import AnswerFile
 
 # FFmpeg's messages are searched for lost packets. All others are dropped: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
@@ -32,40 +33,97 @@ _MISSED = "missed"  # "RTP: missed 3 packets", the only sign of it
 _PACKETS_IN_DOUBT = 2  # after a sign of loss: this packet and the next
 _UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
 
+_UNKNOWN_HOST = re.compile(r"(?:resolve hostname |getaddrinfo\()([^\s:,]+)")
+_STATUS = re.compile(r"(?:failed:|HTTP error|returned) ([45]\d\d)\b")  # of RTSP and of HTTP
+_BY_STATUS = {"403": "access forbidden (403)", "404": "no stream at this path (404)"}
+_BY_ERROR = {
+    errno.ECONNREFUSED: "connection refused",
+    errno.ECONNRESET: "connection closed by the camera",
+    errno.EHOSTUNREACH: "no route to the host",
+    errno.ENETUNREACH: "no route to the host",
+    errno.EINVAL: "an address that cannot be used: correct host and port",
+    errno.EADDRINUSE: "UDP port in use by another program",
+}
+
+
+class TransportError(OpeningError):
+    """The camera refuses the transport that was requested for RTSP."""
+
+
+class Fetched(NamedTuple):
+    """A packet of a stream. `is_doubtful`: packets before it may be missing. `asked_s`, `came_s`: when the call that
+    fetched it began and returned (seconds, monotonic). `is_after_gap`: packets before it were dropped here."""
+
+    packet: "Packet[Any]"
+    is_doubtful: bool = False
+    asked_s: float = 0.0
+    came_s: float = 0.0
+    is_after_gap: bool = False
+
 
 def open_pictures(
     uri: str,
     options: dict[str, str],
     timeouts_s: tuple[float, float] | None = None,
     form: str | None = None,
-    file: "SupportsRead[bytes] | None" = None,
+    file: "AnswerFile | None" = None,
 ) -> "WholePictures":
     """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
     for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). `file`: an open file that is
-    read instead. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
-    with av.logging.Capture() as said:
+    read instead, and closed. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
+    with av.logging.Capture() as logged:
         try:
             container = av.open(file or uri, "r", format=form, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError) as error:
-            messages = [message for _, _, message in said]
-            raise explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
+            messages = [message for _, _, message in logged]
+            if file:
+                file.close()
+            raise _explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
     if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
-        return WholePictures(container, _is_missed(said))
+        return WholePictures(container, _has_loss(logged), file)
     has_video = bool(container.streams.video)
     container.close()
+    if file:
+        file.close()
     raise OpeningError("a codec that FFmpeg does not know" if has_video else "no video in the stream")
 
 
-@dataclass(frozen=True, slots=True)
-class Fetched:
-    """A packet of the stream, and whether it can be trusted. `is_doubtful`: packets before it may be missing."""
-
-    packet: "Packet[Any]"
-    is_doubtful: bool
+def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
+    return any(_MISSED in message for _, _, message in logged)
 
 
-def _is_missed(said: list[tuple[int, str, str]]) -> bool:
-    return any(_MISSED in message for _, _, message in said)
+def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
+    """Return the error with the cause why FFmpeg could not open `uri` in `timeout_s` seconds. `messages`: what FFmpeg
+    logged meanwhile; some causes are found only there. The cause never contains the address, which may hold a password.
+    """
+    text = "\n".join(messages)
+    if "SETUP failed: 461" in text or "Nonmatching transport" in text:
+        return TransportError("transport refused (461)")
+    return OpeningError(_find_cause(uri, error, text, timeout_s))
+
+
+def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
+    if host := _UNKNOWN_HOST.search(text):
+        if uri.count("@") > 1:  # then the host may be a part of the password
+            return "no such host: percent-encode the password's special characters, such as @ as %40"
+        return f"no such host {host[1]}"
+    if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
+        found = _STATUS.search(f"{text}\n{error}")
+        status = found[1] if found else "HTTP"
+        if status == "401":
+            if "@" not in urlsplit(uri).netloc:
+                return "password needed (401): write USER:PASSWORD@ before the host"
+            return "password refused (401): correct it, with special characters percent-encoded, such as % as %25"
+        return _BY_STATUS.get(status, f"refused by the camera ({status})")
+    number = errno.EADDRINUSE if "Address already in use" in text else getattr(error, "errno", 0)
+    if number in _BY_ERROR:
+        return _BY_ERROR[number]
+    if isinstance(error, av.ExitError) or "Immediate exit" in text or number == errno.ETIMEDOUT:
+        missing = "video in the packets" if uri.lower().startswith(("udp:", "rtp:")) else "answer"
+        return f"no {missing} within {timeout_s:g} s"
+    if isinstance(error, av.InvalidDataError):
+        return "connection closed by the camera" if "End of file" in text else "no video that FFmpeg can read"
+    return getattr(error, "strerror", None) or type(error).__name__
 
 
 class WholePictures:
@@ -73,20 +131,22 @@ class WholePictures:
     and so are all pictures after it up to the next key frame, which is decoded without others.
 
     `is_cancelled`: set it to end a `fetch` in another thread with the next packet, be it of sound.
-    FFmpeg reads ahead while it opens a stream. `are_missed`: it reported lost packets during that. As it does not say
-    which packets are lost, all are rejected until `caught_up` is called."""
+    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead, as it does when it opens a stream. It does
+    not say which: all are rejected until this is set to False."""
 
-    def __init__(self, container: "InputContainer", are_missed: bool) -> None:
-        self.container, self.stream = container, container.streams.video[0]
-        self.time_base = self.stream.time_base or Fraction(1, 1_000_000)  # unit of the time stamps in seconds
+    def __init__(
+        self, container: "InputContainer", is_backlog_doubtful: bool, file: "AnswerFile | None" = None
+    ) -> None:
+        self.container, self.stream, self._file = container, container.streams.video[0], file
+        self.unit_s = float(self.stream.time_base or 1e-6)  # of the time stamps
         self.is_stamped = not container.format.flags & _UNSTAMPED
+        self.is_backlog_doubtful = is_backlog_doubtful
+        self.is_cancelled = False
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory
         self._codec.options = {"err_detect": "explode"}  # damaged data is an error, and not filled in
-        self.is_cancelled = False
         self._packets = container.demux()
         self._converter = PixelConverter()
-        self._is_backlog_doubtful = are_missed
         self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
         self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
         self._has_begun = False
@@ -104,21 +164,18 @@ class WholePictures:
             rate_hz=float(rate) if rate and self.is_stamped else None,
         )
 
-    def caught_up(self) -> None:
-        """Trust the packets that are fetched from now on: they were sent after the opening."""
-        self._is_backlog_doubtful = False
-
     def fetch(self) -> Fetched | None:
         """Wait for the next packet and return it; None at the end of the file, or if the stream is lost. One thread may
         fetch while another one decodes."""
-        with av.logging.Capture() as said:
+        ours = self.stream.index
+        with av.logging.Capture() as logged:
             try:
-                packet = next((each for each in self._packets if self.is_cancelled or self._is_ours(each)), None)
+                packet = next((each for each in self._packets if self.is_cancelled or each.stream.index == ours), None)
             except (av.FFmpegError, OSError):
                 return None
         if packet is None or self.is_cancelled:
             return None
-        if packet.is_corrupt or _is_missed(said):
+        if packet.is_corrupt or _has_loss(logged):
             # FFmpeg reports a gap while it assembles the picture after the one that it returns.
             self._doubtful = _PACKETS_IN_DOUBT
         self._doubtful -= 1
@@ -134,8 +191,8 @@ class WholePictures:
         it is rejected."""
         packet = fetched.packet
         if not packet.size:
-            return [] if self._refusal else self._decoded(packet)
-        if fetched.is_doubtful or self._is_backlog_doubtful:
+            return [] if self._refusal else self._decode_packet(packet)
+        if fetched.is_doubtful or self.is_backlog_doubtful:
             return self._refuse()
         if self._refusal:
             if not packet.is_keyframe:
@@ -147,7 +204,7 @@ class WholePictures:
         # picture whose remainder is shifted or brighter, but that contains nothing of an older picture.
         if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
             return self._refuse()
-        return self._decoded(packet)
+        return self._decode_packet(packet)
 
     def look(self, picture: "VideoFrame") -> Image:
         """Return a coarse grey copy of a picture, see `Shot.look`."""
@@ -162,11 +219,10 @@ class WholePictures:
     def close(self) -> None:
         """Close the file or the connection."""
         self.container.close()
+        if self._file:
+            self._file.close()
 
-    def _is_ours(self, packet: "Packet[Any]") -> bool:
-        return bool(packet.stream.index == self.stream.index)
-
-    def _decoded(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
+    def _decode_packet(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
         with av.logging.Capture():
             try:
                 pictures = self._codec.decode(packet)

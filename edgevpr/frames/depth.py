@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
+from edgevpr.frames.shot import coarse
 
 Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
@@ -18,7 +19,6 @@ _MIN_SPAN_COUNTS = 64  # a picture of sensor noise only stays flat
 _PICTURES_TO_FOLLOW = 30  # time constant: what passes through a picture does not change the grey levels of the rest
 _MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene is another one
 _MIN_USED_SHARE = 0.25  # of the range that a picture must use, else it would have too little contrast
-_SAMPLE_PX = (60, 80)  # least rows and columns of the sample that the percentiles are computed from
 
 
 class DepthRange:
@@ -31,8 +31,8 @@ class DepthRange:
     def update(self, counts: Counts) -> Limits:
         """Return the range to show this picture with, uint16 (H, W[, C]). It begins with the picture's own range, and
         does so again when a picture does not fit."""
-        sample = sample_counts(counts)
-        low, high = find_limits(sample)
+        sample = coarse(counts)
+        low, high = _find_limits(sample)
         clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
         has_contrast = high - low >= _MIN_USED_SHARE * (self._high - self._low)
         is_known = self._high > 0 and has_contrast and clipped_share <= _MAX_CLIPPED_SHARE
@@ -46,18 +46,11 @@ class DepthRange:
         return to_8_bits(counts, self.update(counts))
 
 
-def sample_counts(counts: Counts) -> Counts:
-    """Return every n-th row and column of a picture, enough of them for percentiles."""
-    height, width = counts.shape[:2]
-    return counts[:: max(1, height // _SAMPLE_PX[0]), :: max(1, width // _SAMPLE_PX[1])]
-
-
-def find_limits(sample: Counts) -> Limits:
-    """Return the range of counts of a picture by its percentiles."""
-    low, high = (int(count) for count in np.percentile(sample, _PERCENTILES))
-    missing = max(0, _MIN_SPAN_COUNTS - (high - low))
-    low = max(0, low - missing // 2)
-    return low, max(high, low + _MIN_SPAN_COUNTS)
+def coarse_counts(counts: Counts) -> Image:
+    """Return a coarse copy of a picture, see `shot.coarse`, over its own range, so that copies of a frozen picture are
+    equal."""
+    sample = coarse(counts)
+    return to_8_bits(sample, _find_limits(sample))
 
 
 def to_8_bits(counts: Counts, limits: Limits) -> Image:
@@ -65,3 +58,10 @@ def to_8_bits(counts: Counts, limits: Limits) -> Image:
     low, high = limits
     levels = (np.clip(counts, low, high).astype(np.float32) - low) * (255 / (high - low))
     return np.asarray(np.rint(levels), np.uint8)
+
+
+def _find_limits(sample: Counts) -> Limits:
+    low, high = (int(count) for count in np.percentile(sample, _PERCENTILES))
+    missing = max(0, _MIN_SPAN_COUNTS - (high - low))
+    low = max(0, low - missing // 2)
+    return low, max(high, low + _MIN_SPAN_COUNTS)

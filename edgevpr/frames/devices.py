@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image
 from edgevpr.frames.age import UnstampedTime
-from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
+from edgevpr.frames.depth import DepthRange, coarse_counts, to_8_bits
 from edgevpr.frames.shot import OpeningError, Shot, coarse
 
 _CAUSES = {
@@ -56,8 +56,7 @@ def _explain(path: str) -> str:
 
 
 class DeviceCapture:
-    """A V4L2 camera opened with OpenCV: a `Capture`. If it cannot be opened, the first `read` returns None. OpenCV does
-    not report damaged pictures, so none is rejected here."""
+    """A V4L2 camera opened with OpenCV: a `Capture`. OpenCV does not report damaged pictures, so none is rejected."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
@@ -68,21 +67,21 @@ class DeviceCapture:
     def read(self) -> Shot | None:
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
             asked_s = self._clock()
-            there, read = self._capture.read()
-            if there:
+            is_read, picture = self._capture.read()
+            if is_read:
                 came_s = self._clock()
                 sd_s = self._time.taken(asked_s, came_s).sd_s
-                look, pixels = self._prepare(read)
+                look, pixels = self._prepare(picture)
                 return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=look, pixels=pixels)
         return None
 
-    def _prepare(self, read: Array) -> tuple[Image, Callable[[], Image]]:
+    def _prepare(self, picture: Array) -> tuple[Image, Callable[[], Image]]:
         """Return the coarse copy of a picture, and what converts the picture."""
-        if read.dtype == np.uint16:
-            counts = np.asarray(read, np.uint16)
-            sample, limits = sample_counts(counts), self._depth.update(counts)
-            return to_8_bits(sample, find_limits(sample)), lambda: to_8_bits(counts, limits)
-        image: Image = np.asarray(read, np.uint8)
+        if picture.dtype == np.uint16:
+            counts = np.asarray(picture, np.uint16)
+            limits = self._depth.update(counts)
+            return coarse_counts(counts), lambda: to_8_bits(counts, limits)
+        image: Image = np.asarray(picture, np.uint8)
         return coarse(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def cancel(self) -> None:

@@ -29,32 +29,23 @@ _SKYDIO = re.compile(rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-s
 
 def read_exif(path: str | Path) -> GeoTag:
     """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
-    impossible (minutes of 99, a date of 1e308) is None.
+    impossible is None. The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no
+    time zone. Heading, roll, pitch and height are those of `read_xmp`, else the heading is that of EXIF."""
+    tags, xmp = _read_tags(path), read_xmp(path)
 
-    The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no time zone. Heading,
-    roll, pitch and height are those of `read_xmp`; if it gives no heading, the heading is that of EXIF.
-    """
-    tags, xmp = _exif_of(path), read_xmp(path)
-
-    def known(read: Callable[[Tags], T]) -> T | None:
-        with contextlib.suppress(Exception):  # a tag may be absent, impossible, of another type, or divide by zero
-            return read(tags)
+    def first(*readers: Callable[[Tags], T]) -> T | None:
+        for read in readers:
+            with contextlib.suppress(Exception):  # a tag may be absent, impossible, of another type, or divide by zero
+                return read(tags)
         return None
 
-    position, alt_m, gps_time_s = known(_position), known(_alt_m), known(_gps_time_s)
+    position, alt_m = first(_position), first(_alt_m)
     return replace(
         xmp,
         position=position and replace(position, alt_m=alt_m),
-        heading_deg=known(_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
-        t_utc_s=known(_camera_time_s) if gps_time_s is None else gps_time_s,
+        heading_deg=first(_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
+        t_utc_s=first(_gps_time_s, _camera_time_s),
     )
-
-
-def is_at_zero(path: str | Path) -> bool:
-    """Return True if the EXIF data of a picture say exactly (0, 0), as of a receiver without a fix. Never raises."""
-    with contextlib.suppress(Exception):
-        return _lat_lon_deg(_exif_of(path)) == (0.0, 0.0)
-    return False
 
 
 def fov_deg_of(path: str | Path) -> float | None:
@@ -62,7 +53,7 @@ def fov_deg_of(path: str | Path) -> float | None:
     that gives the same view on film of 36 x 24 mm. The views are compared along the diagonal (CIPA DCG-001). None: the
     EXIF data do not say it. Never raises."""
     with contextlib.suppress(Exception):
-        tags = _exif_of(path)
+        tags = _read_tags(path)
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
         # Wider pictures than the sensors of 4:3 and 3:2 are cut out of theirs, and as long.
@@ -71,7 +62,7 @@ def fov_deg_of(path: str | Path) -> float | None:
     return None
 
 
-def _exif_of(path: str | Path) -> Tags:
+def _read_tags(path: str | Path) -> Tags:
     import exifread  # not at the top: most sources never need it
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
@@ -90,12 +81,8 @@ def _within(value: float, low: float, high: float) -> float:
 def _position(tags: Tags) -> Position | None:
     if "GPS GPSStatus" in tags and tags["GPS GPSStatus"].values == "V":  # void: the receiver has lost its fix
         return None
-    return position_or_none(*_lat_lon_deg(tags), None)
-
-
-def _lat_lon_deg(tags: Tags) -> tuple[float, float]:
     lat_deg = _degrees(tags, "GPS GPSLatitude", {"N": 1, "S": -1}, 90)
-    return lat_deg, _degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180)
+    return position_or_none(lat_deg, _degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180), None)
 
 
 def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
@@ -136,30 +123,25 @@ def _time_s(text: str) -> float:
 
 def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
-    that is absent, damaged or impossible is None.
-
-    The heading is that of the top of the picture, or if that is unknown, of the aircraft's nose. Roll and pitch are the
-    deviation of the camera from straight down. The height is over the take-off point. Position and time are None.
-    """
+    that is absent, damaged or impossible is None. The heading is that of the picture's top, else of the aircraft's
+    nose. Roll and pitch are the camera's deviation from straight down. The height is over the take-off point."""
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)
     values = _values(head)
     if oriented := _SKYDIO.search(head):
         values |= {f"NED {name}": text for name, text in _values(oriented[1]).items()}
-    heights = (_number(values, f"{maker}:RelativeAltitude", *ALT_M) for maker in ("drone-dji", "drone", "drone-skydio"))
-    height_m = next((known for known in heights if known is not None), None)
+    height_m = _first_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_M)
     for name in _GIMBALS:
         # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
-        if (angles := _yaw_pitch_roll(values, name)) and any(angles):
+        if angles := _yaw_pitch_roll(values, name):
             heading_deg, roll_deg, pitch_deg = from_straight_down(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
     # In the tags of Pix4D, 0 is straight down; a camera without an IMU writes zeros, which are ignored.
-    if (angles := _yaw_pitch_roll(values, "Camera:{}")) and any(angles):
+    if angles := _yaw_pitch_roll(values, "Camera:{}"):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    noses_deg = (_number(values, f"{maker}:FlightYawDegree") for maker in ("drone-dji", "drone"))
-    nose_deg = next((known for known in noses_deg if known is not None), None)
+    nose_deg = _first_number(values, "FlightYawDegree", ("drone-dji", "drone"), -360, 360)
     return GeoTag(heading_deg=None if nose_deg is None else nose_deg % 360, height_m=height_m)
 
 
@@ -168,13 +150,19 @@ def _values(packet: bytes) -> dict[str, bytes]:
 
 
 def _yaw_pitch_roll(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
-    yaw, pitch, roll = (_number(values, name.format(axis)) for axis in ("Yaw", "Pitch", "Roll"))
-    return None if yaw is None or pitch is None or roll is None else (yaw, pitch, roll)
-
-
-def _number(values: Mapping[str, bytes], name: str, low: float = -360.0, high: float = 360.0) -> float | None:
+    """Return the angles by a name with {} for Yaw, Pitch and Roll; None if one is missing, or if all are zero."""
     with contextlib.suppress(KeyError, ValueError):
-        return _within(float(values[name]), low, high)
+        yaw, pitch, roll = (_within(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll"))
+        return (yaw, pitch, roll) if any((yaw, pitch, roll)) else None
+    return None
+
+
+def _first_number(
+    values: Mapping[str, bytes], name: str, makers: tuple[str, ...], low: float, high: float
+) -> float | None:
+    for maker in makers:
+        with contextlib.suppress(KeyError, ValueError):
+            return _within(float(values[f"{maker}:{name}"]), low, high)
     return None
 
 

@@ -67,11 +67,8 @@ def counting_order(name: str) -> tuple[list[str | int], str]:
 
 def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
     """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated as its EXIF data say, without transparency.
-    An image of 16 bits is shown over the range `depth` of the images before it (None: over its own).
-
-    Raises ImageError for a file that is missing, no regular file, cut short, no image, neither of 8 nor of 16 bits,
-    smaller than 16x16 pixels, or larger than `MAX_PIXELS`.
-    """
+    An image of 16 bits is shown over the range `depth` of the images before it (None: over its own). Raises ImageError
+    for any file but a whole image of 8 or 16 bits, at least 16x16 pixels and at most `MAX_PIXELS`."""
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
@@ -121,14 +118,12 @@ def as_jpeg(image: Image) -> bytes:
 
 
 def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3]), as a small JPEG for people to look at: its longest side is scaled down to
-    `longest_px` if it is longer."""
+    """Encode a picture, uint8 (H, W[, 3]), as a JPEG for people, its longest side at most `longest_px`."""
     return _encoded(".jpg", at_most(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
 def small_webp(image: Image, longest_px: int, quality: int = _WEBP_QUALITY) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP file, scaled as `small_jpeg` does. It takes about half of
-    that, at a lower quality, and can be transparent."""
+    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large, and can be transparent."""
     return _encoded(".webp", at_most(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, quality))
 
 

@@ -35,15 +35,15 @@ _SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant angles by which a camera looks ahead and to the right of what is straight down for the airframe, or for
-    the gimbal that it hangs in (negative: behind, to the left)."""
+    """Constant angles by which a camera looks ahead and to the right of straight down of the airframe, or of the gimbal
+    that it hangs in (negative: behind, to the left)."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0
 
     def body_from_straight(self) -> Doubles:
-        """Return the rotation (3, 3) that turns a camera from straight down to where it looks, in the airframe's axes:
-        to look ahead is to turn as the airframe does with its nose up, to the right as with its left wing down."""
+        """Return the rotation (3, 3), in the axes of the airframe, from straight down to where the camera looks."""
+        # To look ahead is to turn as the airframe does with its nose up, to the right as with its left wing down.
         return _level_from_body(-self.right_deg, self.ahead_deg)
 
 
@@ -52,9 +52,8 @@ STRAIGHT_DOWN = Mount()
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera's lens, and how the camera is mounted. `fov_deg`: its field of view across the longest side of the
-    picture. `up_deg`: compass direction of the picture's top while the nose points north. `calibrated`: its distortion
-    (None: it has none); then `fov_deg` is that of the straightened picture, see `frames.lens`."""
+    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, straightened if
+    there is a calibration of its distortion, `calibrated`. `up_deg`: direction of the picture's top, from the nose."""
 
     fov_deg: float
     up_deg: float = 0.0
@@ -69,10 +68,8 @@ class View:
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
     `aside`: offset from the picture's middle to the point straight under the camera, (right, up) in shares of the
     longest side. `zoom`: factor by which the picture was enlarged; its longest side shows that many times less ground.
-    `lean_m`: offset on the ground (east, north) in metres from the point in the picture's middle to the point straight
-    under the camera. Set only for a picture that was not warped because its lens is unknown.
-    `focal`: focal length in shares of the longest side.
-    `reason`: words that say why a tilted picture was not warped (None: it was, or needed no warp)."""
+    `lean_m`: that offset on the ground (east, north), of a picture that was not warped because its lens is unknown.
+    `focal`: focal length in shares of the longest side. `reason`: why a tilted picture was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -127,10 +124,10 @@ def levelled(
     The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
     scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The picture shows
     `scale` times as much ground as the height tells. Its middle shows the same point as before or, with `below`, the
-    point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None: it shows ground
-    everywhere). A picture of known pose is returned unchanged, and so is, but for the distortion of its lens, one that
-    needs no warp or is tilted too far for one. Impossible values in frame or vehicle never raise; ImageError is raised
-    for a picture of another shape than the calibrated lens takes.
+    point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None: nowhere).
+    A picture of known pose is returned unchanged, and so is, but for the distortion of its lens, one that needs no warp
+    or is tilted too far for one. Raises ImageError for a picture of another shape than the calibrated lens takes, and
+    nothing for impossible values in frame or vehicle.
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
@@ -211,10 +208,9 @@ def enlarged(picture: Levelled, zoom: float) -> Levelled:
 
 
 def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
-    """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`, computed
-    from the `mount` and the roll, pitch, heading and height of `frame`, or where the frame has none those of `vehicle`;
-    or only `reason`, if the picture is tilted too far; or neither, if too little is known. Impossible values never
-    raise."""
+    """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`; or only
+    `reason`, if the picture is tilted too far; or neither, if too little is known. The arguments are as in `levelled`,
+    and impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -231,15 +227,13 @@ def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN)
 
 
 class _Taking:
-    """The geometry of a picture when it was taken, as far as known.
+    """The geometry of a picture when it was taken, as far as known; of a lens with distortion, of the straightened one.
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
     looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
-    `straight` is the rotation from lens to level picture without a turn, `tilt_deg` the angle between the viewing
-    direction and straight down, and `is_too_tilted` is True if that is too much for a warp. `top_deg` is the compass
-    direction of the picture's top (None: unknown). `own_m` is the ground length of the longest side if the picture were
-    level (None: height unknown). `corners` (3, 4) are the picture's corners in homogeneous pixels, one per column.
-    `size_px` is its size (width, height). Of a lens with distortion, the picture meant is the straightened one."""
+    `straight`: rotation from lens to level picture without a turn. `tilt_deg`: angle between the viewing direction and
+    straight down; `is_too_tilted` for a warp. `top_deg`: compass direction of the picture's top. `own_m`: ground length
+    of the longest side if the picture were level. `corners` (3, 4): those of the picture, homogeneous pixels."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, _ = _attitude(frame, vehicle)
@@ -256,8 +250,8 @@ class _Taking:
         self.own_m = footprint_of(frame, vehicle, lens)
         focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
         self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
-        across, along = (-0.5, width - 0.5), (-0.5, height - 0.5)
-        self.corners = np.array([[*across, *across[::-1]], [along[0], along[0], along[1], along[1]], [1] * 4])
+        right, lower = width - 0.5, height - 0.5
+        self.corners = np.array([[-0.5, right, right, -0.5], [-0.5, -0.5, lower, lower], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
         rays = self.straight @ self.lens_from_pixel @ self.corners

@@ -1,12 +1,21 @@
-"""Live sources: cameras and network streams. The newest picture counts; a source that gives none is opened anew."""
+"""Live sources: cameras and network streams. The newest picture counts; a source that gives none is opened anew.
+
+A call into a driver or a decoder may never return, and a thread that hangs in one cannot be ended. So one thread opens
+a source and reads it, another converts the pictures that are used, and a third, which calls nothing that could hang,
+gives up on both and starts others; the process ends without them (`cli.main`). A process of its own, which can be
+ended, was not taken: it needs 40 MB more on a small board, every picture has to be copied out of it, and a driver that
+hangs in the kernel holds a process as it holds a thread.
+"""
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
+from queue import SimpleQueue
 
+from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.calls import Conversion, Converter, Opening
 from edgevpr.frames.liveness import LOST_S, Fault, Liveness
-from edgevpr.frames.shot import Capture, Condition, Newness, Refusal, Shot
+from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot
 from edgevpr.frames.source import Source
 from edgevpr.frames.twins import TwinCheck
 
@@ -16,22 +25,63 @@ _CLOSE_TIMEOUT_S = 0.5
 _TICK_S = 0.2
 _OPENING_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
 _AGED_S = 1.0
-_MOST_HANGING = 3  # calls that have not returned: a source that hangs each time must not take ever more threads
+_MOST_HANGING = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
+
+
+class _Opening:
+    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: why it could not be
+    opened or read on, in a few words (None: it is lost, or cancelled). `thread` runs `read` with this object."""
+
+    def __init__(self, read: Callable[["_Opening"], None], began_s: float) -> None:
+        self.began_s = began_s
+        self.opened_s: float | None = None
+        self.cause: str | None = None
+        self.capture: Capture | None = None
+        self.is_cancelled = False
+        self.thread = threading.Thread(target=read, args=(self,), name="capture", daemon=True)
+        self.thread.start()
+
+    def cancel(self) -> None:
+        """Let the thread end as soon as its present call returns."""
+        self.is_cancelled = True
+        if self.capture is not None:
+            self.capture.cancel()
+
+
+class _Conversion:
+    """The conversion of a picture, requested at `began_s`. `image`: the result, once it is `done`; None: it failed."""
+
+    def __init__(self, number: int, shot: Shot, began_s: float) -> None:
+        self.number, self.shot, self.began_s = number, shot, began_s
+        self.image: Image | None = None
+        self.done = threading.Event()
+
+
+class _Converter:
+    """A thread that converts the pictures in `requests`, one after the other, until it comes to None."""
+
+    def __init__(self) -> None:
+        self.requests: SimpleQueue[_Conversion | None] = SimpleQueue()
+        self.thread = threading.Thread(target=self._run, name="convert", daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        while (conversion := self.requests.get()) is not None:
+            with suppress(Exception):  # a picture that a decoder cannot give is left out
+                conversion.image = conversion.shot.pixels()
+            conversion.done.set()
+            del conversion  # its picture is large
 
 
 class LiveSource(Source):
-    """Gives the newest frame of the camera or stream that `open_capture` opens. Where that returns None or raises
-    OpeningError, it could not be opened.
+    """Gives the newest frame of the camera or stream that `open_capture` opens, or cannot open (OpeningError).
 
     `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
-    `latency_s` grows while no new picture comes.
-
-    One thread opens the source and reads it (`Opening`), another converts the pictures that are used (`Converter`). A
-    third calls nothing that could hang: it gives up on the others if no new picture comes in time (`Liveness`), and has
-    the source opened anew after pauses that grow, for ever. `read` and `close` wait for no call that hangs.
+    `latency_s` grows while no new picture comes. The source is opened anew if no new picture comes in time
+    (`Liveness`), after pauses that grow, for ever. `read` and `close` wait for no call that hangs.
     """
 
-    def __init__(self, open_capture: Callable[[], Capture | None], clock: Callable[[], float]):
+    def __init__(self, open_capture: Callable[[], Capture], clock: Callable[[], float]):
         self.is_live, self.total, self.ended = True, 0, False
         self.condition, self.state = Condition.OPENING, "opening, no picture yet"
         self.dropped: int = 0
@@ -45,11 +95,10 @@ class LiveSource(Source):
         self._newness = Newness()  # over all openings: a server may begin with the picture that it has kept
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
-        self._conversion: Conversion | None = None
-        self._converter = Converter()
-        self._opening: Opening | None = None
-        self._is_open_noted = False
-        self._hanging: list[Callable[[], bool]] = []  # for each call that was given up: has it returned?
+        self._conversion: _Conversion | None = None
+        self._converter = _Converter()
+        self._opening: _Opening | None = None
+        self._hanging: list[threading.Thread] = []  # threads that were given up
         self._changed = threading.Condition()  # guards all of these
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._keep_open, name="camera", daemon=True)
@@ -61,9 +110,9 @@ class LiveSource(Source):
                 self._changed.wait_for(lambda: self._newest is not None, timeout_s)
                 if self._newest is None or self._closing.is_set():
                     return None
-                self._conversion = Conversion(*self._newest, self._clock())
+                self._conversion = _Conversion(*self._newest, self._clock())
                 self._newest = None
-                self._converter.ask(self._conversion)
+                self._converter.requests.put(self._conversion)
             conversion = self._conversion
         if not conversion.done.wait(timeout_s):  # the next call waits on
             return None
@@ -86,87 +135,94 @@ class LiveSource(Source):
             opening = self._opening
         if opening:
             opening.cancel()
-            opening.ended.wait(_CLOSE_TIMEOUT_S)
-        self._converter.end(_TICK_S)
+            opening.thread.join(_CLOSE_TIMEOUT_S)
+        self._converter.requests.put(None)
+        self._converter.thread.join(_TICK_S)
         self._thread.join(_CLOSE_TIMEOUT_S)
         self.end()
 
     def _keep_open(self) -> None:
         wait_s = 0.0
-        while (opening := self._open()) is not None:
+        while not self._closing.is_set():
+            with self._changed:
+                opening = self._opening = _Opening(self._read_capture, self._clock())
             before = self._captured
             fault = self._watch(opening)
             opening.cancel()
-            self._hanging.append(opening.ended.is_set)
+            self._hanging.append(opening.thread)
             has_failed_again = wait_s and self._captured == before and fault.condition is not Condition.FROZEN
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
             self._liveness.reopen(fault)
             self._set_condition(fault.condition, f"{fault.text}, reopening in {wait_s:g} s")
             self._closing.wait(wait_s)
-            self._wait_for_calls(fault)
+            self._wait_for_threads(fault)
 
-    def _open(self) -> Opening | None:
-        """Begin to open the source; None if it is to be closed."""
-        with self._changed:
-            if self._closing.is_set():
-                return None
-            self._is_open_noted = False
-            self._opening = Opening(self._open_capture, self._take, self._clock)
-            return self._opening
-
-    def _watch(self, opening: Opening) -> Fault:
+    def _watch(self, opening: _Opening) -> Fault:
         """Wait until a source that is being opened, or is open, must be opened anew, and return why."""
-        while not (opening.ended.wait(_TICK_S) or self._closing.is_set()):
+        while opening.thread.is_alive() and not self._closing.is_set():
+            opening.thread.join(_TICK_S)
             with self._changed:
-                if fault := self._fault(opening):
+                if opening.thread.is_alive() and (fault := self._fault(opening)):
                     self._set_condition(fault.condition, fault.text)
                     if fault.must_reopen:
                         return fault
-        cause = "no picture came" if opening.opened_s else "nothing there"
-        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else cause), True)
+        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else "no picture came"), True)
 
-    def _fault(self, opening: Opening) -> Fault | None:
+    def _fault(self, opening: _Opening) -> Fault | None:
         now_s, conversion = self._clock(), self._conversion
         if self._captured and now_s - self._last_taken_s > _AGED_S:
             self.latency_s = now_s - self._last_taken_s
         if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_S:
-            self._converter.end()
-            self._hanging.append(self._converter.has_ended)
-            self._converter, self._conversion = Converter(), None
+            self._converter.requests.put(None)
+            self._hanging.append(self._converter.thread)
+            self._converter, self._conversion = _Converter(), None
             self._newest = None  # of the same decoder
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
-        if opening.opened_s is None:
-            is_late = now_s - opening.began_s > _OPENING_S
-            return Fault(Condition.LOST, "lost: the opening hangs", True) if is_late else None
-        self._note_open(opening)
-        return self._liveness.fault(now_s)
+        if opening.opened_s is not None:
+            return self._liveness.fault(now_s)
+        return Fault(Condition.LOST, "lost: the opening hangs", True) if now_s - opening.began_s > _OPENING_S else None
 
-    def _note_open(self, opening: Opening) -> None:
-        if not self._is_open_noted and opening.opened_s is not None:
-            self._is_open_noted = True
-            self._liveness.open(opening.opened_s)
-
-    def _wait_for_calls(self, fault: Fault) -> None:
+    def _wait_for_threads(self, fault: Fault) -> None:
         while not self._closing.is_set():
-            self._hanging = [has_returned for has_returned in self._hanging if not has_returned()]
+            self._hanging = [thread for thread in self._hanging if thread.is_alive()]
             if len(self._hanging) < _MOST_HANGING:
                 return
             self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls into it hang")
             self._closing.wait(_FIRST_WAIT_S)
 
-    def _take(self, opening: Opening, shot: Shot | Refusal) -> None:
+    def _read_capture(self, opening: _Opening) -> None:
+        """Open the source, take what it gives until it is lost or cancelled, and release it: the work of a thread."""
+        try:
+            capture = opening.capture = self._open_capture()
+            try:
+                with self._changed:
+                    if self._is_current(opening):
+                        opening.opened_s = self._clock()
+                        self._liveness.open(opening.opened_s)
+                while not opening.is_cancelled and (shot := capture.read()) is not None:
+                    self._take(opening, shot)
+            finally:
+                capture.release()
+        except OpeningError as error:
+            opening.cause = str(error)
+        except Exception as error:  # of a driver or a decoder, whatever it is
+            opening.cause = f"{type(error).__name__}: {error}"
+
+    def _is_current(self, opening: _Opening) -> bool:
+        return opening is self._opening and not opening.is_cancelled
+
+    def _take(self, opening: _Opening, shot: Shot | Refusal) -> None:
         """Take what an opening has read, unless it has been given up."""
         with self._changed:
-            if opening is not self._opening or opening.is_cancelled:
+            if not self._is_current(opening):
                 return
-            self._note_open(opening)
             now_s = self._clock()
-            found = shot if isinstance(shot, Refusal) else self._put(shot, now_s)
-            if found is None:
-                self.facts = self.facts or opening.facts
+            refusal = shot if isinstance(shot, Refusal) else self._put(shot, now_s)
+            if refusal is None:
+                self.facts = self.facts or getattr(opening.capture, "facts", None)
             else:
-                self.refused[found.value] += 1
-                self._liveness.refuse(found, now_s)
+                self.refused[refusal.value] += 1
+                self._liveness.refuse(refusal, now_s)
 
     def _put(self, shot: Shot, now_s: float) -> Refusal | None:
         """Keep a picture as the newest one, or return why it is none."""

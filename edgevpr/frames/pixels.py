@@ -1,6 +1,5 @@
 """Conversion of decoded pictures of any pixel format to the pixels that edgevpr works with: 8 bits, square."""
 
-import logging
 import re
 import threading
 from collections.abc import Callable
@@ -11,17 +10,16 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
-from edgevpr.frames.depth import DepthRange, find_limits, sample_counts, to_8_bits
+from edgevpr.frames.depth import DepthRange, coarse_counts, to_8_bits
 from edgevpr.frames.shot import coarse
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-# Formats whose first plane is the brightness: the kind, the bits of a channel (none: 8) and the order of its two bytes.
-_LUMA_FIRST = re.compile(r"(gray|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
+# Formats whose first plane is the brightness: grey, the bits of a channel (none: 8), and the order of its two bytes.
+_LUMA_FIRST = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
 _SQUARE_TOLERANCE = 0.01  # pixels count as square within it: the positions are off by less than by other errors
 _MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more than this, or less than 1/4, is wrong
-_log = logging.getLogger(__name__)
 
 
 class PixelConverter:
@@ -34,49 +32,29 @@ class PixelConverter:
     def __init__(self) -> None:
         self._of_thread = threading.local()  # FFmpeg's converter hangs or crashes if two threads use it at once
         self._depth = DepthRange()
-        self._aspect = 1.0
 
     def look(self, picture: "VideoFrame") -> Image:
-        """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.look`. That of counts is shown over its own
-        range, so that the copies of a frozen picture are equal."""
+        """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.look`."""
         layout = _layout(picture)
         if layout is None:
-            return coarse(self._gray_or_bgr(picture, "gray"))
+            return coarse(np.asarray(self._reformat(picture, "gray").to_ndarray(), np.uint8))
         plane = _first_plane(picture, layout)
-        if not _is_counts(layout):
-            return np.asarray(coarse(plane) >> (int(layout[2] or 8) - 8), np.uint8)
-        sample = sample_counts(plane)
-        return to_8_bits(sample, find_limits(sample))
+        if layout[1] and layout[2]:
+            return coarse_counts(plane)
+        return np.asarray(coarse(plane) >> (int(layout[2] or 8) - 8), np.uint8)
 
     def conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
         """Return a function that converts a picture to uint8 (H, W, 3) BGR, or (H, W) grey for counts, with square
-        pixels. `aspect` is the width of its pixels over their height."""
-        width_px, layout = self._square_width_px(picture, aspect), _layout(picture)
-        if layout is None or not _is_counts(layout):
-            return lambda: self._gray_or_bgr(picture, "bgr24", width_px)
+        pixels of the same height. `aspect` is the width of its pixels over their height."""
+        is_usable = abs(aspect - 1) > _SQUARE_TOLERANCE and 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
+        width_px = round(picture.width * aspect) if is_usable else picture.width
+        layout = _layout(picture)
+        if not (layout and layout[1] and layout[2]):
+            return lambda: np.asarray(self._reformat(picture, "bgr24", width_px).to_ndarray(), np.uint8)
         limits = self._depth.update(_first_plane(picture, layout))
         return lambda: to_8_bits(_first_plane(self._reformat(picture, picture.format.name, width_px), layout), limits)
 
-    def _square_width_px(self, picture: "VideoFrame", aspect: float) -> int:
-        """Return how wide a picture is with square pixels of the same height; announce a change of their shape."""
-        if abs(aspect - 1) <= _SQUARE_TOLERANCE:
-            aspect = 1.0
-        is_usable = 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
-        width_px = round(picture.width * aspect) if is_usable else picture.width
-        if aspect != self._aspect:
-            self._aspect = aspect
-            stated = f"pixels {aspect:.3g} times as wide as high"
-            size = f"{picture.width} x {picture.height}"
-            if is_usable:
-                _log.info("%s: pictures of %s are resampled to %d x %d", stated, size, width_px, picture.height)
-            else:
-                _log.warning("%s cannot be right, pictures of %s are used as they are", stated, size)
-        return width_px
-
-    def _gray_or_bgr(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> Image:
-        return np.asarray(self._reformat(picture, form, width_px).to_ndarray(), np.uint8)
-
-    def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None) -> "VideoFrame":
+    def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> "VideoFrame":
         converter: VideoReformatter | None = getattr(self._of_thread, form, None)
         if converter is None:
             converter = VideoReformatter()
@@ -88,10 +66,6 @@ def _layout(picture: "VideoFrame") -> re.Match[str] | None:
     """Return how the brightness lies in the first plane, by `_LUMA_FIRST`; None if it has to be computed. Rows from the
     bottom to the top cannot be read in place."""
     return None if picture.planes[0].line_size < 0 else _LUMA_FIRST.fullmatch(picture.format.name)
-
-
-def _is_counts(layout: re.Match[str]) -> bool:
-    return layout[1] == "gray" and layout[2] is not None
 
 
 def _first_plane(picture: "VideoFrame", layout: re.Match[str]) -> NDArray[Any]:

@@ -42,8 +42,8 @@ _ANGLES = [1, 3, 4]  # which of `_numbers_of` are angles of a full turn
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
-    """Position, heading (0..360 clockwise from true north) and time (seconds since 1970) of an image, and roll, pitch
-    and height above the ground as defined by `Frame`. None: unknown."""
+    """Position, heading and time (seconds since 1970) of an image, and roll, pitch and height above the ground, as
+    defined by `Frame`. None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None
@@ -56,8 +56,8 @@ class GeoTag:
 def find_positions(folder: str | Path) -> Path | None:
     """Return the path of positions.csv in `folder`, else in the folder that contains it, else None."""
     folder = Path(folder).absolute()
-    candidates = (folder / "positions.csv", folder.parent / "positions.csv")
-    return next((path for path in candidates if path.is_file()), None)
+    tables = (folder / "positions.csv", folder.parent / "positions.csv")
+    return next((table for table in tables if table.is_file()), None)
 
 
 def find_track(video: str | Path) -> Path | None:
@@ -70,18 +70,16 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     """Read a positions.csv. Returns the data of each image by its file name.
 
     Columns: file, lat, lon (degrees) and, optionally, alt (m), heading_deg or yaw_deg, time, roll_deg (right wing down
-    is positive), pitch_deg (nose up), and height_m above the ground or rel_alt. rel_alt is DJI's height over the
-    take-off point, which is that above the ground only if the ground is level. All cells but the name may be empty;
-    other columns are ignored. Raises UsageError for a file that cannot be read, and for a wrong value, with its line.
-    """
+    is positive), pitch_deg (nose up), and height_m above the ground or rel_alt (DJI's, over the take-off point). All
+    cells but the name may be empty; other columns are ignored. Raises UsageError for a file that cannot be read, and
+    for a wrong value, with its line."""
     return {row["file"]: _tag_of(row, where) for where, row in _rows_of(csv_path)}
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
     """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
-    _write(
-        csv_path, ("file", *_WRITTEN, "time"), ((name, *_numbers_of(tag), tag.t_utc_s) for name, tag in tags.items())
-    )
+    rows = [(name, *_numbers_of(tag), tag.t_utc_s) for name, tag in tags.items()]
+    _write(csv_path, ("file", *_WRITTEN, "time"), rows)
 
 
 def write_track(csv_path: str | Path, track: "Track") -> None:
@@ -95,8 +93,7 @@ def _write(csv_path: str | Path, header: Sequence[str], rows: Iterable[Sequence[
     table = csv.writer(text)
     table.writerow(header)
     table.writerows(rows)
-    content = text.getvalue().encode()
-    write_whole(Path(csv_path), lambda path: path.write_bytes(content))
+    write_whole(Path(csv_path), lambda path: path.write_bytes(text.getvalue().encode()))
 
 
 def _numbers_of(tag: GeoTag) -> tuple[Any, ...]:
@@ -139,12 +136,14 @@ def _rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> l
 def _tag_of(row: Mapping[str, str], where: str) -> GeoTag:
     """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
     known = {column: _number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
-    lat_deg, lon_deg = known["lat"], known["lon"]
-    if (lat_deg is None) != (lon_deg is None):
+    lat_deg, lon_deg, position = known["lat"], known["lon"], None
+    if lat_deg is not None and lon_deg is not None:
+        position = position_or_none(lat_deg, lon_deg, known["alt"])
+    elif lat_deg is not None or lon_deg is not None:
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
     heading_deg = known["yaw_deg"] if known["heading_deg"] is None else known["heading_deg"]
     return GeoTag(
-        position=None if lat_deg is None or lon_deg is None else position_or_none(lat_deg, lon_deg, known["alt"]),
+        position=position,
         heading_deg=None if heading_deg is None else heading_deg % 360,
         t_utc_s=_time_in(row, where),
         roll_deg=known["roll_deg"],
@@ -156,14 +155,6 @@ def _tag_of(row: Mapping[str, str], where: str) -> GeoTag:
 def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
     """Make a position; return None for exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
-
-
-def count_at_zero(csv_path: str | Path) -> int:
-    """Count the rows of a table of positions that lie at exactly (0, 0). Raises UsageError as `read_positions` does."""
-    return sum(
-        all(_number_in(row, name, *_NUMBERS[name], where) == 0 for name in ("lat", "lon"))
-        for where, row in _rows_of(csv_path, ("lat", "lon"))
-    )
 
 
 def _number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
@@ -192,11 +183,8 @@ def _time_in(row: Mapping[str, str], where: str) -> float | None:
 
 
 def parse_time(text: str) -> float:
-    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds.
-
-    A time without a zone is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, such as one
-    in milliseconds.
-    """
+    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds. Without a zone it
+    is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, such as one in milliseconds."""
     try:
         seconds = float(text)
     except ValueError:

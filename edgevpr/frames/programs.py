@@ -17,18 +17,21 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import IO
 
 from edgevpr.core.errors import SourceError
 from edgevpr.core.text import shown
 from edgevpr.frames.shot import OpeningError, Refusal, Shot
-from edgevpr.frames.streams import StreamCapture, open_stream
+from edgevpr.frames.streams import StreamCapture, open_raw
 
 _RIBBON, _PIPELINE = "rpicam-vid", "gst-launch-1.0"
 _OLDER = {_RIBBON: "libcamera-vid"}  # names on older systems
 _PACKAGES = {
     _RIBBON: "rpicam-apps-lite",
     _PIPELINE: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
+}
+_ADVICE = {
+    _RIBBON: "`rpicam-hello --list-cameras` says if it is found, and whether it is in use",
+    _PIPELINE: "run `gst-launch-1.0 -v` with it to see why, and end it with raw video (video/x-raw)",
 }
 # For this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read all of their pixels, binned: for a smaller one
 # some read the middle only, and see less.
@@ -38,25 +41,23 @@ _WAITING_PICTURES = 10  # of a reader that does not read: older ones are dropped
 # From the start to the first picture. A camera takes a second or two, but GStreamer that looks for its plugins, or a
 # sensor behind several drivers, 10 s and more on a small board; and whoever is ended too early starts as slowly again.
 _FIRST_PICTURE_S = 60.0
-_LOOK_S = 0.2
-_ENDS_S = 2.0
-_WORDS_LINES = 20  # of what a program says last
-_WORDS_CHARS = 160  # a longer line explains nothing in a status
+_POLL_S = 0.2
+_END_S = 2.0
+_STDERR_LINES = 20  # the last ones are kept
+_STDERR_CHARS = 160  # a longer line explains nothing in a status
 _log = logging.getLogger(__name__)
 
 
 def require_program(uri: str) -> str:
     """Return the path of the system's program that reads this camera. Raises SourceError if it is not installed, or if
     `uri` is no pipeline."""
-    name = _RIBBON
-    if uri.startswith("gst:"):
-        name = _PIPELINE
-        _words(uri)
-    found = shutil.which(name) or shutil.which(_OLDER.get(name, name))
-    if found is None:
-        packages = _PACKAGES[name]
-        raise SourceError(f"{name}, which reads this camera, is not here: run `sudo apt install {packages}`.")
-    return found
+    name = _name_program(uri)
+    if name == _PIPELINE:
+        _split_pipeline(uri)
+    path = shutil.which(name) or shutil.which(_OLDER.get(name, name))
+    if path is None:
+        raise SourceError(f"{name}, which reads this camera, is not here: run `sudo apt install {_PACKAGES[name]}`.")
+    return path
 
 
 def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
@@ -65,34 +66,28 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    is_pipeline = uri.startswith("gst:")
+    name = _name_program(uri)
     process = subprocess.Popen(
-        (_pipeline if is_pipeline else _ribbon)(uri, port),
+        _pipeline_command(uri, port) if name == _PIPELINE else _ribbon_command(uri, port),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
     )
-    words = _LastWords(process.stderr)
+    errors = ErrorLines(process)
     end_s = time.monotonic() + _FIRST_PICTURE_S
     while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
-            stream = open_stream(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s)
+            stream = open_raw(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s)
             if time.monotonic() < end_s:
                 return ProgramCapture(stream, process)
             stream.release()  # FFmpeg calls a stream open when its time is over, without a picture too
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     exit_code = process.poll()
-    why = (
-        f"run `{_PIPELINE} -v` with it to see why, and end it with raw video (video/x-raw)"
-        if is_pipeline
-        else "`rpicam-hello --list-cameras` says if it is found, and whether it is in use"
-    )
-    _log.warning("%s gives no picture: %s", uri, why)
+    _log.warning("%s gives no picture: %s", uri, _ADVICE[name])
     _end(process)
-    name = _PIPELINE if is_pipeline else _RIBBON
     if exit_code is None:
         raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_S:g} s")
-    raise OpeningError(f"{name} has ended with code {exit_code}{words.explain_exit()}")
+    raise OpeningError(f"{name} has ended with code {exit_code}{errors.explain_exit()}")
 
 
 class ProgramCapture:
@@ -113,10 +108,37 @@ class ProgramCapture:
         self._stream.release()
 
 
-def _ribbon(uri: str, port: int) -> list[str]:
+class ErrorLines:
+    """The last lines that a program writes to stderr. A thread reads them, as a program whose pipe is full hangs."""
+
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        self._process = process
+        self._lines: deque[bytes] = deque(maxlen=_STDERR_LINES)
+        self._thread = threading.Thread(target=self._read, name="stderr", daemon=True)
+        self._thread.start()
+
+    def explain_exit(self) -> str:
+        """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
+        self._thread.join(_POLL_S)
+        lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
+        lines = [line for line in lines if 0 < len(line) <= _STDERR_CHARS]
+        best = [line for line in lines if "error" in line.lower()][:1] or lines[-1:]
+        return f": {shown(best[0])}" if best else ""
+
+    def _read(self) -> None:
+        assert self._process.stderr is not None
+        with self._process.stderr as pipe:
+            self._lines.extend(iter(lambda: pipe.readline(2 * _STDERR_CHARS), b""))
+
+
+def _name_program(uri: str) -> str:
+    return _PIPELINE if uri.startswith("gst:") else _RIBBON
+
+
+def _ribbon_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon camera to the first who connects to `port`."""
     return [
-        *_die_with_parent("KILL"),
+        *("setpriv", "--pdeathsig", "KILL"),  # ends with our thread: it has nothing to close
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -124,62 +146,27 @@ def _ribbon(uri: str, port: int) -> list[str]:
     ]
 
 
-def _pipeline(uri: str, port: int) -> list[str]:
+def _pipeline_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a pipeline to those who connect to `port`. It does not notice that
     they have gone."""
     sink = f"sync=false buffers-soft-max={_WAITING_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
-    sent = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    return [*_die_with_parent("TERM"), require_program(uri), "-q", *_words(uri), *sent.split()]
+    encoder = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
+    ends = "setpriv", "--pdeathsig", "TERM"  # with our thread; it closes its camera upon this
+    return [*ends, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
 
 
-def _die_with_parent(name: str) -> tuple[str, ...]:
-    """Return the words before a command that let the kernel send it the signal `name` when our thread ends. GStreamer
-    closes its camera upon TERM; rpicam-vid has nothing to close."""
-    return "setpriv", "--pdeathsig", name
-
-
-def _words(uri: str) -> list[str]:
+def _split_pipeline(uri: str) -> list[str]:
     """Split a pipeline, without an appsink, into words. Raises SourceError if there is none or a quote does not end."""
-    try:
-        words = shlex.split(_APPSINK.sub("", uri.removeprefix("gst:")))
-    except ValueError:
-        words = []
-    if not words:
-        raise SourceError(
-            f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end."
-        )
-    return words
-
-
-class _LastWords:
-    """The last lines of what a program says. A thread reads them, as a program whose pipe is full hangs."""
-
-    def __init__(self, pipe: IO[bytes] | None) -> None:
-        assert pipe is not None
-        self._pipe = pipe
-        self._lines: deque[bytes] = deque(maxlen=_WORDS_LINES)
-        self._thread = threading.Thread(target=self._read, name="last words", daemon=True)
-        self._thread.start()
-
-    def explain_exit(self) -> str:
-        """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
-        self._thread.join(_LOOK_S)
-        lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
-        lines = [line for line in lines if line and len(line) <= _WORDS_CHARS]
-        errors = [line for line in lines if "error" in line.lower()]
-        best = errors[:1] or lines[-1:]
-        return f": {shown(best[0])}" if best else ""
-
-    def _read(self) -> None:
-        with self._pipe:
-            for line in iter(lambda: self._pipe.readline(2 * _WORDS_CHARS), b""):
-                self._lines.append(line)
+    with suppress(ValueError):
+        if words := shlex.split(_APPSINK.sub("", uri.removeprefix("gst:"))):
+            return words
+    raise SourceError(f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end.")
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
     process.terminate()
     try:
-        process.wait(_ENDS_S)
+        process.wait(_END_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

@@ -34,7 +34,11 @@ class CoarsePicture:
     @cached_property
     def blocks(self) -> Singles:
         """Its blocks, float32 (48, 256), each without its mean and of length 1; of length 0 without texture."""
-        return _blocks(self.grey)
+        blocks = _cut(self.grey)
+        blocks = blocks - blocks.mean(axis=1, keepdims=True)
+        length = np.linalg.norm(blocks, axis=1, keepdims=True)
+        has_texture = length >= _TEXTURE_LEVELS * _BLOCK_PX
+        return np.asarray(np.where(has_texture, blocks / np.maximum(length, 1e-6), 0), np.float32)
 
     @cached_property
     def thumb(self) -> Singles:
@@ -45,8 +49,8 @@ class CoarsePicture:
 
     @cached_property
     def least_loss(self) -> Singles:
-        """By how much the correlation of each block falls if the picture moves by 1.5 pixels in the direction in which
-        that is seen least, float32 (48,), from the least eigenvalue of its structure tensor."""
+        """By how much the correlation of each block falls, float32 (48,), if the picture moves by 1.5 pixels in the
+        direction in which that is seen least: from the least eigenvalue of its structure tensor."""
         right, down = (_cut(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
         pairs = (right, right), (down, down), (right, down)
         across, along, both = ((one * other).sum(axis=1) for one, other in pairs)
@@ -71,14 +75,6 @@ def make_coarse(image: Image) -> CoarsePicture:
     step = max(1, image.shape[1] // _READ_PX)
     plane = np.ascontiguousarray((image if image.ndim == 2 else image[:, :, 1])[::step, ::step])
     return CoarsePicture(np.asarray(cv2.resize(plane, _SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))
-
-
-def _blocks(grey: Array) -> Singles:
-    blocks = _cut(grey)
-    blocks = blocks - blocks.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(blocks, axis=1, keepdims=True)
-    has_texture = length >= _TEXTURE_LEVELS * _BLOCK_PX
-    return np.asarray(np.where(has_texture, blocks / np.maximum(length, 1e-6), 0), np.float32)
 
 
 def _cut(plane: Array) -> Singles:

@@ -8,13 +8,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import FRAME_TIME_SD_S
+
+Plane = TypeVar("Plane", bound=NDArray[Any])
 
 _LOOK_PX = (60, 80)  # least rows and columns of a coarse copy
 _BANDS = 12
@@ -28,10 +30,9 @@ _MOVES_ALWAYS = 0.75  # least share of pictures in which a band changed; a band 
 
 
 class Condition(Enum):
-    """The condition of a source. OPENING: until the first picture comes or the opening fails. RUNNING: new and complete
-    pictures come. DAMAGED: pictures come, but none is complete. LATE: pictures come, but their age is unknown. FROZEN:
-    the same picture comes again and again. LOST: no pictures come, and the source is being reopened. ENDED: no more
-    pictures will come."""
+    """The condition of a source. OPENING: no picture has come yet. RUNNING: new and complete pictures come. DAMAGED:
+    none is complete. LATE: their age is unknown. FROZEN: the same one comes again and again. LOST: none comes, and the
+    source is being reopened. ENDED: no more will come."""
 
     OPENING = auto()
     RUNNING = auto()
@@ -43,12 +44,10 @@ class Condition(Enum):
 
 
 class Refusal(Enum):
-    """The reason why a picture is rejected.
-
-    DAMAGED: it is incomplete, or was decoded with the help of an incomplete one.
-    PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before.
-    LATE: its age is unknown, because it was buffered before the source was opened, arrived out of order, or has a time
-    stamp that does not keep time; or it was skipped, because decoding lags behind."""
+    """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded with the help of an incomplete
+    one. PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before. LATE: its age is
+    unknown, because it was buffered before the source was opened, arrived out of order, or has a time stamp that does
+    not keep time; or it was skipped, because decoding lags behind."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"
@@ -58,10 +57,9 @@ class Refusal(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
-    """A complete picture. `t_mono_s`: time at which it was taken, as far as known, at most that of its arrival (seconds
-    of the monotonic clock); `t_sd_s`: its standard deviation in seconds. `look`: coarse grey copy, uint8 (h, w).
-    `pixels`: function that converts and returns the picture, uint8 (H, W, 3) BGR or (H, W) grey; called only for
-    pictures that are used."""
+    """A complete picture. `t_mono_s`: when it was taken, at most its arrival (seconds of the monotonic clock);
+    `t_sd_s`: standard deviation of that. `look`: coarse grey copy, uint8 (h, w). `pixels`: converts and returns a
+    picture that is used, uint8 (H, W, 3) BGR or (H, W) grey."""
 
     t_mono_s: float
     look: Image
@@ -75,8 +73,8 @@ class OpeningError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamFacts:
-    """What a stream states of its pictures: size, name of the codec, bits of a channel, width of a pixel by its height,
-    and pictures per second (None: not stated)."""
+    """What a stream states of its pictures. `pixel_aspect`: width of a pixel by its height. `rate_hz`: None if not
+    stated."""
 
     width_px: int
     height_px: int
@@ -104,11 +102,11 @@ class Capture(Protocol):
         """Close the camera or the connection."""
 
 
-def coarse(plane: Image) -> Image:
-    """Return a small copy of a picture's grey plane, uint8 (H, W): every n-th row and column, 60 x 80 pixels or a few
+def coarse(plane: Plane) -> Plane:
+    """Return a small copy of a picture's grey plane (H, W[, C]): every n-th row and column, 60 x 80 pixels or a few
     more. Pixels are not averaged, as that would remove the noise that tells a new picture from a repeated one."""
-    height, width = plane.shape
-    return plane[:: max(1, height // _LOOK_PX[0]), :: max(1, width // _LOOK_PX[1])].copy()
+    height, width = plane.shape[:2]
+    return plane[:: max(1, height // _LOOK_PX[0]), :: max(1, width // _LOOK_PX[1])].copy()  # type: ignore[return-value]
 
 
 class Newness:

@@ -35,10 +35,9 @@ _UNESCAPED = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*
 class Source:
     """A source of frames.
 
-    `is_live`: True for a camera or stream, of which only the newest picture is read. False for a recording, which is
-    read in order to its end.
+    `is_live`: a camera or stream, of which only the newest picture is read, and no recording, which is read to its end.
     `ended`: no more frames will come. `total`: approximate number of frames, 0 if unknown.
-    `dropped`: number of pictures not read in time; None for a recording, which drops none.
+    `dropped`: number of pictures not read in time; None for a recording.
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
     `latency_s`: seconds from the taking of the newest picture until it could be read, or until now if it is the newest
     one for long; None if unknown.
@@ -75,8 +74,7 @@ class Source:
 
 
 class RecordingSource(Source):
-    """Base class of sources that end: folders and video files. For the attributes see `Source`. Only frames whose names
-    are in `only` are read (None: all)."""
+    """Base class of folders and video files. Only frames whose names are in `only` are read (None: all)."""
 
     is_live, ended, condition, state = False, False, Condition.RUNNING, "reading"
     dropped = latency_s = None
@@ -99,9 +97,8 @@ def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
 
 class FolderSource(RecordingSource):
     """Gives each image of a folder once, in counting order of the names (2 before 10), with the position, attitude and
-    time of its line in the table `positions` (None: positions.csv in or beside the folder), or if it has no line, with
-    those of its EXIF data. `clock`: the monotonic clock in seconds, for the frames' times. `steps_s`: the seconds
-    between two images, in this order, if they are to be flown by them."""
+    time of its line in the table of positions, or if it has no line, with those of its EXIF data. For the arguments see
+    `open_source`."""
 
     def __init__(
         self,
@@ -115,8 +112,7 @@ class FolderSource(RecordingSource):
         super().__init__(only)
         self._steps_s = iter(steps_s)
         paths = {decoded_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
-        csv_path = positions or find_positions(folder)
-        self._tags = read_positions(csv_path) if csv_path else {}
+        self._tags = _read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
         self._unread = [(name, path) for name, path in paths.items() if self.is_wanted(name)][::-1]
@@ -141,18 +137,21 @@ class FolderSource(RecordingSource):
         return tagged(image, name, self._clock(), self._tags.get(name) or read_exif(path))
 
 
-def tags_of(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
-    """Read what a `FolderSource` says of each image of a folder beside its picture, by path; `positions` is the
-    source's. Raises UsageError for an unusable table."""
+def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
     csv_path = positions or find_positions(folder)
-    tags = read_positions(csv_path) if csv_path else {}
+    return read_positions(csv_path) if csv_path else {}
+
+
+def tags_of(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
+    """Read the tags that a `FolderSource` gives to the images of a folder, by path; `positions` is the source's. Raises
+    UsageError for an unusable table."""
+    tags = _read_table(folder, positions)
     return {path: tags.get(decoded_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
 def recorded_steps(uri: str | None, positions: Path | None = None) -> list[float]:
     """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty:
-    `uri` is no folder, an image has no time, one is older than the image before it, or all have the same time; or the
-    folder or the table cannot be used, which `open_source` says."""
+    `uri` is no folder that can be used, an image has no time, one is older than that before it, or all are equal."""
     times: list[float | None] = []
     if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
@@ -175,10 +174,8 @@ def open_source(
     """Open the source that `uri` names: a path, device or address.
 
     `step_s`: least video time in seconds between two frames of a video file (None: every frame); of an address of a
-    single picture, seconds between two requests (None: 0.5).
-    `positions`: for a folder of images its positions.csv (None: the one in or beside the folder, else EXIF data); for a
-    video the table that `positions.read_track` reads (None: the .csv of the same name beside it, else frames have no
-    positions).
+    single picture, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
+    of a folder the positions.csv in or beside it, else EXIF data; of a video the .csv of the same name beside it).
     `live`: allow cameras and streams, which never end. One that is not there yet is opened as soon as it is.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
     for a folder that is flown by its recorded times, the `recorded_steps` (empty: it is not).
@@ -240,7 +237,7 @@ def missing_cause(uri: str) -> str | None:
     return None
 
 
-def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture | None]:
+def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
     """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
     each must be requested. Raises SourceError if that can never succeed: a device or a file that is missing may come
     later."""
@@ -249,26 +246,25 @@ def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callab
 
         require_program(uri)
         return lambda: open_by_program(uri, clock)
-    if "://" in uri:
-        if _UNESCAPED.fullmatch(uri):
-            raise SourceError(
-                "The password in the address of the source must be percent-encoded: write %2F for /, %23 for #, %3F "
-                "for ?, %40 for @, %25 for % and %20 for a space."
-            )
-        if not _ADDRESS.fullmatch(uri):
-            raise SourceError(
-                f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
-            )
-    elif uri.startswith("/dev/"):
-        from edgevpr.frames.devices import open_device
+    if "://" in uri and _UNESCAPED.fullmatch(uri):
+        raise SourceError(
+            "The password in the address of the source must be percent-encoded: write %2F for /, %23 for #, %3F "
+            "for ?, %40 for @, %25 for % and %20 for a space."
+        )
+    if "://" in uri and not _ADDRESS.fullmatch(uri):
+        raise SourceError(
+            f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
+        )
 
-        return lambda: _open_if_present(uri, lambda: open_device(uri, clock))
-    from edgevpr.frames.streams import open_address  # loads FFmpeg
+    def open_capture() -> Capture:
+        if cause := missing_cause(uri):
+            raise OpeningError(cause)
+        if uri.startswith("/dev/"):
+            from edgevpr.frames.devices import open_device
 
-    return lambda: _open_if_present(uri, lambda: open_address(uri, clock, period_s))
+            return open_device(uri, clock)
+        from edgevpr.frames.streams import open_address  # loads FFmpeg
 
+        return open_address(uri, clock, period_s)
 
-def _open_if_present(uri: str, open_capture: Callable[[], Capture | None]) -> Capture | None:
-    if cause := missing_cause(uri):
-        raise OpeningError(cause)
-    return open_capture()
+    return open_capture

@@ -4,17 +4,15 @@ thread receives packets as they come (`Arrivals`), the thread of `frames.live` d
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from edgevpr.frames.age import StampedTime, Taken, UnstampedTime
-from edgevpr.frames.causes import TransportError
-from edgevpr.frames.decoding import Fetched, WholePictures, open_pictures
+from edgevpr.frames.decoding import Fetched, TransportError, WholePictures, open_pictures
 from edgevpr.frames.rtp import describe_rtp
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
-from edgevpr.frames.webpictures import PartsFile, Snapshots, open_request
+from edgevpr.frames.webpictures import AnswerFile, Snapshots, try_request
 
 if TYPE_CHECKING:
-    from _typeshed import SupportsRead
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
@@ -39,53 +37,46 @@ _CLOSE_S = 0.5  # longest wait for a stream to be closed
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | Snapshots":
-    """Open a network stream or an .sdp file as `open_stream` does, or an address of a single picture, which is then
-    requested every `period_s` seconds."""
-    if not uri.lower().startswith("http"):
-        return open_stream(uri, clock)
+    """Open a network stream, an .sdp file, or an address of a single picture, which is then requested every `period_s`
+    seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
-    request = open_request(uri, OPEN_TIMEOUT_S)
-    if request is None:
-        return open_stream(uri, clock)  # or the cause
-    kind = request.headers.get_content_type()
-    if kind.startswith("multipart/"):
-        return StreamCapture(_open(uri, "mpjpeg", PartsFile(request)), clock, opened_s)
-    if kind == "application/octet-stream":  # FFmpeg as a server says so; a second request would find it gone
-        return StreamCapture(_open(uri, None, request), clock, opened_s)
-    request.close()
+    answer = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
+    kind = answer.headers.get_content_type() if answer else ""
+    timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
+    if answer and kind.startswith("multipart/"):
+        parts = AnswerFile(answer, is_multipart=True)
+        return StreamCapture(open_pictures(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
+    if answer and kind == "application/octet-stream":  # of FFmpeg as a server, which would answer no second request
+        file = AnswerFile(answer, is_multipart=False)
+        return StreamCapture(open_pictures(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
+    if answer:
+        answer.close()
     if kind.startswith("image/"):
         return Snapshots(uri, period_s, OPEN_TIMEOUT_S, clock)
     if kind == "text/html":
         raise OpeningError(f"no video at this address, but {kind}")
-    return open_stream(uri, clock)
+    return StreamCapture(_open(uri), clock, opened_s)
 
 
-def open_stream(
-    uri: str, clock: Callable[[], float], form: str | None = None, open_timeout_s: float | None = None
-) -> "StreamCapture":
-    """Open a network stream or an .sdp file, with time-outs. `clock` is the monotonic clock, in seconds; `form`
-    FFmpeg's name of a format without time stamps (None: it finds out); `open_timeout_s` the seconds to wait for the
-    first picture (None: the usual ones). Raises OpeningError with the cause."""
+def open_raw(uri: str, clock: Callable[[], float], form: str, timeout_s: float) -> "StreamCapture":
+    """Open a stream of a format without time stamps, `form` by its name in FFmpeg, whose first picture is waited for
+    `timeout_s` seconds. Raises OpeningError with the cause."""
     opened_s = clock()
-    return StreamCapture(_open(uri, form, open_timeout_s=open_timeout_s), clock, opened_s)
+    return StreamCapture(open_pictures(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form), clock, opened_s)
 
 
-def _open(
-    uri: str,
-    form: str | None = None,
-    file: "SupportsRead[bytes] | None" = None,
-    open_timeout_s: float | None = None,
-) -> WholePictures:
-    options = _RAW_OPTIONS if form else _OPTIONS if "://" in uri else _SDP_OPTIONS
-    is_udp = uri.lower().startswith(("udp:", "rtp:")) or "://" not in uri
-    if is_udp and "://" in uri and (described := describe_rtp(uri, OPEN_TIMEOUT_S)):
-        uri, form, options = described[0], "sdp", _SDP_OPTIONS | described[1]
-    open_s = open_timeout_s or OPEN_TIMEOUT_S
-    timeouts_s = open_s, UDP_READ_TIMEOUT_S if is_udp else READ_TIMEOUT_S
+def _open(uri: str) -> WholePictures:
+    udp_timeouts_s = OPEN_TIMEOUT_S, UDP_READ_TIMEOUT_S
+    if "://" not in uri:
+        return open_pictures(uri, _SDP_OPTIONS, udp_timeouts_s)
+    if uri.lower().startswith(("udp:", "rtp:")):
+        if sdp := describe_rtp(uri, OPEN_TIMEOUT_S):
+            return open_pictures(sdp, _SDP_OPTIONS, udp_timeouts_s, "sdp")
+        return open_pictures(uri, _OPTIONS, udp_timeouts_s)
     try:
-        return open_pictures(uri, options, timeouts_s, form, file)
+        return open_pictures(uri, _OPTIONS, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
     except TransportError:
-        return open_pictures(uri, _UDP_OPTIONS, (open_s, UDP_READ_TIMEOUT_S))
+        return open_pictures(uri, _UDP_OPTIONS, udp_timeouts_s)
 
 
 class StreamCapture:
@@ -94,7 +85,6 @@ class StreamCapture:
 
     def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
         self._whole, self._clock = whole, clock
-        self._unit_s = float(whole.time_base)
         self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
@@ -109,18 +99,18 @@ class StreamCapture:
             arrival = self._arrivals.next()
             if arrival is None:
                 return None
-            fetched, asked_s, t_mono_s, is_after_gap = arrival
-            if is_after_gap:
+            if arrival.is_after_gap:
                 self._whole.skip()
-            came = self._unstamped.taken(asked_s, t_mono_s)
-            self._note_stamp(fetched, t_mono_s)
-            waited_s = self._clock() - t_mono_s
+            if self._stamped:
+                self._follow_stamps(self._stamped, arrival)
+            taken = self._unstamped.taken(arrival.asked_s, arrival.came_s)
+            waited_s = self._clock() - arrival.came_s
             if waited_s > _TOO_OLD_S or (waited_s > _BEHIND_S and self._arrivals.can_begin_anew()):
                 return self._whole.skip()
-            pictures = self._whole.decode(fetched)
+            pictures = self._whole.decode(arrival)
             if isinstance(pictures, Refusal):
                 return pictures
-            self._ready.extend(self._shot(picture, came, t_mono_s) for picture in pictures)
+            self._ready.extend(self._make_shot(picture, taken, arrival.came_s) for picture in pictures)
         return self._ready.popleft()
 
     def cancel(self) -> None:
@@ -131,34 +121,23 @@ class StreamCapture:
         self.cancel()
         self._arrivals.close()
 
-    def _note_stamp(self, fetched: Fetched, t_mono_s: float) -> None:
-        packet = fetched.packet
-        if self._stamped is None or packet.pts is None:
+    def _follow_stamps(self, stamped: StampedTime, arrival: Fetched) -> None:
+        packet, unit_s = arrival.packet, self._whole.unit_s
+        if packet.pts is None:
             return
         order = packet.pts if packet.dts is None else packet.dts
-        self._stamped.arrived(packet.pts * self._unit_s, order * self._unit_s, t_mono_s, packet.size)
-        if self._stamped.is_live:
-            self._whole.caught_up()
+        stamped.arrived(packet.pts * unit_s, order * unit_s, arrival.came_s, packet.size)
+        if stamped.is_live:
+            self._whole.is_backlog_doubtful = False  # packets from now on were sent after the opening
 
-    def _shot(self, picture: "VideoFrame", came: Taken, arrived_s: float) -> Shot | Refusal:
-        taken: Taken | None = came
+    def _make_shot(self, picture: "VideoFrame", by_wait: Taken, came_s: float) -> Shot | Refusal:
+        taken: Taken | None = by_wait
         if self._stamped:
-            stamp = picture.pts
-            taken = None if stamp is None else self._stamped.taken(stamp * self._unit_s, arrived_s)
+            taken = None if picture.pts is None else self._stamped.taken(picture.pts * self._whole.unit_s, came_s)
         if taken is None:
             return Refusal.LATE
         look, pixels = self._whole.look(picture), self._whole.conversion(picture)
         return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=pixels)
-
-
-class Arrival(NamedTuple):
-    """A packet, and when the call that fetched it began and returned (seconds, monotonic). `is_after_gap`: packets
-    before it were dropped."""
-
-    fetched: Fetched
-    asked_s: float
-    t_mono_s: float
-    is_after_gap: bool = False
 
 
 class Arrivals:
@@ -173,7 +152,7 @@ class Arrivals:
         self, fetch: Callable[[], Fetched | None], clock: Callable[[], float], close_stream: Callable[[], None]
     ) -> None:
         self._fetch, self._clock, self._close_stream = fetch, clock, close_stream
-        self._waiting: deque[Arrival] = deque()
+        self._waiting: deque[Fetched] = deque()
         self._waiting_bytes = 0
         self._has_gap = self._is_lost = False
         self._changed = threading.Condition()
@@ -181,20 +160,20 @@ class Arrivals:
         self._thread = threading.Thread(target=self._run, name="fetch", daemon=True)
         self._thread.start()
 
-    def next(self) -> Arrival | None:
+    def next(self) -> Fetched | None:
         """Wait for the next packet and return it; None if the stream is lost or cancelled."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_lost)
             if not self._waiting:
                 return None
             arrival = self._waiting.popleft()
-            self._waiting_bytes -= arrival.fetched.packet.size
+            self._waiting_bytes -= arrival.packet.size
             return arrival
 
     def can_begin_anew(self) -> bool:
         """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
         with self._changed:
-            return any(arrival.fetched.packet.is_keyframe for arrival in self._waiting)
+            return any(arrival.packet.is_keyframe for arrival in self._waiting)
 
     def cancel(self) -> None:
         """Drop all packets, and let `next` return None from now on."""
@@ -217,7 +196,7 @@ class Arrivals:
                 fetched = self._fetch()
                 if fetched is None:
                     break
-                self._put(fetched, asked_s, self._clock())
+                self._put(fetched._replace(asked_s=asked_s, came_s=self._clock()))
         finally:
             with self._changed:
                 self._is_lost = True
@@ -225,15 +204,15 @@ class Arrivals:
             self._is_unused.wait()
             self._close_stream()
 
-    def _put(self, fetched: Fetched, asked_s: float, t_mono_s: float) -> None:
+    def _put(self, arrival: Fetched) -> None:
         with self._changed:
             if self._waiting_bytes > _WAITING_BYTES or len(self._waiting) > _WAITING_PACKETS:
                 self._clear()
                 self._has_gap = True
-            if self._is_lost or (self._has_gap and not fetched.packet.is_keyframe):
+            if self._is_lost or (self._has_gap and not arrival.packet.is_keyframe):
                 return
-            self._waiting.append(Arrival(fetched, asked_s, t_mono_s, self._has_gap))
-            self._waiting_bytes += fetched.packet.size
+            self._waiting.append(arrival._replace(is_after_gap=self._has_gap))
+            self._waiting_bytes += arrival.packet.size
             self._has_gap = False
             self._changed.notify_all()
 

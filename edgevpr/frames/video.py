@@ -61,10 +61,9 @@ class VideoSource(RecordingSource):
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track
         self._whole = whole = _open_video(path, "a video file or a folder of images")
         stream = whole.stream
-        self._unit_s, self._first_stamp = float(whole.time_base), stream.start_time or 0
+        self._first_stamp = stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
-        self._is_stamped = whole.is_stamped
-        lasts_s = stream.duration * self._unit_s if stream.duration else (whole.container.duration or 0) / 1e6
+        lasts_s = stream.duration * whole.unit_s if stream.duration else (whole.container.duration or 0) / 1e6
         stated_s = lasts_s if whole.is_stamped else 0.0
         frames = stream.frames or stated_s / self._frame_s
         self._promised_s = max(stated_s, stream.frames * self._frame_s)  # a cut AVI file has only this right
@@ -74,7 +73,7 @@ class VideoSource(RecordingSource):
         self._ready: deque[VideoFrame] = deque()
         self._index, self._damaged = -1, 0
         self._t_s = -self._frame_s
-        self._t_due_s = self._heard_s = 0.0
+        self._t_due_s = self._read_s = 0.0
 
     def read(self, timeout_s: float) -> Frame | None:
         deadline_s = self._clock() + timeout_s
@@ -82,7 +81,7 @@ class VideoSource(RecordingSource):
             if not self._ready:
                 self._decode_more()
             elif self._damaged:
-                self._tell_damaged()
+                self._report_damage()
             elif self._advance(picture := self._ready.popleft()):
                 self._t_due_s = self._t_s + self._step_s
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
@@ -104,7 +103,7 @@ class VideoSource(RecordingSource):
             self._finish()
             return
         if fetched.packet.pts is not None:
-            self._heard_s = max(self._heard_s, (fetched.packet.pts - self._first_stamp) * self._unit_s)
+            self._read_s = max(self._read_s, (fetched.packet.pts - self._first_stamp) * self._whole.unit_s)
         pictures = self._whole.decode(fetched)
         if isinstance(pictures, Refusal):
             self._damaged += 1
@@ -114,16 +113,16 @@ class VideoSource(RecordingSource):
     def _advance(self, picture: "VideoFrame") -> bool:
         """Set index and video time to those of `picture`, the next one decoded; return True if it should be given."""
         self._index += 1
-        stamp_s = ((picture.pts or 0) - self._first_stamp) * self._unit_s
+        stamp_s = ((picture.pts or 0) - self._first_stamp) * self._whole.unit_s
         # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
 
-    def _tell_damaged(self, until: str = "") -> None:
+    def _report_damage(self, until: str = "") -> None:
         count, first, t_s = self._damaged, self._index + 1, self._t_s + self._frame_s
         self.refused[Refusal.DAMAGED.value] += count
         self._damaged, self._index = 0, self._index + count
-        self._t_s += 0.0 if self._is_stamped else count * self._frame_s
+        self._t_s += 0.0 if self._whole.is_stamped else count * self._frame_s
         which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
             f"{self._path}: {which} cannot be used, being damaged or built on damage{until}: copy the video again.",
@@ -132,12 +131,12 @@ class VideoSource(RecordingSource):
 
     def _finish(self) -> None:
         if self._damaged:
-            self._tell_damaged(until=", to the end of the file, which may be cut short")
+            self._report_damage(until=", to the end of the file, which may be cut short")
         self.end()
-        seen_s = self._heard_s + self._frame_s
-        if self._promised_s - seen_s > _CUT_S:
+        missing_s = self._promised_s - self._read_s - self._frame_s
+        if missing_s > _CUT_S:
             raise ImageError(
-                f"{self._path} ends after {seen_s:.1f} s of {self._promised_s:.1f} s: it is cut short: copy the "
-                "video again.",
-                round((self._promised_s - seen_s) / self._frame_s),
+                f"{self._path} ends after {self._promised_s - missing_s:.1f} s of {self._promised_s:.1f} s: it is cut "
+                "short: copy the video again.",
+                round(missing_s / self._frame_s),
             )

@@ -1,11 +1,12 @@
 """Pictures over HTTP that FFmpeg does not read as a stream: an address of one picture, requested again and again
-(`Snapshots`), and a multipart stream whose parts are not called image/jpeg (`PartsFile`)."""
+(`Snapshots`), and a multipart stream whose parts may be of any image type (`AnswerFile`)."""
 
 import http.client
+import re
 import ssl
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from urllib.parse import unquote, urlsplit
 
@@ -16,6 +17,7 @@ from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
 
 _MAX_BYTES = 64_000_000  # of one picture
+_MAX_PART_S = 15.0  # for one picture of a multipart stream: a sender that trickles must not hold a thread for ever
 _CHUNK_BYTES = 65536
 _MAX_PERIOD_S = 1.0  # from one request for a picture to the next
 _JPEG_START = b"\xff\xd8"
@@ -23,53 +25,36 @@ _JPEG_END = b"\xff\xd9"
 _FAILURES = (OSError, http.client.HTTPException, ValueError)
 
 
-class Request:
-    """The answer to a request for `uri`, http or https. `timeout_s` limits each wait, and each `take`."""
+def request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
+    """Return the answer to a request for `uri`, http or https, that may hold user and password. `timeout_s` limits each
+    wait. Raises one of `_FAILURES`."""
+    parts = urlsplit(uri)
+    account, _, host = parts.netloc.rpartition("@")
+    address = parts._replace(netloc=host).geturl()
+    user, _, password = account.partition(":")
+    passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+    passwords.add_password(None, address, unquote(user), unquote(password))
+    context = ssl.create_default_context()
+    context.check_hostname = False  # cameras sign their certificates themselves; FFmpeg does not check them either
+    context.verify_mode = ssl.CERT_NONE
+    opener = urllib.request.build_opener(
+        urllib.request.ProxyHandler({}),
+        urllib.request.HTTPSHandler(context=context),
+        urllib.request.HTTPDigestAuthHandler(passwords),
+        urllib.request.HTTPBasicAuthHandler(passwords),
+    )
+    answer: http.client.HTTPResponse = opener.open(address, timeout=timeout_s)
+    return answer
 
-    def __init__(self, uri: str, timeout_s: float) -> None:
-        parts = urlsplit(uri)
-        account, _, host = parts.netloc.rpartition("@")
-        address = parts._replace(netloc=host).geturl()
-        user, _, password = account.partition(":")
-        passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
-        passwords.add_password(None, address, unquote(user), unquote(password))
-        context = ssl.create_default_context()
-        context.check_hostname = False  # cameras sign their certificates themselves; FFmpeg does not check them either
-        context.verify_mode = ssl.CERT_NONE
-        opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}),
-            urllib.request.HTTPSHandler(context=context),
-            urllib.request.HTTPDigestAuthHandler(passwords),
-            urllib.request.HTTPBasicAuthHandler(passwords),
-        )
-        self._timeout_s, self._buffer = timeout_s, bytearray()
-        self._answer: http.client.HTTPResponse = opener.open(address, timeout=timeout_s)
-        self.headers = self._answer.headers
 
-    def read(self, size: int = -1) -> bytes:
-        """Return the next bytes, at most `size`; none if the connection is lost."""
-        with suppress(*_FAILURES):
-            return self.take(lambda seen: min(size, len(seen)))
-        return b""
-
-    def take(self, find_end: Callable[[bytearray], int] | None = None) -> bytes:
-        """Read as many bytes of those that have come as `find_end` says (0: more are needed), or all. Raises OSError if
-        the answer ends before, and if that is too much or takes too long."""
-        end_s = time.monotonic() + self._timeout_s
-        while not (count := find_end(self._buffer) if find_end else 0):
-            chunk = self._answer.read1(_CHUNK_BYTES)
-            self._buffer += chunk
-            if not chunk and not find_end:
-                return bytes(self._buffer)
-            if not chunk or len(self._buffer) > _MAX_BYTES or time.monotonic() > end_s:
-                raise OSError("the answer is cut short, too large or too slow")
-        data = bytes(self._buffer[:count])
-        del self._buffer[:count]
-        return data
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._answer.close()
+def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
+    """Request `uri`; None if that fails, for a cause that FFmpeg can find. Raises OpeningError if nothing answers."""
+    try:
+        return request(uri, timeout_s)
+    except _FAILURES as error:
+        if isinstance(getattr(error, "reason", error), TimeoutError):
+            raise OpeningError(f"no answer within {timeout_s:g} s") from None
+    return None
 
 
 class Snapshots:
@@ -88,10 +73,9 @@ class Snapshots:
         before_s, self._asked_s = self._asked_s, self._clock()
         self._due_s = self._asked_s + self._period_s
         try:
-            request = Request(self._uri, self._timeout_s)
-            data = request.take(None)
+            with request(self._uri, self._timeout_s) as answer:
+                data = answer.read(_MAX_BYTES)
             answered_s = self._clock()
-            request.close()
             image = decode_image(data, "the snapshot", self._depth)
         except ImageError:
             return Refusal.DAMAGED
@@ -111,53 +95,55 @@ class Snapshots:
         """Do nothing: no connection is open between two requests."""
 
 
-class PartsFile:
-    """A file of a multipart stream that FFmpeg can read: each part of `request` becomes an image/jpeg."""
+class AnswerFile:
+    """A file of what comes in the `answer` to a request, without waiting for more than that, and for `is_multipart` as
+    FFmpeg can read it: each part an image/jpeg. It ends if the connection is lost."""
 
-    def __init__(self, request: Request) -> None:
-        self._request, self._unread = request, b""
-        self._boundary = (request.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace")
+    def __init__(self, answer: http.client.HTTPResponse, is_multipart: bool) -> None:
+        self._pieces, self._unread = (_read_parts if is_multipart else _read_chunks)(answer), b""
+        self.close = answer.close
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next bytes, at most `size`; none if the stream is lost."""
-        try:
-            while not self._unread:
-                self._unread = self._next_part()
-        except _FAILURES:
-            return b""
+        """Return the next bytes, at most `size`."""
+        self._unread = self._unread or next(self._pieces, b"")
         data, self._unread = self._unread[:size], self._unread[size:]
         return data
 
-    def _next_part(self) -> bytes:
-        self._request.take(lambda seen: seen.find(b"\n", at) + 1 if (at := seen.find(self._boundary)) >= 0 else 0)
-        length = 0
-        while line := self._request.take(lambda seen: seen.find(b"\n") + 1).strip():
-            name, _, value = line.partition(b":")
-            if name.strip().lower() == b"content-length":
-                length = max(0, int(value))
-        data = self._request.take(lambda seen: length * (len(seen) >= length) if length else self._find_end(seen))
-        if not data.startswith(_JPEG_START):
-            try:
-                data = as_jpeg(decode_image(data, "the part"))
-            except ImageError:
-                return b""
-        return b"--part\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(data), data)
 
-    def _find_end(self, seen: bytearray) -> int:
-        """Return the number of bytes of a picture without a stated length, 0 if its end has not come. A JPEG ends with
-        its end mark. FFmpeg waits for the next part instead, which makes each picture a whole period older."""
-        end = 0
-        while seen.startswith(_JPEG_START) and (end := seen.find(_JPEG_END, end) + 2) >= 2:
-            if jpeg_is_whole(bytes(seen[:end])):
-                return end
-        return max(0, seen.find(b"\n--" + self._boundary))
+def _read_chunks(answer: http.client.HTTPResponse) -> Iterator[bytes]:
+    with suppress(*_FAILURES):
+        while chunk := answer.read1(_CHUNK_BYTES):
+            yield chunk
 
 
-def open_request(uri: str, timeout_s: float) -> Request | None:
-    """Request `uri`; None if that fails, for a cause that FFmpeg can find. Raises OpeningError if nothing answers."""
-    try:
-        return Request(uri, timeout_s)
-    except _FAILURES as error:
-        if isinstance(getattr(error, "reason", error), TimeoutError):
-            raise OpeningError(f"no answer within {timeout_s:g} s") from None
-    return None
+def _read_parts(answer: http.client.HTTPResponse) -> Iterator[bytes]:
+    boundary = re.escape((answer.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
+    head = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
+    seen, whole_s = bytearray(), time.monotonic()
+    for chunk in _read_chunks(answer):
+        seen += chunk
+        while (part := head.search(seen)) and (end := _find_end(seen, part, boundary)):
+            data = bytes(seen[part.end() : end])
+            del seen[:end]
+            whole_s = time.monotonic()
+            with suppress(ImageError):
+                jpeg = data if data.startswith(_JPEG_START) else as_jpeg(decode_image(data, "the part"))
+                yield b"--part\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(jpeg), jpeg)
+        if len(seen) > _MAX_BYTES or time.monotonic() > whole_s + _MAX_PART_S:
+            return
+
+
+def _find_end(seen: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
+    """Return where the picture ends that begins after the head of a `part`, 0 if its end has not come. If its length is
+    not stated, a JPEG ends with its end mark. FFmpeg waits for the next part instead, which makes each picture a whole
+    period older."""
+    start = part.end()
+    if length := re.search(rb"(?im)^content-length:\s*(\d+)", part[1]):
+        end = start + int(length[1])
+        return end if end <= len(seen) else 0
+    end = start
+    while seen.startswith(_JPEG_START, start) and (end := seen.find(_JPEG_END, end) + 2) >= 2:
+        if jpeg_is_whole(bytes(seen[start:end])):
+            return end
+    next_part = re.search(rb"\r?\n--" + boundary, seen[start:])
+    return start + next_part.start() if next_part else 0

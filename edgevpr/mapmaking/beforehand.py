@@ -16,10 +16,10 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import at_work
-from edgevpr.frames.exif import fov_deg_of, is_at_zero, read_exif, read_xmp
+from edgevpr.frames.exif import fov_deg_of, read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
-from edgevpr.frames.positions import count_at_zero, find_positions, find_track, read_positions
+from edgevpr.frames.positions import find_positions, find_track, read_positions
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
 from edgevpr.runtime.recognise.evidence import FEWEST_PLACES
@@ -48,16 +48,9 @@ def say_what_will_lack(uri: str, positions: Path | None, rate_hz: float | None, 
         tags = read_positions(table) if table else {}
         some = [path for run in _runs(list_images(uri)) for path in run]
         is_placed = any((tags.get(path.name) or read_exif(path)).position for path in some)
-        if not table and (blank := sum(map(is_at_zero, some))):
-            text = "%s: of %d pictures looked at, %d say 0, 0, as of a camera without a fix: that counts as no position"
-            _log.warning(text, uri, len(some), blank)
     elif not rate_hz and total > _MANY_HZ * (lasts_s := _film(uri).total):
         text = "every frame of %s becomes a place, %d in %d s: --rate-hz 1 makes %d"
         _log.warning(text, uri, total, lasts_s, lasts_s)
-    if table and (at_zero := count_at_zero(table)):
-        _log.warning(
-            "%s: %d lines are at 0, 0, as of a logger without a fix: they count as no position", table, at_zero
-        )
     if not is_placed:
         _log.warning(
             "no position was found, and without one no fix can be sent: run edgevpr positions %s --images %s",

@@ -4,7 +4,7 @@ import photographs
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.frames.exif import fov_deg_of, is_at_zero, read_exif
+from edgevpr.frames.exif import fov_deg_of, read_exif
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 
@@ -13,9 +13,8 @@ pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillo
 LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT, TIME, STATUS = 1, 2, 3, 4, 5, 6, 7, 9
 DIRECTION_REF, DIRECTION, DATE = 16, 17, 29
 GPS = {LAT_REF: "N", LAT: (46.0, 50.0, 33.0), LON_REF: "W", LON: (91.0, 59.0, 42.0)}
-POSITION = Position(46.8425, -91.995, None)
-NO_FIX = {LAT: (0.0, 0.0, 0.0), LON: (0.0, 0.0, 0.0)}  # as a receiver writes it that knows no position
 TAKEN, ZONE = 0x9003, 0x9011
+T_UTC_S = 1466699519  # date -u -d '2016-06-23 16:31:59' +%s
 
 
 def tag_of(path, gps=None, **tags):
@@ -23,25 +22,23 @@ def tag_of(path, gps=None, **tags):
     return read_exif(path / "photo.jpg")
 
 
-def test_a_photograph_with_everything(tmp_path):
+def test_read_exif_of_a_photograph_with_everything(tmp_path):
     gps = GPS | {ALT_REF: b"\x00", ALT: 198.5, TIME: (16.0, 31.0, 59.5), DATE: "2016:06:23"}
     tag = tag_of(tmp_path, gps | {DIRECTION_REF: "T", DIRECTION: 123.25})
     assert tag.position.lat_deg == pytest.approx(46.8425, abs=1e-9)
     assert tag.position.lon_deg == pytest.approx(-91.995, abs=1e-9)
-    assert tag.position.alt_m == 198.5
-    assert tag.heading_deg == 123.25
-    assert tag.t_utc_s == 1466699519.5  # date -u -d '2016-06-23 16:31:59' +%s
+    assert (tag.position.alt_m, tag.heading_deg, tag.t_utc_s) == (198.5, 123.25, T_UTC_S + 0.5)
 
 
-def test_a_height_above_the_ellipsoid_and_a_magnetic_heading_are_not_taken_for_what_they_are_not(tmp_path):
-    assert tag_of(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == POSITION
+def test_read_exif_ignores_a_height_above_the_ellipsoid_and_a_magnetic_heading(tmp_path):
+    assert tag_of(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == Position(46.8425, -91.995, None)
     assert tag_of(tmp_path, {DIRECTION_REF: "M", DIRECTION: 10.0}).heading_deg is None
 
 
 @pytest.mark.parametrize(
     "gps",
     [
-        NO_FIX,
+        {LAT: (0.0, 0.0, 0.0), LON: (0.0, 0.0, 0.0)},  # as a receiver writes it that knows no position
         {STATUS: "V"},  # the receiver itself says that the position is void
         {LAT: (96.0, 0.0, 0.0)},
         {LAT: (46.0, 99.0, 33.0)},
@@ -51,54 +48,41 @@ def test_a_height_above_the_ellipsoid_and_a_magnetic_heading_are_not_taken_for_w
         {LAT: (46.0, 50.0)},
     ],
 )
-def test_a_senseless_position_is_no_position(gps, tmp_path):
-    assert tag_of(tmp_path, GPS).position == POSITION
+def test_read_exif_takes_a_senseless_position_for_none(gps, tmp_path):
     assert tag_of(tmp_path, GPS | gps).position is None
-    assert is_at_zero(tmp_path / "photo.jpg") == (gps == NO_FIX)
 
 
-def test_the_camera_clock_counts_where_the_receiver_gives_no_time(tmp_path):
-    assert tag_of(tmp_path, camera={TAKEN: "2016:06:23 16:31:59"}).t_utc_s == 1466699519
-    assert tag_of(tmp_path, camera={TAKEN: "2016:06:23 18:31:59", ZONE: "+02:00"}).t_utc_s == 1466699519
-    assert tag_of(tmp_path, camera={TAKEN: "0000:00:00 00:00:00"}).t_utc_s is None
+@pytest.mark.parametrize(
+    ("gps", "camera", "t_utc_s"),
+    [
+        (None, {TAKEN: "2016:06:23 16:31:59"}, T_UTC_S),  # the receiver gives no time
+        (None, {TAKEN: "2016:06:23 18:31:59", ZONE: "+02:00"}, T_UTC_S),
+        (None, {TAKEN: "0000:00:00 00:00:00"}, None),
+        ({TIME: (4294967295.0, 31.0, 59.5), DATE: "2016:06:23"}, None, None),
+        ({TIME: (16.0, 31.0, 59.5), DATE: "1e308"}, None, None),
+        (None, {TAKEN: "1e308"}, None),
+        (None, {TAKEN: "9999:12:31 23:59:59"}, None),
+        (None, {TAKEN: "    :  :     :  :  "}, None),
+    ],
+)
+def test_read_exif_time(gps, camera, t_utc_s, tmp_path):
+    assert tag_of(tmp_path, gps, camera=camera).t_utc_s == t_utc_s
 
 
-def test_a_photograph_lying_on_its_side_is_set_upright(tmp_path):
+def test_photograph_lying_on_its_side_is_set_upright(tmp_path):
     photographs.write_jpeg(tmp_path / "lying.jpg", image={0x0112: 6})
-    photographs.write_jpeg(tmp_path / "upright.jpg")
-    assert read_image(tmp_path / "upright.jpg").shape == (48, 64, 3)
     assert read_image(tmp_path / "lying.jpg").shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"rubbish", b"II*\x00", b"MM\x00*\xff\xff\xff\xff", b"II*\x00\x08\x00\x00\x00" * 9]
 )
-def test_rubbish_in_place_of_exif_is_no_tag_at_all(content, tmp_path, capfd):
+def test_read_exif_of_rubbish_or_nothing_is_no_tag(content, tmp_path, capfd):
     path = tmp_path / "rubbish.jpg"
     path.write_bytes(photographs.with_app1(photographs.encoded(".jpg", photographs.picture()), content))
-    assert read_exif(path) == GeoTag()
+    assert read_exif(path) == read_exif(tmp_path / "missing.jpg") == GeoTag()
     assert read_image(path).shape == (48, 64, 3)
     assert capfd.readouterr().err == ""
-
-
-def test_a_file_that_is_missing_or_no_image_has_no_tag(tmp_path, capfd):
-    (tmp_path / "text.jpg").write_text("no image")
-    assert read_exif(tmp_path / "text.jpg") == read_exif(tmp_path / "missing.jpg") == GeoTag()
-    assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("gps", "taken"),
-    [
-        ({TIME: (4294967295.0, 31.0, 59.5), DATE: "2016:06:23"}, None),
-        ({TIME: (16.0, 31.0, 59.5), DATE: "1e308"}, None),
-        (None, "1e308"),
-        (None, "9999:12:31 23:59:59"),
-        (None, "    :  :     :  :  "),
-    ],
-)
-def test_a_time_that_cannot_be_is_unknown(gps, taken, tmp_path):
-    assert tag_of(tmp_path, gps, camera=taken and {TAKEN: taken}).t_utc_s is None
 
 
 @pytest.mark.parametrize(
@@ -111,7 +95,7 @@ def test_a_time_that_cannot_be_is_unknown(gps, taken, tmp_path):
         (24, (), None),
     ],
 )
-def test_the_field_of_view_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_deg, tmp_path):
+def test_fov_deg_of_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_deg, tmp_path):
     size = dict(zip((0xA002, 0xA003), sides, strict=False))
     photographs.write_jpeg(tmp_path / "photo.jpg", camera={0xA405: focal_mm, **size})
     assert fov_deg_of(tmp_path / "photo.jpg") == (None if fov_deg is None else pytest.approx(fov_deg, abs=0.1))

@@ -2,16 +2,14 @@
 repeated. And slow cameras, which are none of these."""
 
 import io
-import socket
-import threading
 import time
 from contextlib import suppress
 from fractions import Fraction
 
 import av
-import cv2
 import numpy as np
 import pytest
+from answering_cameras import Server, multipart
 from live_sources import wait_for
 
 from edgevpr.frames.shot import Condition
@@ -20,46 +18,28 @@ from edgevpr.frames.source import open_source
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 SIZE_PX = 160, 120
-HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"
-
-
-class Server:
-    """Serves each viewer by `feed`, which is given its file and its number (0, 1, ...)."""
-
-    def __init__(self, feed):
-        self._feed, self.viewers = feed, 0
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.port = self._server.getsockname()[1]
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def _serve(self):
-        with suppress(OSError):
-            while True:
-                viewer, _ = self._server.accept()
-                threading.Thread(target=self._run, args=(viewer, self.viewers), daemon=True).start()
-                self.viewers += 1
-
-    def _run(self, viewer, number):
-        with viewer, suppress(OSError, av.FFmpegError), viewer.makefile("wb", 0) as file:
-            self._feed(file, number)
-
-    def close(self):
-        self._server.close()
 
 
 @pytest.fixture
 def served():
-    """Open a source of what `feed` serves; returns it and the server."""
-    opened = []
+    """Open a source of what `feed(number of the viewer)` answers to each viewer; returns it and the list of viewers."""
+    to_close = []
 
     def serve(feed, address):
-        server = Server(feed)
-        source = open_source(address.format(server.port), live=True)
-        opened.extend((source, server))
-        return source, server
+        viewers = []
+
+        def answer(connection, asked):
+            viewers.append(connection)
+            with suppress(av.FFmpegError):  # the viewer has gone
+                feed(len(viewers) - 1)(connection, asked)
+
+        server = Server(answer)
+        source = open_source(address.format(server.address), live=True)
+        to_close.extend((source, server))
+        return source, viewers
 
     yield serve
-    for each in opened:
+    for each in to_close:
         each.close()
 
 
@@ -70,23 +50,22 @@ def picture(number):
 class Out(io.RawIOBase):
     """What a muxer writes goes to the viewer at once."""
 
-    def __init__(self, file):
-        self._file = file
+    def __init__(self, connection):
+        self._connection = connection
 
     def writable(self):
         return True
 
     def write(self, data):
-        self._file.write(bytes(data))
+        self._connection.sendall(bytes(data))
         return len(data)
 
 
-def transport_stream(file, codec="mpeg2video", rate_hz=Fraction(20), options=()):
+def transport_stream(connection, codec="mpeg2video", rate_hz=20, **options):
     """A muxer of MPEG-TS to a viewer, and its stream of pictures."""
-    box = av.open(
-        Out(file), "w", format="mpegts", container_options={"max_interleave_delta": "1", "flush_packets": "1"}
-    )
-    stream = box.add_stream(codec, rate=rate_hz, options=dict(options))
+    at_once = {"max_interleave_delta": "1", "flush_packets": "1"}
+    box = av.open(Out(connection), "w", format="mpegts", container_options=at_once)
+    stream = box.add_stream(codec, rate=Fraction(rate_hz), options=options)
     stream.width, stream.height, stream.pix_fmt = *SIZE_PX, "yuv420p"
     stream.codec_context.gop_size = 5
     return box, stream
@@ -99,8 +78,8 @@ def send(box, stream, number):
         box.mux(packet)
 
 
-def pictures_then_sound(file, _):
-    box, stream = transport_stream(file)
+def pictures_then_sound(connection, _):
+    box, stream = transport_stream(connection)
     sound = box.add_stream("mp2", rate=16000)
     sound.layout = "mono"
     for number in range(10**6):
@@ -113,57 +92,40 @@ def pictures_then_sound(file, _):
         time.sleep(0.05)
 
 
-def two_codecs(file, viewer):
-    """The first viewer sees the codec change: from then on no packet is of the stream that it has opened."""
-    codecs = ("mpeg2video", "libx264") if viewer == 0 else ("libx264",)
-    for codec in codecs:
-        box, stream = transport_stream(
-            file, codec, options={"tune": "zerolatency"}.items() if codec != "mpeg2video" else ()
-        )
-        for number in range(60 if codec == codecs[0] and viewer == 0 else 10**6):
-            send(box, stream, number)
-            time.sleep(0.05)
+def one_codec(connection, _):
+    box, stream = transport_stream(connection, "libx264", tune="zerolatency")
+    for number in range(10**6):
+        send(box, stream, number)
+        time.sleep(0.05)
 
 
-def mjpeg(file, numbers, every_s=0.05):
-    """Pictures of these numbers, over HTTP."""
-    file.write(HEAD)
-    for number in numbers:
-        jpeg = cv2.imencode(".jpg", picture(number))[1].tobytes()
-        file.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%s\r\n" % (len(jpeg), jpeg))
-        time.sleep(every_s)
+def two_codecs(connection, _):
+    """The codec changes: from then on no packet is of the stream that the viewer has opened."""
+    box, stream = transport_stream(connection)
+    for number in range(60):
+        send(box, stream, number)
+        time.sleep(0.05)
+    one_codec(connection, _)
 
 
-@pytest.mark.parametrize("feed", [pictures_then_sound, two_codecs])
-def test_a_stream_whose_pictures_end_is_lost_and_opened_again(served, feed):
-    source, server = served(feed, "tcp://127.0.0.1:{}")
+@pytest.mark.parametrize("feed", [lambda _: pictures_then_sound, lambda viewer: one_codec if viewer else two_codecs])
+def test_stream_whose_pictures_end_is_lost_and_opened_again(served, feed):
+    source, viewers = served(feed, "tcp://{}")
     wait_for(lambda: source.read(0.1))
     wait_for(lambda: source.read(0.1) is None and source.condition in (Condition.LOST, Condition.DAMAGED))
     assert source.latency_s > 2.0, "the age of the newest picture grows"
-    wait_for(lambda: server.viewers >= 2 and source.read(0.1))
+    wait_for(lambda: len(viewers) >= 2 and source.read(0.1))
     assert source.condition is Condition.RUNNING
 
 
-def test_a_picture_that_is_repeated_until_the_viewer_comes_again_is_left(served):
-    def feed(file, viewer):
-        began = 1000 * viewer
-        mjpeg(file, (began + min(number, 40) for number in range(10**6)))
+def test_picture_that_stays_for_every_viewer_is_never_a_frame_again(served):
+    def feed(viewer):
+        return multipart(numbers=(5 if viewer else min(number, 5) for number in range(10**6)), every_s=0.05)
 
-    source, server = served(feed, "http://127.0.0.1:{}/")
+    source, viewers = served(feed, "http://{}/")
     wait_for(lambda: source.read(0.1))
     wait_for(lambda: source.read(0.1) is None and source.condition is Condition.FROZEN)
-    assert server.viewers == 1
-    wait_for(lambda: server.viewers == 2 and source.read(0.1))
-
-
-def test_a_picture_that_stays_for_every_viewer_is_never_a_frame_again(served):
-    def feed(file, viewer):
-        mjpeg(file, (5 if viewer else min(number, 5) for number in range(10**6)))
-
-    source, server = served(feed, "http://127.0.0.1:{}/")
-    wait_for(lambda: source.read(0.1))
-    wait_for(lambda: source.read(0.1) is None and source.condition is Condition.FROZEN)
-    while server.viewers < 2:
+    while len(viewers) < 2:
         assert source.read(0.1) is None
     frozen = source.refused["frozen"]
     while source.refused["frozen"] < frozen + 20:
@@ -171,23 +133,20 @@ def test_a_picture_that_stays_for_every_viewer_is_never_a_frame_again(served):
     assert source.condition is Condition.FROZEN
 
 
-@pytest.mark.parametrize("every_s", [2.0, 4.0])
-def test_a_slow_camera_is_not_lost(served, every_s):
-    source, server = served(lambda file, _: mjpeg(file, range(10**6), every_s), "http://127.0.0.1:{}/")
+def slow_stream(connection, _):
+    box, stream = transport_stream(connection, rate_hz=1)
+    for number in range(10**6):
+        send(box, stream, number)
+        time.sleep(1.0)
+
+
+@pytest.mark.parametrize(
+    ("feed", "address"),
+    [(lambda _: multipart(every_s=4.0), "http://{}/"), (lambda _: slow_stream, "tcp://{}")],
+)
+def test_slow_camera_is_not_lost(served, feed, address):
+    source, viewers = served(feed, address)
     for _ in range(3):
         wait_for(lambda: source.read(0.1))
         assert source.condition is Condition.RUNNING
-    assert server.viewers == 1
-
-
-def test_a_slow_stream_with_stamps_is_not_lost(served):
-    def feed(file, _):
-        box, stream = transport_stream(file, rate_hz=Fraction(1))
-        for number in range(10**6):
-            send(box, stream, number)
-            time.sleep(1.0)
-
-    source, server = served(feed, "tcp://127.0.0.1:{}")
-    for _ in range(3):
-        wait_for(lambda: source.read(0.1))
-    assert (server.viewers, source.condition) == (1, Condition.RUNNING)
+    assert len(viewers) == 1
