@@ -2,6 +2,7 @@
 a capture, or `main`: the main thread hangs, with its first query. MARK is a file that is made when it does."""
 
 import ctypes
+import itertools
 import sys
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from edgevpr.runtime.flight.flight import Flight
 _STEP = sys.argv[1]
 _MARK = Path(sys.argv[2])
 _PICTURES = 5
+_SEEDS = itertools.count()  # of all openings: pictures that repeat would count as patched
 
 
 def hang() -> None:
@@ -39,7 +41,7 @@ class HangingCapture:
         self._number += 1
         if self._number > _PICTURES and _STEP in ("read", "release"):
             return hang() if _STEP == "read" else None
-        picture = textured(self._number, 240, 320)
+        picture = textured(next(_SEEDS), 240, 320)
         return Shot(t_mono_s=time.monotonic(), look=picture[::4, ::4], pixels=lambda: self._pixels(picture))
 
     def _pixels(self, picture):

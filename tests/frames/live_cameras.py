@@ -7,7 +7,6 @@ from pathlib import Path
 import imageio_ffmpeg
 from rtsp_camera import RtspCamera, free_port
 
-KINDS = ("udp", "tcp", "http", "rtsp")
 WIDTH, HEIGHT = 160, 120
 
 

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("imageio_ffmpeg", reason="the cameras need ffmpeg (pip install imageio-ffmpeg)")
 
 import damaged_streams
-import numbered_pictures
 
 from edgevpr.frames import streams
 
@@ -37,15 +36,8 @@ def rows():
         return {row.stream: row for (row,) in found}
 
 
-def test_the_time_can_be_read_from_every_band_of_a_picture():
-    patched = numbered_pictures.picture(700)
-    patched[128:] = numbered_pictures.picture(650)[128:]
-    patched[8:16, :160] = 0
-    assert numbered_pictures.numbers_in(patched) == [None, *[700] * 7, *[650] * 7]
-
-
 @pytest.mark.parametrize("stream", WHOLE)
-def test_a_whole_stream_loses_nothing(stream, rows):
+def test_whole_stream_loses_nothing(stream, rows):
     whole = rows[stream]
     late = whole.refused["late"]  # those that waited for the opening, and what a busy machine is too slow for
     assert (whole.old, whole.broken) == (0, 0)
@@ -69,14 +61,14 @@ def test_pictures_whose_bytes_are_corrupted_are_never_old(rows):
 
 
 @pytest.mark.parametrize("stream", LOSSY)
-def test_of_a_stream_that_loses_packets_nothing_old_or_broken_is_delivered(stream, rows):
+def test_stream_that_loses_packets_gives_nothing_old_or_broken(stream, rows):
     lossy = rows[stream]
     assert (lossy.old, lossy.broken) == (0, 0)
     assert lossy.delivered < lossy.sent
     assert sum(lossy.refused.values()) > PICTURES / 10
 
 
-def test_where_decoding_is_too_slow_for_a_stream_pictures_are_left_out_and_none_is_old():
+def test_stream_decoded_too_slowly_leaves_pictures_out_and_none_is_old():
     """Each takes twice as long as the stream has for it: one would be 1.5 s behind after 3 s."""
     (slow,) = damaged_streams.run(80, 1, only="MJPEG over HTTP, whole, decoded too slowly".__eq__, rate_hz=RATE_HZ)
     assert (slow.old, slow.broken) == (0, 0)

@@ -3,10 +3,7 @@
 import contextlib
 import os
 import random
-import resource
 import struct
-import subprocess
-import sys
 import zlib
 
 import cv2
@@ -42,7 +39,7 @@ def complaint(path):
 
 
 @pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"])
-def test_a_colour_image_of_each_format_is_read_as_bgr(extension, tmp_path):
+def test_read_image_gives_bgr_of_each_format(extension, tmp_path):
     blue = np.zeros((20, 30, 3), np.uint8)
     blue[..., 0] = 200
     image = read_image(write(tmp_path / f"blue{extension}", photographs.encoded(extension, blue)))
@@ -52,41 +49,41 @@ def test_a_colour_image_of_each_format_is_read_as_bgr(extension, tmp_path):
 
 
 @pytest.mark.parametrize("kind", JPEGS)
-def test_a_whole_jpeg_is_read_also_with_bytes_behind_its_end(kind, tmp_path):
+def test_read_image_allows_bytes_behind_the_end_of_a_jpeg(kind, tmp_path):
     whole = read_image(write(tmp_path / "a.jpg", JPEGS[kind]))
     with_more = read_image(write(tmp_path / "b.jpg", JPEGS[kind] + bytes(100) + THUMBNAIL[:50]))
     np.testing.assert_array_equal(whole, with_more)
 
 
-@pytest.mark.parametrize("kind", JPEGS)
-@pytest.mark.parametrize("share", [0.05, 0.5, 0.99, 1.0])
-def test_a_truncated_jpeg_is_refused(kind, share, tmp_path, capfd):
-    cut = JPEGS[kind][: int(share * len(JPEGS[kind])) - 1]
-    assert "cut short" in complaint(write(tmp_path / "cut.jpg", cut))
+WHOLE = [(".jpg", data) for data in JPEGS.values()] + [
+    (extension, photographs.encoded(extension, photographs.picture()))
+    for extension in (".png", ".tif", ".bmp", ".webp", ".ppm")
+]
+
+
+@pytest.mark.parametrize(("extension", "whole"), WHOLE)
+def test_read_image_refuses_a_truncated_image(extension, whole, tmp_path, capfd):
+    for share in (0.02, 0.2, 0.5, 0.9, 0.995):
+        sentence = complaint(write(tmp_path / f"cut{extension}", whole[: int(share * len(whole))]))
+        assert "cut short" in sentence or extension not in (".jpg", ".png")
     assert capfd.readouterr().err == ""
 
 
-def test_a_jpeg_that_ends_in_zeros_is_refused(tmp_path):
-    """What a card holds when the power went while the camera was writing."""
-    half = len(JPEGS["baseline"]) // 2
-    assert "cut short" in complaint(write(tmp_path / "zeros.jpg", JPEGS["baseline"][:half] + bytes(half)))
+PNG = dict(WHOLE)[".png"]
+BASELINE = JPEGS["baseline"]
 
 
-@pytest.mark.parametrize("extension", [".png", ".tif", ".bmp", ".webp", ".ppm"])
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9, 0.995])
-def test_a_truncated_image_of_another_format_is_refused(extension, share, tmp_path, capfd):
-    whole = photographs.encoded(extension, photographs.picture())
-    complaint(write(tmp_path / f"cut{extension}", whole[: int(share * len(whole))]))
-    assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("missing", [1, 4, 8, 12, 13])
-def test_a_png_without_its_last_bytes_or_with_a_wrong_bit_is_refused(missing, tmp_path, capfd):
-    png = bytearray(photographs.encoded(".png", photographs.picture()))
-    assert "cut short" in complaint(write(tmp_path / "cut.png", png[:-missing]))
-    png[len(png) // 2] ^= 1
-    assert "damaged" in complaint(write(tmp_path / "bit.png", png))
-    assert capfd.readouterr().err == ""
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        # What a card holds when the power went while the camera was writing.
+        ("zeros.jpg", BASELINE[: len(BASELINE) // 2] + bytes(len(BASELINE) // 2)),
+        ("bit.png", PNG[: len(PNG) // 2] + bytes([PNG[len(PNG) // 2] ^ 1]) + PNG[len(PNG) // 2 + 1 :]),
+        *(("end.png", PNG[:-missing]) for missing in (1, 4, 8, 12, 13)),
+    ],
+)
+def test_read_image_refuses_a_damaged_image(name, content, tmp_path):
+    assert "cut short or damaged" in complaint(write(tmp_path / name, content))
 
 
 @pytest.mark.parametrize(
@@ -101,20 +98,12 @@ def test_a_png_without_its_last_bytes_or_with_a_wrong_bit_is_refused(missing, tm
         ("thin.png", photographs.encoded(".png", np.zeros((40, 15), np.uint8)), "15x40 pixels"),
     ],
 )
-def test_a_file_that_is_no_image_or_another_one_than_is_read_is_refused(name, content, what, tmp_path, capfd):
+def test_read_image_refuses_what_is_no_image_of_8_or_16_bits(name, content, what, tmp_path, capfd):
     assert what in complaint(write(tmp_path / name, content))
     assert capfd.readouterr().err == ""
 
 
-def test_an_image_that_does_not_fit_in_memory_is_refused_like_any_other(tmp_path, monkeypatch):
-    def full(*_):
-        raise MemoryError
-
-    monkeypatch.setattr("edgevpr.frames.images.read_file", full)
-    assert "memory" in complaint(tmp_path / "large.tif")
-
-
-def test_a_missing_image_a_folder_a_pipe_and_a_device_are_refused_and_not_waited_for(tmp_path):
+def test_read_image_refuses_what_is_no_file_and_waits_for_none(tmp_path):
     complaint(tmp_path / "nothing.jpg")
     (tmp_path / "folder.jpg").mkdir()
     assert "a directory" in complaint(tmp_path / "folder.jpg")
@@ -123,42 +112,34 @@ def test_a_missing_image_a_folder_a_pipe_and_a_device_are_refused_and_not_waited
     assert "device" in complaint("/dev/zero")
 
 
-def test_images_are_listed_as_a_person_counts(tmp_path):
+def test_list_images_sorts_as_a_person_counts(tmp_path):
     for name in ("IMG_10.jpg", "IMG_9.JPG", "img_2.Png", "a.tif", "notes.txt", "positions.csv", "._IMG_9.JPG"):
         (tmp_path / name).touch()
     assert [path.name for path in list_images(tmp_path)] == ["a.tif", "img_2.Png", "IMG_9.JPG", "IMG_10.jpg"]
 
 
-def test_a_folder_without_images_is_refused(tmp_path):
+def test_list_images_refuses_a_folder_without_and_names_those_inside(tmp_path):
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(SourceError, match=r"\(\.jpg"):
-        list_images(tmp_path)
     with pytest.raises(SourceError, match="nowhere"):
         list_images(tmp_path / "nowhere")
     with pytest.raises(SourceError, match="listed"):
         list_images(tmp_path / "notes.txt")
-
-
-def test_where_the_images_lie_in_a_folder_inside_that_one_is_named(tmp_path):
-    for name in ("notes", "day_2", "day_10"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "notes" / "._IMG_1.jpg").touch()
-    for name in ("day_10", "day_2"):
-        (tmp_path / name / "IMG_1.jpg").touch()
-    with pytest.raises(SourceError) as refused:
+    for name in ("day_10/IMG_1.jpg", "day_2/IMG_1.jpg", "notes/._IMG_1.jpg"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    with pytest.raises(SourceError, match=r"\(\.jpg") as refused:
         list_images(tmp_path)
     assert str(refused.value).endswith(f" {tmp_path}/day_2 or {tmp_path}/day_10.")
 
 
-def png(width, height, rows=b""):
+def png(width, height):
     """A PNG whose header promises width x height, with every checksum right."""
 
     def chunk(kind, content):
-        checksum = zlib.crc32(kind + content)
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
 def tiff(**tags):
@@ -179,7 +160,7 @@ def tiff(**tags):
         ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100)),
     ],
 )
-def test_a_picture_of_too_many_pixels_is_refused_by_its_header(name, content, tmp_path, capfd):
+def test_read_image_refuses_too_many_pixels_by_the_header(name, content, tmp_path, capfd):
     if name == "wide.jpg":
         at = content.index(b"\xff\xc0") + 5
         content = content[:at] + struct.pack(">HH", 65_000, 65_000) + content[at + 4 :]
@@ -187,24 +168,6 @@ def test_a_picture_of_too_many_pixels_is_refused_by_its_header(name, content, tm
     with pytest.raises(ImageError, match=f"{name}.*102 megapixels"):
         read_image(tmp_path / name)
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.process
-def test_a_small_file_does_not_take_gigabytes(tmp_path):
-    side = 20_000
-    (tmp_path / "bomb.png").write_bytes(png(side, side, bytes(side + 1) * side))
-    assert (tmp_path / "bomb.png").stat().st_size < 1_300_000
-    code = (
-        "import sys\nfrom edgevpr.core.errors import ImageError\nfrom edgevpr.frames.images import read_image\n"
-        "try:\n    read_image(sys.argv[1])\nexcept ImageError as error:\n    print(error)"
-    )
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_AS, (2_000_000_000, 2_000_000_000))
-
-    argv = [sys.executable, "-c", code, tmp_path / "bomb.png"]
-    done = subprocess.run(argv, capture_output=True, text=True, preexec_fn=limit, timeout=60)
-    assert "102 megapixels" in done.stdout, done.stderr
 
 
 def whole_files(folder):
@@ -223,7 +186,7 @@ def whole_files(folder):
 
 
 @pytest.mark.slow
-def test_a_file_with_bytes_gone_wrong_is_read_or_refused_and_its_tags_never_leave_the_earth(tmp_path):
+def test_file_with_bytes_gone_wrong_is_read_or_refused_and_its_tags_never_leave_the_earth(tmp_path):
     chance, path = random.Random(5), tmp_path / "broken.jpg"
     for whole, most in whole_files(tmp_path):
         for _ in range(100):

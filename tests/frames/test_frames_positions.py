@@ -21,22 +21,20 @@ def written(tmp_path):
     return write
 
 
-def test_a_full_row_is_read_and_other_columns_are_ignored(written):
-    tags = read_positions(written(HEADER + FIRST))
-    assert tags == {
-        "0000.jpg": GeoTag(
-            position=Position(46.84260708, -91.99455989, 198.309),
-            heading_deg=46.0,
-            t_utc_s=1466699519.0,
-            height_m=39.8,
-        )
-    }
-
-
 @pytest.mark.parametrize(
     ("text", "tags"),
     [
-        ("file,lat,lon\na.jpg,-54.5,2\n", {"a.jpg": GeoTag(position=Position(-54.5, 2.0))}),
+        (
+            HEADER + FIRST,
+            {
+                "0000.jpg": GeoTag(
+                    position=Position(46.84260708, -91.99455989, 198.309),
+                    heading_deg=46.0,
+                    t_utc_s=1466699519.0,
+                    height_m=39.8,
+                )
+            },
+        ),
         (HEADER + "a.jpg,ref,,,,,,\n", {"a.jpg": GeoTag()}),
         # a receiver without a fix, and one that has it
         ("file,lat,lon\na.jpg,0,0.0\nb.jpg,0,0.1\n", {"a.jpg": GeoTag(), "b.jpg": GeoTag(position=Position(0.0, 0.1))}),
@@ -54,7 +52,7 @@ def test_a_full_row_is_read_and_other_columns_are_ignored(written):
         ),
     ],
 )
-def test_a_table_is_read(text, tags, written):
+def test_read_positions(text, tags, written):
     assert read_positions(written(text, "utf-8-sig")) == tags
 
 
@@ -70,7 +68,7 @@ def test_a_table_is_read(text, tags, written):
         "1466699519.0",
     ],
 )
-def test_a_time_is_understood_in_each_of_its_forms(text):
+def test_parse_time(text):
     assert parse_time(text) == 1466699519
 
 
@@ -78,7 +76,7 @@ def test_a_time_is_understood_in_each_of_its_forms(text):
     "text",
     ["", "yesterday", "nan", "-inf", "2016:13:23 16:31:59", "2016:06:23 25:00:00", "1466699519000", "1e308", "-1e10"],
 )
-def test_what_is_no_time_is_refused(text):
+def test_parse_time_refuses(text):
     with pytest.raises(ValueError):
         parse_time(text)
 
@@ -100,7 +98,7 @@ def test_what_is_no_time_is_refused(text):
         ("0000.jpg,ref,46,2,,,,", "one of an earlier line (`0000.jpg`)"),
     ],
 )
-def test_a_wrong_row_is_refused_with_its_line_and_value(row, complaint, written):
+def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, written):
     path = written(HEADER + FIRST + row + "\n")
     with pytest.raises(UsageError) as refusal:
         read_positions(path)
@@ -119,13 +117,13 @@ def test_a_wrong_row_is_refused_with_its_line_and_value(row, complaint, written)
         ("file,lat,lon,rel_alt,rel_alt\n", "rel_alt"),
     ],
 )
-def test_a_column_that_is_missing_or_there_twice_is_named(text, column, written):
+def test_read_positions_names_a_column_that_is_missing_or_there_twice(text, column, written):
     with pytest.raises(UsageError, match=f"line 1.*`{column}`"):
         read_positions(written(text))
     assert read_positions(written("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
 
 
-def test_a_file_that_is_missing_no_text_or_a_pipe_is_refused(written, tmp_path):
+def test_read_positions_refuses_what_is_no_text(written, tmp_path):
     with pytest.raises(UsageError, match=r"nothing\.csv"):
         read_positions(tmp_path / "nothing.csv")
     with pytest.raises(UsageError, match="text file"):
@@ -135,7 +133,7 @@ def test_a_file_that_is_missing_no_text_or_a_pipe_is_refused(written, tmp_path):
         read_positions(tmp_path / "pipe.csv")
 
 
-def test_positions_are_found_in_the_folder_or_else_beside_it(tmp_path, monkeypatch):
+def test_find_positions_in_the_folder_or_else_beside_it(tmp_path, monkeypatch):
     folder = tmp_path / "ref"
     folder.mkdir()
     assert find_positions(folder) is None
@@ -147,7 +145,7 @@ def test_positions_are_found_in_the_folder_or_else_beside_it(tmp_path, monkeypat
     assert find_positions(folder) == folder / "positions.csv"
 
 
-def test_positions_that_are_written_are_read_as_the_same(tmp_path):
+def test_write_positions_is_read_as_the_same(tmp_path):
     at = Position(-35.123456789012345, 179.99999999999997, 612.3000000000001)
     tags = {"a.png": GeoTag(position=at, heading_deg=0.1, roll_deg=-0.2, pitch_deg=1 / 3, height_m=80.0, t_utc_s=7.5)}
     tags |= {"b, c.png": GeoTag(position=Position(1.0, 2.0)), "d.png": GeoTag()}
@@ -156,17 +154,12 @@ def test_positions_that_are_written_are_read_as_the_same(tmp_path):
 
 
 @pytest.fixture
-def track(tmp_path):
+def track(written):
     """A function that writes a table and reads it."""
-
-    def made(text):
-        (tmp_path / "flight.csv").write_text(text)
-        return read_track(tmp_path / "flight.csv")
-
-    return made
+    return lambda text: read_track(written(text))
 
 
-def test_a_frame_lies_between_two_lines_and_turns_the_shorter_way(track):
+def test_tag_at_interpolates_and_turns_the_shorter_way(track):
     found = track(
         "time,lat,lon,alt,yaw_deg,roll_deg,pitch_deg,rel_alt\n10,50,179.999,600,350,-4,2,80\n12,51,-179.999,604,20,4,,90\n"
     )
@@ -179,7 +172,7 @@ def test_a_frame_lies_between_two_lines_and_turns_the_shorter_way(track):
     assert found.tag_at(11.5).position.lon_deg == pytest.approx(-179.9995)
 
 
-def test_nothing_is_made_up_outside_the_table_and_in_wide_gaps(track):
+def test_tag_at_makes_nothing_up_outside_the_table_and_in_wide_gaps(track):
     found = track("time,lat,lon\n1,50,8\n2,,\n6,50.1,8\n11.1,50.2,8\n12,0,0\n13,50.3,8\n")
     assert [found.tag_at(t_s).position is not None for t_s in (0.9, 1, 3, 6, 8, 11.1, 12, 13, 13.1)] == [
         False, True, True, True, False, True, True, True, False
@@ -196,6 +189,6 @@ def test_nothing_is_made_up_outside_the_table_and_in_wide_gaps(track):
         ("time,lat,lon\n1,,\n2,0,0\n", "has no line with time, lat and lon"),
     ],
 )
-def test_a_table_that_says_no_path_is_refused(track, text, said):
+def test_read_track_refuses_a_table_without_a_path(track, text, said):
     with pytest.raises(UsageError, match=said):
         track(text)

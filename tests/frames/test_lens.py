@@ -44,7 +44,7 @@ def written(path, text, **given):
 
 @pytest.mark.parametrize("name", ["lens.yaml", "lens.xml", "lens.json"])
 @pytest.mark.parametrize("camera", [wide(), fisheye()])
-def test_a_file_of_opencv_is_read_in_all_its_forms(tmp_path, name, camera):
+def test_read_lens_of_opencv_in_all_its_forms(tmp_path, name, camera):
     path = camera.write(tmp_path / name)
     path.write_text(path.read_text().replace("%YAML 1.2", "%YAML:1.0"))  # as OpenCV 4 writes it
     lens = read_lens(str(path))
@@ -55,33 +55,21 @@ def test_a_file_of_opencv_is_read_in_all_its_forms(tmp_path, name, camera):
 
 
 @pytest.mark.parametrize(
-    ("model", "coefficients", "is_fisheye"),
+    ("text", "model", "coefficients"),
     [
-        ("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0), False),
-        ("rational_polynomial", (-0.2, 0.05, 0.001, -0.001, 0.0, 0.1, 0.01, 0.0), False),
-        ("equidistant", (0.02, -0.01, 0.003, -0.0005), True),
+        (ROS, "plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0)),
+        (ROS, "rational_polynomial", (-0.2, 0.05, 0.001, -0.001, 0.0, 0.1, 0.01, 0.0)),
+        (ROS, "equidistant", (0.02, -0.01, 0.003, -0.0005)),
+        (KALIBR, "radtan", (-0.2, 0.05, 0.001, -0.001)),
+        (KALIBR, "equidistant", (0.02, -0.01, 0.003, -0.0005)),
+        (KALIBR, "none", ()),
     ],
 )
-def test_a_file_of_ros_is_read(tmp_path, model, coefficients, is_fisheye):
-    text = ", ".join(map(str, coefficients))
-    lens = read_lens(written(tmp_path / "ros.yaml", ROS, model=model, number=len(coefficients), coefficients=text))
+def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
+    given = {"camera": "pinhole", "model": model, "number": len(coefficients)}
+    lens = read_lens(written(tmp_path / "a.yaml", text, coefficients=", ".join(map(str, coefficients)), **given))
     assert (*lens.focal_px, *lens.centre_px) == PINHOLE
-    assert (lens.coefficients, lens.is_fisheye) == (coefficients, is_fisheye)
-
-
-@pytest.mark.parametrize(
-    ("model", "coefficients", "read"),
-    [
-        ("radtan", "-0.2, 0.05, 0.001, -0.001", (-0.2, 0.05, 0.001, -0.001)),
-        ("equidistant", "0.02, -0.01, 0.003, -0.0005", (0.02, -0.01, 0.003, -0.0005)),
-        ("none", "", (0.0,) * 4),
-    ],
-)
-def test_a_file_of_kalibr_is_read(tmp_path, model, coefficients, read):
-    path = written(tmp_path / "camchain.yaml", KALIBR, camera="pinhole", model=model, coefficients=coefficients)
-    lens = read_lens(path)
-    assert (*lens.focal_px, *lens.centre_px) == PINHOLE
-    assert (lens.coefficients, lens.is_fisheye) == (read, model == "equidistant")
+    assert (lens.coefficients, lens.is_fisheye) == (coefficients or (0.0,) * 4, model == "equidistant")
 
 
 @pytest.mark.parametrize(
@@ -104,7 +92,7 @@ def test_a_file_of_kalibr_is_read(tmp_path, model, coefficients, read):
         ("nothing: here", {}, "calibrate-camera"),
     ],
 )
-def test_what_is_no_calibration_ends_with_one_sentence(tmp_path, text, given, says):
+def test_read_lens_refuses_what_is_no_calibration(tmp_path, text, given, says):
     path = written(tmp_path / "lens.yaml", text, **given)
     with pytest.raises(ConfigError, match=says) as error:
         read_lens(path)
@@ -123,15 +111,6 @@ def lens_of(camera):
         is_fisheye=camera.fisheye,
         size_px=camera.size_px,
     )
-
-
-@pytest.fixture(scope="module")
-def ground():
-    """Ground that is smooth enough that a picture of a picture is hardly another; 0.5 m a pixel."""
-    rng = np.random.default_rng(1)
-    octaves = [rng.random((2**octave, 2**octave, 3), dtype=np.float32) / octave for octave in range(3, 8)]
-    smooth = sum(cv2.resize(each, (1600, 1600), interpolation=cv2.INTER_CUBIC) for each in octaves)
-    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def taken(camera, ground, **pose):

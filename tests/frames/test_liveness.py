@@ -36,19 +36,19 @@ def must_reopen(fault):
 @pytest.mark.parametrize(
     ("interval_s", "lost_s"), [(0.04, 3.0), (1.0, 3.0), (2.0, 5.0), (5.0, 12.5), (10.0, 25.0), (20.0, 30.0)]
 )
-def test_a_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, lost_s):
+def test_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, lost_s):
     watched = liveness(*(number * interval_s for number in range(8)))
     assert begins_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
     assert begins_s(watched, must_reopen, 7 * interval_s) == lost_s
 
 
-def test_the_first_picture_and_the_second_of_a_slow_camera_are_waited_for():
+def test_first_picture_and_second_of_a_slow_camera_are_waited_for():
     assert begins_s(liveness(), is_(Condition.LOST)) == 12.0
     assert begins_s(liveness(1.0), is_(Condition.LOST), 1.0) == 12.0
     assert liveness(0.0, 5.0).fault(10.0) is None
 
 
-def test_a_source_opened_anew_is_given_time_for_a_key_frame_and_keeps_its_rate():
+def test_source_opened_anew_is_given_time_for_a_key_frame_and_keeps_its_rate():
     watched = liveness(0.0, 0.1, 0.2)
     watched.open(20.0)
     assert begins_s(watched, is_(Condition.LOST), 20.0) == 12.0
@@ -61,14 +61,14 @@ def test_one_long_pause_does_not_make_a_source_slow():
     assert begins_s(watched, is_(Condition.LOST), 60.1) == 3.0
 
 
-def test_a_source_of_which_no_picture_is_whole_is_damaged_and_opened_anew():
+def test_source_of_which_no_picture_is_whole_is_damaged_and_opened_anew():
     watched = liveness(0.0, 0.1)
     assert begins_s(watched, is_(Condition.DAMAGED), 0.1, Refusal.DAMAGED) == 3.0
     assert begins_s(watched, must_reopen, 0.1, Refusal.DAMAGED) == 5.0
     assert begins_s(liveness(), must_reopen, 0.0, Refusal.DAMAGED) == 12.0, "a key frame may be ten seconds away"
 
 
-def test_a_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
+def test_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
     watched = liveness(0.0, 0.1)
     assert begins_s(watched, is_(Condition.LATE), 0.1, Refusal.LATE) == 3.0
     assert "the age of its pictures is unknown" in watched.fault(4.0).text
@@ -81,7 +81,7 @@ def test_a_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
     ("repeats", "step_s", "is_frozen"),
     [(5, 0.1, False), (11, 0.1, True), (2, 0.9, False), (3, 0.9, True), (3, 0.2, False)],
 )
-def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
+def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
     watched = liveness(0.0, 0.1)
     for _ in range(repeats):
         watched.refuse(Refusal.FROZEN, 0.1)
@@ -89,7 +89,7 @@ def test_a_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, 
     assert (fault is not None and fault.condition is Condition.FROZEN) == is_frozen
 
 
-def test_a_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
+def test_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
     watched, waits_s = liveness(0.0, 0.1), []
     for _ in range(5):
         watched.open(0.0)
@@ -102,7 +102,7 @@ def test_a_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_p
     assert begins_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
 
 
-def test_a_new_picture_ends_every_fault():
+def test_new_picture_ends_every_fault():
     for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
         watched = liveness(0.0, 0.1)
         for _ in range(20):
