@@ -3,7 +3,7 @@
 import os
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +116,7 @@ def run_match(args: Namespace) -> int:
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
     if page:
-        page.write(recogniser, config)
+        page.write(config)
     return exit_code(unusable)
 
 
@@ -125,30 +125,34 @@ class _MatchPage:
 
     def __init__(self, args: Namespace) -> None:
         from edgevpr.review.album import Album, album_of_map
+        from edgevpr.review.logged import LoggedQuery
         from edgevpr.review.overhead import read_ground
 
         require_out(args.page, args.map)
-        self._args, self._ground, self._lines = args, read_ground(args.map), list[dict[str, Any]]()
-        self._albums = {"seen": Album([]), "place": album_of_map(args.map_images, self._ground)}
+        self._args, self._ground, self._queries = args, read_ground(args.map), list[LoggedQuery]()
+        self._albums = {"seen": Album(), "place": album_of_map(args.map_images, self._ground)}
 
     def take(self, event: "Recognition") -> None:
         """Take the event of a query."""
-        from edgevpr.review.matchpage import line_of
+        from edgevpr.review.logged import read_query
+        from edgevpr.runtime.recognise.recognition import fields_of
 
-        self._lines.append(line_of(event, len(self._lines)))
+        query, tag = read_query(fields_of(event, exact=True), 0.0), event.frame and event.frame.position
+        tagged_at = (tag.lat_deg, tag.lon_deg) if tag else None
+        self._queries.append(replace(query, gps_at=tagged_at, true_at=tagged_at))
         if event.frame:
             self._albums["seen"].keep(event.frame.name, event.frame.image)
 
-    def write(self, recogniser: "Recogniser", config: Config) -> None:
+    def write(self, config: Config) -> None:
         """Write the page."""
-        from edgevpr.review.matchpage import match_page_of
+        from edgevpr.review.page import make_match_page
         from edgevpr.runtime.recognise.levelling import lens_of
 
-        name, sure = Path(self._args.map).name, recogniser.rule.sure
-        page = match_page_of(self._lines, self._ground, self._albums, name, sure, lens_of(config.source))
+        name = Path(self._args.map).name
+        page = make_match_page(self._queries, name, self._ground, self._albums, lens_of(config.source))
         write_out(self._args.page, self._args.map, lambda out: out.write(page))
         if not self._args.json:
-            print(f"{self._args.page}: {len(self._lines)} queries")
+            print(f"{self._args.page}: {len(self._queries)} queries")
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:

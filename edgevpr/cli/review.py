@@ -47,10 +47,9 @@ def add(commands: Any) -> None:
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
     from edgevpr.review.album import album_of, album_of_map
-    from edgevpr.review.logged import read_flight, text, value
-    from edgevpr.review.matchpage import thresholds_of
+    from edgevpr.review.logged import read_flight, text
     from edgevpr.review.overhead import read_ground
-    from edgevpr.review.page import page_of
+    from edgevpr.review.page import make_flight_page
     from edgevpr.runtime.flight.recording import frames_of, recording_of
 
     flight = read_flight(args.log)
@@ -66,8 +65,7 @@ def run_report(args: Namespace) -> int:
                 raise
             no_ground = f"The map of the flight is not drawn: {error} Its place can be given with --map."
     references = album_of_map(args.map_images, ground)
-    thresholds = thresholds_of(value(flight.start, "decided", "rule", "sure"))
-    page = page_of(flight, ground, frames, references, no_ground, thresholds)
+    page = make_flight_page(flight, ground, frames, references, no_ground)
     write_out(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0

@@ -21,10 +21,12 @@ from edgevpr.core.text import shown
 Points = Sequence[tuple[float, float]]  # (x, value), or (x, y) of a drawing
 
 UNKNOWN = "–"
+WIDTH = 1000.0  # of every drawing, in its own units
 
-_WIDE, _HIGH = 1000.0, 100.0
-_LAST = 0.97  # share of an axis: a text centred on a point further right would leave the page
-_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
+_CHART_HEIGHT = 100.0
+_LANE_HEIGHT = 20.0
+_LAST_TICK = 0.97  # share of an axis: a text centred on a point further right would leave the page
+_TICKS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400)
 _MOST_TICKS = 6
 
 # Content security policy: the browser loads nothing from anywhere and runs no script but the page's own, even if a file
@@ -55,6 +57,11 @@ def data(name: str, value: Any) -> str:
     return f'<script type="application/json" id="{name}">{text}</script>'
 
 
+def data_url(kind: str, content: bytes) -> str:
+    """Return a file of an image of a `kind` ("webp") as an address that needs no file."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
 def foreign(text: str) -> str:
     """Return `text`, which may come from anywhere, as HTML: escaped, without passwords and control characters."""
     return escape(shown(text))
@@ -66,9 +73,9 @@ def heading(title: str, known: Iterable[str]) -> str:
 
 
 def figures(known: Mapping[str, str]) -> str:
-    """Return figures by their names, as HTML each; those that are unknown are left out."""
-    rows = "".join(f"<div><dt>{name}</dt><dd>{each}</dd></div>" for name, each in known.items() if each != UNKNOWN)
-    return f'<dl class="figures">{rows}</dl>'
+    """Return a section of figures by their names, as HTML each; those that are unknown are left out."""
+    rows = "".join(f"<div><dt>{name}</dt><dd>{text}</dd></div>" for name, text in known.items() if text != UNKNOWN)
+    return section("", f'<dl class="figures">{rows}</dl>')
 
 
 def section(title: str, content: str) -> str:
@@ -91,15 +98,6 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]], cell: Callable
     return f'<div class="scroll"><table><tr>{head}</tr>{lines}</table></div>'
 
 
-def picture(name: str, caption: str, jpeg: bytes) -> str:
-    """Return a picture with a caption. The JPEG is stored inside the page, as a data: address."""
-    data = base64.b64encode(jpeg).decode()
-    return (
-        f'<figure><img alt="{foreign(name)}" src="data:image/jpeg;base64,{data}">'
-        f"<figcaption>{foreign(caption)}</figcaption></figure>"
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Series:
     """One line of a chart (with `are_dots`: its dots): the name in the legend, the colour, and the points (x, value) in
@@ -119,69 +117,74 @@ class Axis:
     last: float
     ticks: Sequence[tuple[float, str]]
 
-    def across(self, x: float) -> float:
-        """Return where `x` lies along the axis, from 0 (left end, or left of it) to 1 (right end, or right of it)."""
-        return min(max((x - self.first) / ((self.last - self.first) or 1.0), 0.0), 1.0)
+    def x(self, value: float) -> float:
+        """Return where `value` lies along the axis, from 0 (left end, or left of it) to `WIDTH` (right end)."""
+        return WIDTH * min(max((value - self.first) / ((self.last - self.first) or 1.0), 0.0), 1.0)
 
-    def grid(self, high: float) -> str:
-        """Return an SVG path of vertical lines at the ticks, `high` units high, and the line below them."""
-        lines = "".join(f"M{_WIDE * self.across(x):.1f} 0v{high:g}" for x, _ in self.ticks)
-        return f'<path class="grid" d="{lines}M0 {high:g}h{_WIDE:g}"/>'
+    def grid(self, height: float) -> str:
+        """Return an SVG path of vertical lines at the ticks, and the line below them."""
+        lines = "".join(f"M{self.x(value):.1f} 0v{height:g}" for value, _ in self.ticks)
+        return f'<path class="grid" d="{lines}M0 {height:g}h{WIDTH:g}"/>'
 
-    def below(self) -> str:
-        """Return the texts below the axis, as HTML."""
+    def texts(self) -> str:
+        """Return the texts below the axis."""
         texts = ""
-        for x, text in self.ticks:
-            left = self.across(x)
-            last = " class=last" if left > _LAST else ""
-            texts += f'<span{last} style="left:{100 * left:.1f}%">{escape(text)}</span>' if text else ""
+        for share, text in ((self.x(value) / WIDTH, text) for value, text in self.ticks):
+            last = " class=last" if share > _LAST_TICK else ""
+            texts += f'<span{last} style="left:{share:.1%}">{escape(text)}</span>' if text else ""
         return f'<div class="times">{texts}</div>'
 
 
+def time_axis(span_s: float) -> Axis:
+    """Return an axis of time, from 0 to `span_s` seconds."""
+    step_s = next((step_s for step_s in _TICKS_S if span_s / step_s <= _MOST_TICKS), span_s / _MOST_TICKS)
+    ticks_s = [count * step_s for count in range(int(span_s / step_s) + 1)]
+    return Axis(0.0, span_s, [(t_s, clock(t_s) if t_s <= _LAST_TICK * span_s or not t_s else "") for t_s in ticks_s])
+
+
 def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: float = 0.0) -> str:
-    """Return a chart of `series` as HTML. Its values reach from 0 to the highest one, and to `top` at least. A series
-    without points is left out; if none has points, the result is ""."""
+    """Return a chart of `series`. Its values reach from 0 to the highest one, and to `top` at least. A series without
+    points is left out; if none has points, the result is ""."""
     series = [each for each in series if each.points]
     if not series:
         return ""
-    highest = nice(max(top, *(value for each in series for _, value in each.points)))
-    paths = ""
+    highest = _round_up(max(top, *(value for each in series for _, value in each.points)))
+    paths = axis.grid(_CHART_HEIGHT)
     for each in series:
-        path, kind = (dots, "dots") if each.are_dots else (way, "line")
-        places = [(_WIDE * axis.across(x), _HIGH * (1 - max(v, 0.0) / highest)) for x, v in each.points]
-        paths += f'<path class="{kind} {each.colour}" d="{path(places)}"/>'
+        points = [(axis.x(x), _CHART_HEIGHT * (1 - max(value, 0.0) / highest)) for x, value in each.points]
+        form = "dots" if each.are_dots else "line"
+        paths += f'<path class="{form} {each.colour}" d="{path(points, form)}"/>'
     legend = "".join(f'<span class="key {each.colour}">{escape(each.name)}</span>' for each in series if each.name)
-    drawing = _svg(f"{title}, {unit}", _HIGH, axis.grid(_HIGH) + paths)
-    return _framed(title, f"{unit} {legend}", highest, axis, drawing)
+    return (
+        f'<figure class="chart"><figcaption><b>{escape(title)}</b> {unit} {legend}</figcaption>'
+        f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>0</span></div>'
+        f"<div>{_svg(f'{title}, {unit}', _CHART_HEIGHT, paths)}{axis.texts()}</div></div></figure>"
+    )
 
 
 def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
     """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number; "" without
     rows."""
-    axis, lines = times(span_s), ""
-    for at, (name, colour, times_s) in enumerate(rows):
-        marks = "".join(f"M{x:g} 0v20" for x in sorted({round(_WIDE * axis.across(t_s), 1) for t_s in times_s}))
-        path = f'<path class="mark {colour}" d="{marks}" data-lane="{at}"/>'
-        drawing = _svg(f"{name}: {len(times_s)}", 20, axis.grid(20) + path)
+    axis, lines = time_axis(span_s), ""
+    for row, (name, colour, times_s) in enumerate(rows):
+        marks = "".join(f"M{x:g} 0v{_LANE_HEIGHT:g}" for x in sorted({round(axis.x(t_s), 1) for t_s in times_s}))
+        paths = f'{axis.grid(_LANE_HEIGHT)}<path class="mark {colour}" d="{marks}" data-lane="{row}"/>'
+        drawing = _svg(f"{name}: {len(times_s)}", _LANE_HEIGHT, paths)
         lines += f"<span>{escape(name)} <b>{len(times_s)}</b></span>{drawing}"
-    return f'<div class="lanes">{lines}<span></span>{axis.below()}</div>' if rows else ""
+    return f'<div class="lanes">{lines}<span></span>{axis.texts()}</div>' if rows else ""
 
 
-def dots(points: Points) -> str:
-    """Return SVG path data of dots: lines of length 0, whose round ends make dots as wide as the line."""
-    return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+def path(points: Points, form: str = "line") -> str:
+    """Return SVG path data of a "line" through `points`, of an "area" inside them, or of "dots": lines of length 0,
+    whose round ends make dots as wide as the line."""
+    if form == "dots" or len(points) == 1:
+        return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + "z" * (form == "area")
 
 
-def way(points: Points) -> str:
-    """Return SVG path data of a line through `points`; a single point becomes a dot."""
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + ("h0" if len(points) == 1 else "")
-
-
-def nice(value: float) -> float:
+def _round_up(value: float) -> float:
     """Round up to two digits that are easily read: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 or 8 times a power of ten."""
-    if value <= 0:
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
+    power = 10.0 ** math.floor(math.log10(value)) if value > 0 else 1.0
     return next(step * power for step in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10) if step * power >= value * 0.999)
 
 
@@ -200,24 +203,8 @@ def clock(t_s: float) -> str:
     return f"{hours}:{seconds:02d}"
 
 
-def _svg(label: str, high: float, content: str) -> str:
+def _svg(label: str, height: float, content: str) -> str:
     return (
-        f'<svg role="img" aria-label="{escape(label)}" viewBox="0 0 {_WIDE:g} {high:g}" preserveAspectRatio="none">'
+        f'<svg role="img" aria-label="{escape(label)}" viewBox="0 0 {WIDTH:g} {height:g}" preserveAspectRatio="none">'
         f"{content}</svg>"
     )
-
-
-def _framed(title: str, beside: str, highest: float, axis: Axis, drawing: str) -> str:
-    return (
-        f'<figure class="chart"><figcaption><b>{escape(title)}</b> {beside}</figcaption>'
-        f'<div class="plot"><div class="scale"><span>{figure(highest)}</span><span>0</span></div>'
-        f"<div>{drawing}{axis.below()}</div></div></figure>"
-    )
-
-
-def times(span_s: float) -> Axis:
-    """Return an axis of time, from 0 to `span_s` seconds."""
-    step = next((each for each in _STEPS_S if span_s / each <= _MOST_TICKS), span_s / _MOST_TICKS)
-    ticks = [count * step for count in range(int(span_s / step) + 1)] if step else [0.0]
-    last = _LAST * span_s
-    return Axis(0.0, span_s, [(t_s, clock(t_s) if t_s <= last or not t_s else "") for t_s in ticks])

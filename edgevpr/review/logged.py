@@ -2,6 +2,7 @@
 or of another type, becomes None."""
 
 import logging
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -16,8 +17,9 @@ _log = logging.getLogger(__name__)
 Point = tuple[float, float]  # latitude and longitude, degrees
 _FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
 _CONTINUOUS = "taken into the continuous position"  # `why` of a fix in the stream of positions, which is not answered
-_WORDS = ("said", "state", "problem", "why")  # fields with a text for people: the first that a line has is shown
+_TEXTS = ("said", "state", "problem", "why")  # fields with a text for people: the first that a line has is shown
 _LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
+_NUMBER = re.compile(r"\d+(\.\d+)?%?")
 
 
 class FixOutcome(Enum):
@@ -29,6 +31,9 @@ class FixOutcome(Enum):
     UNANSWERED = "fix not answered"
     CONTINUOUS = "in continuous position"
     KEPT = "fix not sent"
+
+
+SENT = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -47,9 +52,9 @@ class LoggedQuery:
     """One query, whose frame was taken `t_s` seconds after the start of the flight. None in any field: unknown.
 
     `line` is its line of the log. `at` is the position of an accepted match, `place_at` that of the place found.
-    `autopilot_at` and `gps_at` are the aircraft's positions at that time by autopilot and GPS receiver. `off_m` is the
-    distance from the match to `true_at`: `autopilot_at` if the autopilot has GPS, else `gps_at`. `has_link`: the
-    autopilot was heard."""
+    `autopilot_at` and `gps_at` are the aircraft's positions at that time by autopilot and GPS receiver; `true_at`, by
+    which a match is judged, is `autopilot_at` if the autopilot has GPS, else `gps_at`. `has_link`: a report of the
+    autopilot arrived within a second."""
 
     line: dict[str, Any]
     name: str
@@ -65,9 +70,13 @@ class LoggedQuery:
     autopilot_at: Point | None
     gps_at: Point | None
     true_at: Point | None
-    off_m: float | None
     fix: LoggedFix | None
     has_link: bool | None
+
+    @property
+    def off_m(self) -> float | None:
+        """Distance from the match to `true_at`."""
+        return float(distance_m(*self.true_at, *self.at)) if self.true_at and self.at else None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -78,7 +87,7 @@ class LoggedFlight:
     quad keys of those that were in RAM. Times are seconds after its start; it is `span_s` long. `truth` names the
     positions by which matches are judged, and `notes` are sentences for the head of its page."""
 
-    path: Path
+    path: Path = Path()
     truth: str = "GPS"
     notes: tuple[str, ...] = ()
     start: dict[str, Any] = field(default_factory=dict)
@@ -108,57 +117,56 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
     flight, queries = LoggedFlight(path=path), dict[str, LoggedQuery]()
     start_s = None
     for line in lines:
-        kind, t_mono_s, t_s = line.get("kind"), number(line, "t_mono_s"), flight.span_s
+        t_mono_s, t_s = number(line, "t_mono_s"), flight.span_s
         if t_mono_s is not None:
             start_s = t_mono_s if start_s is None else start_s
             t_s = max(0.0, t_mono_s - start_s)
         flight.span_s = max(flight.span_s, t_s)
-        if kind == "start":
-            flight.start = line
-        elif kind == "end":
-            flight.end = line
-        elif kind == "query":
-            t_frame_s = number(line, "t_frame_s")
-            taken_s = t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0))
-            query = queries[text(line, "query") or ""] = _query(line, taken_s)
-            flight.queries.append(query)
-        elif kind == "answer":
-            if (answered := queries.get(text(line, "query") or "")) and answered.fix:
-                _take_answer(answered.fix, line)
-        elif kind == "unusable":
-            flight.unusable.append(t_s)
-        elif kind == "learnt":
-            flight.learnt += filter(None, [point(line, "position")])
-        elif kind == "between":
-            flight.between += [line] if point(line) else []
-        elif kind == "tiles":
-            held = value(line, "held")
-            flight.tiles.update(map(str, held) if isinstance(held, list) else ())
-        else:
-            flight.remarks.append((t_s, str(kind), _words(line)))
+        match kind := line.get("kind"):
+            case "start":
+                flight.start = line
+            case "end":
+                flight.end = line
+            case "query":
+                t_frame_s = number(line, "t_frame_s")
+                taken_s = t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0))
+                query = queries[text(line, "query") or ""] = read_query(line, taken_s)
+                flight.queries.append(query)
+            case "answer":
+                if (answered := queries.get(text(line, "query") or "")) and answered.fix:
+                    _apply_answer(answered.fix, line)
+            case "unusable":
+                flight.unusable.append(t_s)
+            case "learnt":
+                flight.learnt += filter(None, [point(line, "position")])
+            case "between":
+                flight.between += [line] if point(line) else []
+            case "tiles":
+                held = value(line, "held")
+                flight.tiles.update(map(str, held) if isinstance(held, list) else ())
+            case _:
+                flight.remarks.append((t_s, str(kind), _text_of(line)))
     return flight
 
 
-def _take_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
+def _apply_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
     """Set outcome and reason of a fix from a log line of kind "answer"."""
     fix.outcome = _outcome(line, line.get("result"))
     fix.why = text(line, "why") or fix.why
     if fix.outcome is FixOutcome.REFUSED:
-        fix.why = fix.why or "it does not say why"
+        fix.why = fix.why or "no reason given"
 
 
-def _query(line: dict[str, Any], t_s: float) -> LoggedQuery:
+def read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
+    """Read a log line of kind "query", or the fields of one (see `recognition.fields_of`)."""
     t_frame_s = number(line, "t_frame_s")
     accepted = line.get("accepted") is True
-    at = point(line, "located") or point(line, "position") if accepted else None
     gps_at = _gps_at(line, t_frame_s)
-    is_heard = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
-    autopilot_at = point(line, "vehicle") if is_heard else None
-    # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
-    truth = autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at
+    has_link = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
+    autopilot_at = point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
     confidences = number(line, "confidence"), number(line, "followed", "confidence")
-    place = number(line, "place")
+    place, fix = number(line, "place"), value(line, "fix")
     return LoggedQuery(
         line=line,
         name=text(line, "query") or "",
@@ -168,29 +176,26 @@ def _query(line: dict[str, Any], t_s: float) -> LoggedQuery:
         confidence=max((known for known in confidences if known is not None), default=None),
         place=None if place is None else int(place),
         reference_image=text(line, "reference_image"),
-        at=at,
+        at=point(line, "located") or point(line, "position") if accepted else None,
         accuracy_m=number(line, "accuracy_m"),
         place_at=point(line, "position"),
         autopilot_at=autopilot_at,
         gps_at=gps_at,
-        true_at=truth,
-        off_m=float(distance_m(*truth, *at)) if truth and at else None,
-        fix=_fix(line),
-        has_link=is_heard if "vehicle" in line else None,
+        # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
+        true_at=autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at,
+        fix=_read_fix(fix) if isinstance(fix, dict) else None,
+        has_link=has_link if "vehicle" in line else None,
     )
 
 
-def _fix(line: dict[str, Any]) -> LoggedFix | None:
-    told = value(line, "fix")
-    if not isinstance(told, dict):
-        return None
-    outcome = _outcome(told, told.get("answer"))
-    return LoggedFix(outcome=outcome, why=text(told, "why"), at=point(told), accuracy_m=number(told, "accuracy_m"))
+def _read_fix(fix: dict[str, Any]) -> LoggedFix:
+    outcome = _outcome(fix, fix.get("answer"))
+    return LoggedFix(outcome=outcome, why=text(fix, "why"), at=point(fix), accuracy_m=number(fix, "accuracy_m"))
 
 
-def _outcome(told: dict[str, Any], answer: object) -> FixOutcome:
-    if told.get("sent") is False:
-        return FixOutcome.CONTINUOUS if told.get("why") == _CONTINUOUS else FixOutcome.KEPT
+def _outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
+    if fix.get("sent") is False:
+        return FixOutcome.CONTINUOUS if fix.get("why") == _CONTINUOUS else FixOutcome.KEPT
     if answer is None:
         return FixOutcome.UNANSWERED
     return FixOutcome.TAKEN if answer == "ACCEPTED" else FixOutcome.REFUSED
@@ -212,14 +217,19 @@ def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     return at
 
 
-def _words(line: dict[str, Any]) -> str:
-    words = next((known for key in _WORDS if (known := text(line, key))), None)
+def _text_of(line: dict[str, Any]) -> str:
+    words = next((known for key in _TEXTS if (known := text(line, key))), None)
     match line:
         case {"from": dict() as before, "to": dict() as after}:  # of the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
             return f"{', '.join(changed)}: {words}"
     others = {"kind", "time", "t_mono_s"}
     return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
+
+
+def without_numbers(sentence: str) -> str:
+    """Return a sentence with "…" for each number, so that equal ones can be counted."""
+    return _NUMBER.sub("…", sentence)
 
 
 def value(record: Any, *keys: str) -> Any:

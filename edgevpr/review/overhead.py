@@ -1,11 +1,8 @@
 """Draws the ground as seen from above: the places of the map with the ground that their pictures show, and what lies
 over them."""
 
-import base64
-import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Literal
 
@@ -16,15 +13,22 @@ from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.tilemap import TileMap
-from edgevpr.review.html import Points, dots, way
+from edgevpr.review.html import WIDTH, Points, data_url, path
 from edgevpr.review.logged import Point
 from edgevpr.review.mosaic import Mosaic
 
-_WIDE = 1000.0  # of the drawing, in its own units
+Form = Literal["dots", "line", "area"]
 _MARGIN = 0.04
-_SHAPES = 0.55, 1.8  # the least and the greatest ratio of a drawing's height to its width
+_LEAST_SHAPE = 0.55  # height of a drawing to its width
+_MOST_SHAPE = 1.8
 _MOST_VH = 80  # of the height of the window
 _MOST_PLACES = 6000  # more are a whole page of dots; then every second, third, ... is drawn
+_SQUARE = np.array([[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]])
+_BUTTONS = (
+    '<div class="zoom" hidden><button type="button" data-zoom="2" aria-label="zoom in">+</button>'
+    '<button type="button" data-zoom="0.5" aria-label="zoom out">−</button>'
+    '<button type="button" data-zoom="0" aria-label="show all">⤢</button></div>'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +39,7 @@ class Layer:
     name: str
     colour: str
     ways: Sequence[Sequence[Point]]
-    form: Literal["dots", "line", "area"] = "dots"
+    form: Form = "dots"
 
 
 def read_ground(path: str | Path, tiles: Collection[str] = ()) -> list[Place]:
@@ -53,61 +57,18 @@ def at_of(place: Place) -> Point:
     return place.position.lat_deg, place.position.lon_deg
 
 
-def draw(
-    view: "Overhead", ground: Sequence[Place], layers: Sequence[Layer], named: Iterable[tuple[str, Point]] = ()
-) -> str:
-    """Return HTML with the ground that is seen, the layers over it, and a label at each of the `named` points (its
-    name, position)."""
-    drawn_of = ground[:: -(-len(ground) // _MOST_PLACES) or 1]
-    paths = view.picture() or f'<path class="footprints layer-ground" d="{"".join(map(view.square, drawn_of))}"/>'
-    boxes = [("ground", "the ground seen")] if any(place.pose for place in ground) else []
-    for layer in layers:
-        path = dots if layer.form == "dots" else way
-        end = "z" if layer.form == "area" else ""
-        drawn = "".join(path(view.on(points)) + end for points in layer.ways if points)
-        paths += f'<path class="{layer.form} {layer.colour} layer-{layer.colour}" d="{drawn}"/>'
-        boxes.append((layer.colour, layer.name))
-    labels = "".join(
-        f'<a class="label" href="#moment-{escape(name)}" data-x="{x:.1f}" data-y="{y:.1f}" '
-        f'style="left:{x / _WIDE:.2%};top:{y / view.high:.2%}">{escape(name)}</a>'
-        for name, at in named
-        for x, y in view.on([at])
-    )
-    legend = "".join(
-        f'<label class="key {each}"><input type="checkbox" checked id="show-{each}">{name}</label>'
-        for each, name in boxes
-    )
-    hides = "".join(f".ground:has(#show-{each}:not(:checked)) .layer-{each}{{display:none}}" for each, _ in boxes)
-    shape = _WIDE / view.high  # labels are placed in per cent of width and height: they fit this shape only
-    length_m, share = view.ruler()
-    ruler = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:.0f} km"
-    return (
-        f'<style>{hides}</style><div class="legend">{legend}</div>'
-        f'<div class="view" style="aspect-ratio:{shape:.4f};max-width:{_MOST_VH * shape:.1f}vh">'
-        f'<svg role="img" aria-label="the ground of the map" viewBox="0 0 {_WIDE:g} {view.high:.0f}">{paths}'
-        f'<g id="now-at"></g></svg>{labels}<div class="ruler" style="width:{share:.1%}">{ruler}</div>'
-        '<div class="north">N ↑</div>'
-        '<div class="zoom" hidden><button type="button" data-zoom="2" aria-label="zoom in">+</button>'
-        '<button type="button" data-zoom="0.5" aria-label="zoom out">−</button>'
-        '<button type="button" data-zoom="0" aria-label="show all">⤢</button></div></div>'
-    )
-
-
 class Overhead:
-    """Converts positions into points of the drawing, which has north up and is 1000 x `high` units large. `everything`
-    are all positions to draw; `ground` sets the room around them. `mosaic` is the picture of the ground, once there is
-    one, in metres from the position `origin`. `per_m`: units of the drawing in a metre."""
+    """Converts positions into points of the drawing, which has north up and is 1000 x `height` units large. `points`
+    are all positions to draw; `ground` sets the room around them. `per_m`: units of the drawing in a metre."""
 
-    def __init__(self, everything: Sequence[Point], ground: Sequence[Place]) -> None:
+    def __init__(self, points: Sequence[Point], ground: Sequence[Place]) -> None:
         footprint_m = max((place.pose.footprint_m for place in ground if place.pose), default=20.0)
-        self.origin = everything[0]
-        self.mosaic: Mosaic | None = None
-        metres = self._metres(everything)
-        wide_m, high_m = np.ptp(metres, axis=1) + 1.5 * footprint_m
-        least, most = _SHAPES
-        high_m, wide_m = max(high_m, least * wide_m), max(wide_m, high_m / most)
-        self.per_m = float(_WIDE * (1 - 2 * _MARGIN) / wide_m)
-        self.high = float(_WIDE * high_m / wide_m)
+        self.origin = points[0]
+        metres = self._metres(points)
+        width_m, height_m = np.ptp(metres, axis=1) + 1.5 * footprint_m
+        height_m, width_m = max(height_m, _LEAST_SHAPE * width_m), max(width_m, height_m / _MOST_SHAPE)
+        self.per_m = float(WIDTH * (1 - 2 * _MARGIN) / width_m)
+        self.height = float(WIDTH * height_m / width_m)
         self._middle_m = (metres.min(axis=1, keepdims=True) + metres.max(axis=1, keepdims=True)) / 2
 
     def on(self, points: Sequence[Point]) -> Points:
@@ -119,30 +80,41 @@ class Overhead:
         longest side of the picture on the ground; "" if that is unknown."""
         if not place.pose:
             return ""
-        half_m = place.pose.footprint_m / 2
-        corners = axes_of(place.pose.up_deg) @ np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * half_m
-        points = self._drawn(self._metres([at_of(place)]) + corners)
-        return "M" + "L".join(f"{x:.0f} {y:.0f}" for x, y in points) + "z"
+        corners = axes_of(place.pose.up_deg) @ _SQUARE * place.pose.footprint_m
+        return path(self._drawn(self._metres([at_of(place)]) + corners), "area")
 
-    def picture(self) -> str:
-        """Return the SVG image of the ground; "" without one."""
-        if self.mosaic is None:
-            return ""
-        west, south, east, north = self.mosaic.edges_m
-        (left, top), (right, bottom) = self._drawn(np.array([[west, east], [north, south]]))
-        data = base64.b64encode(self.mosaic.webp).decode()
+    def draw(self, ground: Sequence[Place], layers: Sequence[Layer], mosaic: Mosaic | None) -> str:
+        """Return HTML with the ground, which has the picture `mosaic` (None: it has none), and the layers over it."""
+        if mosaic:
+            paths = self._picture(mosaic)
+        else:
+            squares = map(self.square, ground[:: -(-len(ground) // _MOST_PLACES) or 1])
+            paths = f'<path class="footprints layer-ground" d="{"".join(squares)}"/>'
+        names = {"ground": "the ground seen"} if any(place.pose for place in ground) else {}
+        for layer in layers:
+            drawn = "".join(path(self.on(points), layer.form) for points in layer.ways if points)
+            paths += f'<path class="{layer.form} {layer.colour} layer-{layer.colour}" d="{drawn}"/>'
+            names[layer.colour] = layer.name
+        legend = "".join(
+            f'<label class="key {colour}"><input type="checkbox" checked id="show-{colour}">{name}</label>'
+            for colour, name in names.items()
+        )
+        hides = "".join(f".ground:has(#show-{key}:not(:checked)) .layer-{key}{{display:none}}" for key in names)
+        shape = WIDTH / self.height
         return (
-            f'<image class="layer-ground" x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" '
-            f'height="{bottom - top:.2f}" preserveAspectRatio="none" href="data:image/webp;base64,{data}"/>'
+            f'<style>{hides}</style><div class="legend">{legend}</div>'
+            f'<div class="view" style="aspect-ratio:{shape:.4f};max-width:{_MOST_VH * shape:.1f}vh">'
+            f'<svg role="img" aria-label="the ground of the map" viewBox="0 0 {WIDTH:g} {self.height:.0f}">{paths}'
+            f'<g id="now-at"></g></svg><div class="ruler" hidden></div><div class="north">N ↑</div>{_BUTTONS}</div>'
         )
 
-    def ruler(self) -> tuple[float, float]:
-        """Choose the length of the drawing's scale bar. Returns two values: a round length in metres, at most a quarter
-        of the drawing's width; and its share of that width, 0..1."""
-        wide_m = _WIDE / self.per_m
-        power = 10.0 ** math.floor(math.log10(wide_m / 4))
-        length_m = max(each * power for each in (1, 2, 5) if each * power <= wide_m / 4)
-        return length_m, length_m / wide_m
+    def _picture(self, mosaic: Mosaic) -> str:
+        west, south, east, north = mosaic.edges_m
+        (left, top), (right, bottom) = self._drawn(np.array([[west, east], [north, south]]))
+        return (
+            f'<image class="layer-ground" x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" '
+            f'height="{bottom - top:.2f}" preserveAspectRatio="none" href="{data_url("webp", mosaic.webp)}"/>'
+        )
 
     def _metres(self, points: Sequence[Point]) -> Doubles:
         """Return float (2, N): how far east and north of the origin the points lie."""
@@ -151,4 +123,4 @@ class Overhead:
 
     def _drawn(self, metres: Doubles) -> Points:
         east, north = (metres - self._middle_m) * self.per_m
-        return list(zip((_WIDE / 2 + east).tolist(), (self.high / 2 - north).tolist(), strict=True))
+        return list(zip((WIDTH / 2 + east).tolist(), (self.height / 2 - north).tolist(), strict=True))

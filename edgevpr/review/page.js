@@ -3,7 +3,7 @@
 (() => {
   const block = document.getElementById("steps");
   if (!block) return;
-  const { steps, pictures, perM, precisions, at: asked, needed } = JSON.parse(block.textContent);
+  const { steps, pictures, perM } = JSON.parse(block.textContent);
   const find = (query, within = document) => within.querySelector(query);
   const all = (query, within = document) => [...within.querySelectorAll(query)];
   const view = find(".view"), svg = view && find("svg", view), nowAt = document.getElementById("now-at");
@@ -22,13 +22,10 @@
     box = [Math.min(Math.max(x, 0), whole[2] - wide), Math.min(Math.max(y, 0), whole[3] - high), wide, high];
     svg.setAttribute("viewBox", box.join(" "));
     view.style.touchAction = zoomed() > 1.01 ? "none" : "pan-x pan-y"; // unzoomed, a finger scrolls the page
-    for (const label of all(".label", view)) {
-      label.style.left = `${100 * (label.dataset.x - box[0]) / box[2]}%`;
-      label.style.top = `${100 * (label.dataset.y - box[1]) / box[3]}%`;
-    }
-    const most = box[2] / perM / 4, power = 10 ** Math.floor(Math.log10(most)); // as Overhead.ruler
+    const most = box[2] / perM / 4, power = 10 ** Math.floor(Math.log10(most)); // a quarter of the width
     const length = [5, 2, 1].map((each) => each * power).find((each) => each <= most);
     const ruler = find(".ruler", view);
+    ruler.hidden = false;
     ruler.style.width = `${100 * length * perM / box[2]}%`;
     ruler.textContent = length < 1000 ? `${+length.toPrecision(1)} m` : `${length / 1000} km`;
   }
@@ -66,7 +63,7 @@
     const fingers = new Map();
     let moved = 0;
     view.addEventListener("pointerdown", (event) => {
-      if (event.target.closest("a, button")) return;
+      if (event.target.closest("button")) return;
       if (!fingers.size) moved = 0;
       fingers.set(event.pointerId, share(event));
     });
@@ -170,40 +167,6 @@
     show(shown.includes(now) ? now : shown[0]);
   }
 
-  // ---- Another precision: which matches it would have accepted, by the rule of `judge`.
-  function accepts({ sure, kind, followed }, number) {
-    const limit = needed[kind][number];
-    if (followed !== null && followed < 0.5) return false;
-    return sure >= limit || (followed !== null && followed >= Math.max(limit, 0.99));
-  }
-  function suppose(number) {
-    const judged = steps.filter((step) => step.judged);
-    const added = judged.filter(({ judged }) => !judged.accepted && accepts(judged, number));
-    const lost = judged.filter(({ judged }) => judged.accepted && !accepts(judged, number));
-    document.getElementById("asked").textContent = precisions[number] + (number === asked ? " (as it was)" : "");
-    const far = added.filter(({ judged }) => judged.off !== null).sort((one, other) => other.judged.off - one.judged.off);
-    const distance = added.length && (far.length
-      ? ` Of those added, ${far.length} have GPS beside them, the farthest ${far[0].judged.off} m away.`
-      : " How far they are from GPS is not known.");
-    document.getElementById("would").textContent =
-      `${added.length} more accepted, ${lost.length} fewer, of ${judged.length} that confidence decided.${distance || ""}`;
-    const list = document.getElementById("others");
-    list.textContent = "";
-    for (const [what, several] of [["added", [...new Set([...far, ...added])]], ["lost", lost]]) {
-      for (const step of several.slice(0, 20)) {
-        const off = step.judged.off === null ? "" : `, ${step.judged.off} m from GPS`;
-        const row = element("li", "", list, { className: `key ${what}` });
-        element("button", `${what}: ${step.title}${off}`, row, { type: "button", onclick: () => show(step) });
-      }
-      if (several.length > 20) element("li", `and ${several.length - 20} more ${what}`, list);
-    }
-    for (const mark of all(".would")) mark.remove();
-    for (const [what, several] of [["added", added], ["lost", lost]]) {
-      const d = several.map(({ at }) => at.accepted || at.found).filter(Boolean).map((point) => `M${point.join(" ")}h0`);
-      view && d.length && draw("path", { class: `would ${what}`, d: d.join("") }, svg);
-    }
-  }
-
   // ---- Put together.
   if (view) moveGround();
   if (!slider || !steps.length) return;
@@ -234,12 +197,6 @@
       const near = nearest(shown.filter((step) => step.lanes.includes(number)), (step) => Math.abs(step.x - x));
       near && show(near);
     });
-  }
-  if (needed) {
-    const precision = document.getElementById("precision");
-    precision.closest("fieldset").hidden = false;
-    precision.oninput = () => suppose(+precision.value);
-    suppose(asked);
   }
   filter();
 })();

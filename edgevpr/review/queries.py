@@ -1,168 +1,135 @@
 """The queries of a flight, or of `match`, as steps and layers over the ground, and as lanes over time."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
-from typing import Any
+from collections.abc import Sequence
 
-from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import nines
 from edgevpr.core.types import Place
 from edgevpr.review.html import clock, figure
-from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, Point, number, point, value
+from edgevpr.review.logged import FixOutcome, LoggedFlight, LoggedQuery, number, point, without_numbers
 from edgevpr.review.overhead import Layer, at_of
-from edgevpr.review.steps import NUMBER, ByConfidence, Step
+from edgevpr.review.steps import Step, layer_of
 
-# So the judge begins its reasons where the confidence alone decided.
-_BY_CONFIDENCE = re.compile(r"(?:([01]\.\d+) sure by the flight so far; )?confidence ([01]\.\d+), [01]\.\d+ needed: ")
-_FIXES = (
-    (FixOutcome.TAKEN, "fixes taken", "taken"),
-    (FixOutcome.UNANSWERED, "fixes not answered", "unanswered"),
-    (FixOutcome.REFUSED, "fixes refused", "refused"),
-)
+FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
+_UNUSABLE = "frame not usable"
+_SILENT = "autopilot silent"
 _LANES = {
     "match accepted": "accepted",
     "match refused": "refused",
-    "frame not usable": "unusable",
+    _UNUSABLE: "unusable",
     FixOutcome.TAKEN.value: "taken",
     FixOutcome.REFUSED.value: "refused",
     FixOutcome.UNANSWERED.value: "unanswered",
     FixOutcome.CONTINUOUS.value: "taken",
     FixOutcome.KEPT.value: "places",
-    "autopilot silent": "refused",
+    _SILENT: "refused",
+}
+_FIX_LAYERS = {
+    FixOutcome.TAKEN: ("fixes taken", "taken"),
+    FixOutcome.UNANSWERED: ("fixes not answered", "unanswered"),
+    FixOutcome.REFUSED: ("fixes refused", "refused"),
 }
 
 Lane = tuple[str, str, Sequence[float]]  # name, colour, times
 
 
-def lanes_of(flight: LoggedFlight) -> list[Lane]:
+def list_lanes(flight: LoggedFlight) -> list[Lane]:
     """Return a lane for everything that became of a query, or of a frame that never was one, if it happened."""
-    times: dict[str, list[float]] = {name: [] for name in _LANES}
-    times["frame not usable"] += flight.unusable
-    for query, names in zip(flight.queries, _became(flight), strict=True):
-        for name in names:
-            times[name].append(query.t_s)
-    return [(name, _LANES[name], times_s) for name, times_s in times.items() if times_s]
+    times_s: dict[str, list[float]] = {name: [] for name in _LANES}
+    times_s[_UNUSABLE] += flight.unusable
+    for query in flight.queries:
+        for name in _lanes_of(query):
+            times_s[name].append(query.t_s)
+    if not any(query.has_link for query in flight.queries):
+        del times_s[_SILENT]  # there was none
+    return [(name, _LANES[name], several_s) for name, several_s in times_s.items() if several_s]
 
 
-def _became(flight: LoggedFlight) -> list[list[str]]:
-    """Return the names of the lanes of each query."""
-    is_heard = any(query.has_link for query in flight.queries)
+def _lanes_of(query: LoggedQuery) -> list[str]:
+    names = ["match accepted" if query.accepted else "match refused"]
+    if query.fix:
+        names.append(query.fix.outcome.value)
+    if query.has_link is False:
+        names.append(_SILENT)
+    return names
+
+
+def list_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
+    """Return the layers of the drawing, from the bottom to the top."""
     return [
-        [
-            "match accepted" if query.accepted else "match refused",
-            *([query.fix.outcome.value] if query.fix else []),
-            *(["autopilot silent"] if is_heard and query.has_link is False else []),
-        ]
+        Layer("places of the map", "places", [[at_of(place) for place in ground]]),
+        layer_of(steps, "places found", "found"),
+        Layer("places learnt", "learnt", [flight.learnt]),
+        Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
+        layer_of(steps, flight.truth, "gps", "line"),
+        layer_of(steps, "autopilot", "autopilot", "line"),
+        layer_of(steps, "refused there", "missed"),
+        layer_of(steps, "matches", "accepted"),
+        *(layer_of(steps, name, colour) for name, colour in _FIX_LAYERS.values()),
+    ]
+
+
+def list_steps(ground: Sequence[Place], flight: LoggedFlight, lanes: Sequence[Lane]) -> list[Step]:
+    """Return a step for each query of a flight over the places of `ground`. Without `lanes` the steps have no time."""
+    places = {place.place_id: place for place in ground}
+    numbers = {name: row for row, (name, *_) in enumerate(lanes)}
+    return [
+        _step(
+            query,
+            places.get(query.place or 0),
+            [numbers[name] for name in _lanes_of(query) if name in numbers],
+            flight.truth,
+        )
         for query in flight.queries
     ]
 
 
-def layers_of(ground: Sequence[Place], flight: LoggedFlight) -> list[Layer]:
-    """Return the layers of the drawing, from the bottom to the top. Those without points are left out."""
-    queries = flight.queries
-    layers = [
-        Layer("places of the map", "places", [[at_of(place) for place in ground]]),
-        Layer("places found", "found", [list(dict.fromkeys(query.place_at for query in queries if query.place_at))]),
-        Layer("places learnt", "learnt", [flight.learnt]),
-        Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
-        Layer(flight.truth, "gps", _known_ways(query.gps_at for query in queries), "line"),
-        Layer("autopilot", "autopilot", _known_ways(query.autopilot_at for query in queries), "line"),
-        Layer("refused there", "missed", [[at for query in queries if (at := _missed_at(query))]]),
-        Layer("matches", "accepted", [[query.at for query in queries if query.at]]),
-    ]
-    for outcome, name, colour in _FIXES:
-        fixes = (query.fix for query in queries if query.fix and query.fix.outcome is outcome)
-        layers.append(Layer(name, colour, [[fix.at for fix in fixes if fix.at]]))
-    return [layer for layer in layers if any(layer.ways)]
-
-
-def _known_ways(points: Iterable[Point | None]) -> list[list[Point]]:
-    """Return the runs of successive known points: None, an unknown point, ends a run."""
-    return [[point for point in several if point] for are_known, several in groupby(points, bool) if are_known]
-
-
-def _missed_at(query: LoggedQuery) -> Point | None:
-    """Return where the aircraft was when a query was refused; None if it was accepted, or that is unknown."""
-    return None if query.accepted else query.true_at or query.autopilot_at
-
-
-def steps_of(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
-    """Return a step for each query of a flight over the places of `ground`."""
-    places = {place.place_id: place for place in ground}
-    lane_of = {name: at for at, (name, *_) in enumerate(lanes_of(flight))}
-    return [
-        _step(query, places.get(query.place or 0), [lane_of[name] for name in names], flight.truth)
-        for query, names in zip(flight.queries, _became(flight), strict=True)
-    ]
-
-
 def _step(query: LoggedQuery, place: Place | None, lanes: Sequence[int], truth: str) -> Step:
-    fix = query.fix
-    known = {
+    fix, verdict = query.fix, "accepted" if query.accepted else "refused"
+    points = {
         "found": query.place_at,
-        "missed": _missed_at(query),
+        "missed": None if query.accepted else query.true_at or query.autopilot_at,
         "gps": query.gps_at,
         "autopilot": query.autopilot_at,
-        **{colour: fix.at for outcome, _, colour in _FIXES if fix and fix.outcome is outcome},
-        "accepted": query.at,
     }
-    verdict = "accepted" if query.accepted else f"refused: {few(query.reason)}"
-    fixed = fix and f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}"
+    if fix and fix.outcome in _FIX_LAYERS:
+        points[_FIX_LAYERS[fix.outcome][1]] = fix.at
+    points["accepted"] = query.at  # the last: its circle is drawn
+    fixed = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
+    groups = [verdict if query.accepted else f"refused: {_brief(query.reason)}", without_numbers(fixed)]
+    if (query.off_m or 0.0) > FAR_M:
+        groups.append(f"match over {FAR_M:.0f} m from {truth}")
     pictures = [("seen", query.name, f"seen: {query.name}")]
-    if image := query.reference_image:
-        pictures.append(("place", image, f"place found: {image}"))
+    pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
     return Step(
-        title=f"{clock(query.t_s)} – {query.name}: {'accepted' if query.accepted else 'refused'}",
-        said=[found(query), _where(query, truth), query.reason, fixed or ""],
-        groups=[verdict, *([NUMBER.sub("…", fixed)] if fixed else [])],
-        at={name: at for name, at in known.items() if at},
+        title=f"{f'{clock(query.t_s)} – ' if lanes else ''}{query.name}: {verdict}",
+        said=[_place_found(query), _position(query, truth), query.reason, fixed],
+        groups=[group for group in groups if group],
+        at={name: at for name, at in points.items() if at},
         circle_m=query.accuracy_m if query.at else None,
         place=place,
-        t_s=query.t_s,
+        t_s=query.t_s if lanes else None,
         lanes=lanes,
-        pictures=[each for each in pictures if each[1]],
-        judged=_judged(query),
+        pictures=[picture for picture in pictures if picture[1]],
     )
 
 
-def found(query: LoggedQuery) -> str:
-    """Say which place was found, and how sure that is."""
+def _place_found(query: LoggedQuery) -> str:
     if query.place is None:
         return "no place was found"
     score = figure(number(query.line, "score"))
-    sure = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
-    return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{sure}"
+    confidence = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
+    return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
 
 
-def _where(query: LoggedQuery, truth: str) -> str:
-    good = "" if query.accuracy_m is None else f", good to {figure(query.accuracy_m, 'm')}"
+def _position(query: LoggedQuery, truth: str) -> str:
+    if not query.at:
+        return ""
+    accuracy = "" if query.accuracy_m is None else f", accurate to {figure(query.accuracy_m, 'm')}"
     off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from {truth}"
-    return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{good}{off}" if query.at else ""
+    return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{accuracy}{off}"
 
 
-def few(reason: str) -> str:
-    """Return a reason in a few words, without its figures."""
-    return "not sure enough" if _BY_CONFIDENCE.match(reason) else NUMBER.sub("…", re.split(r"[:;,] ", reason)[0])
-
-
-def _kind_of(evidence: Mapping[str, Any]) -> str:
-    """Return the kind of evidence, as the models are named, by the figures that the log has."""
-    if "likeness" in evidence:
-        return "ahead_proven" if evidence.get("proof") else "ahead"
-    return "down" if "landmarks" in evidence else "down_bare"
-
-
-def _judged(query: LoggedQuery) -> ByConfidence | None:
-    """Return how the confidence of a query was judged; None if something else decided, or the log does not say."""
-    said, evidence = _BY_CONFIDENCE.match(query.reason), value(query.line, "evidence")
-    if not said or not isinstance(evidence, dict):
-        return None
-    at = query.at or query.place_at
-    return ByConfidence(
-        confidence=float(said[2]),
-        kind=_kind_of(evidence),
-        followed=None if said[1] is None else float(said[1]),
-        accepted=query.accepted,
-        off_m=float(distance_m(*query.true_at, *at)) if query.true_at and at else None,
-    )
+def _brief(reason: str) -> str:
+    """Return the first words of a reason, without its numbers, so that reasons can be counted."""
+    return without_numbers(re.split(r"[:;,] ", reason)[0])

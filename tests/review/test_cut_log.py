@@ -10,7 +10,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.review.album import Album
 from edgevpr.review.export import features_of, write_csv, write_geojson
 from edgevpr.review.logged import read_flight
-from edgevpr.review.page import page_of
+from edgevpr.review.page import make_flight_page
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_a_log_that_was_cut_at_any_byte_is_read_and_exported_up_to_its_last_whol
         flight = read_flight(cut_log)
         assert len(flight.queries) == sum(is_query[:there])
         if cut + 1 in ends:
-            page_of(flight, [], Album([]), Album([]))
+            make_flight_page(flight, [], Album(), Album())
         features = features_of(flight)
         for write in (write_csv, write_geojson):
             write(features, written := io.StringIO())

@@ -10,15 +10,16 @@ from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
-from edgevpr.review.album import Album, album_of_map, small_pictures
-from edgevpr.review.mosaic import Mosaic, mosaic_of
+from edgevpr.review.album import album_of, album_of_map, small_pictures
+from edgevpr.review.mosaic import lay_mosaic
 
 
 def assert_is_the_ground(found):
     """Hold the picture of the ground against the landscape."""
-    assert isinstance(found, Mosaic)
-    seen = cv2.imdecode(np.frombuffer(found.webp, np.uint8), cv2.IMREAD_UNCHANGED)
-    west, south, east, north = found.edges_m
+    mosaic, lacking = found
+    assert not lacking
+    seen = cv2.imdecode(np.frombuffer(mosaic.webp, np.uint8), cv2.IMREAD_UNCHANGED)
+    west, south, east, north = mosaic.edges_m
     assert seen.shape[0] / seen.shape[1] == pytest.approx((north - south) / (east - west), rel=0.01)
     scale = (east - west) / seen.shape[1] * METRE_PX
     way = np.array([[scale, 0, 280 + west * METRE_PX], [0, scale, 280 - north * METRE_PX]])
@@ -29,17 +30,17 @@ def assert_is_the_ground(found):
     assert shown[seen.shape[0] // 2, seen.shape[1] // 2]
 
 
-def test_pictures_lie_where_their_poses_say(tmp_path):
-    assert_is_the_ground(mosaic_of(places_in(tmp_path), Album([tmp_path]), None, ORIGIN))
+def test_lay_mosaic_puts_pictures_where_their_poses_say(tmp_path):
+    assert_is_the_ground(lay_mosaic(places_in(tmp_path), album_of([tmp_path]), None, ORIGIN))
 
 
 def test_a_map_of_levelled_pictures_is_laid_with_its_lens(tmp_path):
     places = places_in(tmp_path)
     write_positions(tmp_path / "positions.csv", places)
     north_up = [replace(each, pose=replace(each.pose, up_deg=0.0)) for each in places]
-    assert_is_the_ground(mosaic_of(north_up, Album([tmp_path]), Lens(60.0), ORIGIN))
-    assert isinstance(mosaic_of(north_up, Album([tmp_path]), None, ORIGIN), str)
-    assert_is_the_ground(mosaic_of(places, Album([tmp_path]), Lens(60.0), ORIGIN))  # it was made without the lens
+    assert_is_the_ground(lay_mosaic(north_up, album_of([tmp_path]), Lens(60.0), ORIGIN))
+    assert lay_mosaic(north_up, album_of([tmp_path]), None, ORIGIN)[0] is None
+    assert_is_the_ground(lay_mosaic(places, album_of([tmp_path]), Lens(60.0), ORIGIN))  # it was made without the lens
 
 
 @pytest.mark.parametrize(
@@ -58,9 +59,9 @@ def test_a_map_of_levelled_pictures_is_laid_with_its_lens(tmp_path):
     ],
 )
 def test_where_there_can_be_no_picture_of_the_ground_it_is_said(tmp_path, places, folder, said):
-    found = mosaic_of(places(places_in(tmp_path)), Album([tmp_path] if folder else []), None, ORIGIN)
-    assert isinstance(found, str)
-    assert said in found
+    mosaic, lacking = lay_mosaic(places(places_in(tmp_path)), album_of([tmp_path] if folder else []), None, ORIGIN)
+    assert mosaic is None
+    assert said in lacking
 
 
 def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
@@ -70,14 +71,13 @@ def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
     album = album_of_map([textured_raster(tmp_path / "town.tif")], places)
     assert album.image("town.tif_r000_c000").std() > 10
     assert album.image("town.tif_r000_c001") is None
-    found = mosaic_of(places, album, None, (HOME.lat_deg, HOME.lon_deg))
-    assert isinstance(found, Mosaic)
+    assert lay_mosaic(places, album, None, (HOME.lat_deg, HOME.lon_deg))[0]
     assert album_of_map([], places).image("town.tif_r000_c000") is None
 
 
 def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
     keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
-    albums = {"seen": Album([tmp_path])}
+    albums = {"seen": album_of([tmp_path])}
     sizes = []
     for room_bytes in (1e6, 3e4, 6e3):
         found, left_out = small_pictures(keys, albums, room_bytes)

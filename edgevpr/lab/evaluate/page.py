@@ -21,12 +21,12 @@ from edgevpr.review.html import (
     Axis,
     Series,
     chart,
+    data_url,
     figure,
     foreign,
     heading,
     notes,
     page,
-    picture,
     section,
     table,
 )
@@ -159,7 +159,9 @@ def _show_match(dataset: Dataset, answer: QueryAnswer) -> str:
 
 
 def _picture(role: str, path: Path) -> str:
-    return picture(path.name, f"{role}: {path.name}", small_jpeg(read_image(path), _PICTURE_PX))
+    name, jpeg = foreign(path.name), small_jpeg(read_image(path), _PICTURE_PX)
+    image = f'<img alt="{name}" src="{data_url("jpeg", jpeg)}">'
+    return f"<figure>{image}<figcaption>{role}: {name}</figcaption></figure>"
 
 
 def _paragraphs(sentences: Sequence[str]) -> str:

@@ -17,11 +17,10 @@ from edgevpr.lab.simulate.processes import autopilot_process, run_to_end
 from edgevpr.lab.simulate.rehearsal import footprint_m, ground_under, write_rehearsal
 from edgevpr.lab.simulate.rehearsal_report import RehearsalReport, RehearsedFlight, judge_by_tags, report_on
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.review.album import Album, album_of_map
-from edgevpr.review.logged import read_lines, value
-from edgevpr.review.matchpage import thresholds_of
+from edgevpr.review.album import album_of, album_of_map
+from edgevpr.review.logged import read_lines
 from edgevpr.review.overhead import read_ground
-from edgevpr.review.page import page_of
+from edgevpr.review.page import make_flight_page
 from edgevpr.runtime.flight.flightlog import flight_of
 
 _MAX_GPS_S, _GPS_SHARE = 20.0, 0.25  # of the flight with GPS, from which its filter starts
@@ -60,8 +59,7 @@ def rehearse(mission: Mission, folder: Path) -> RehearsalReport:
     flown = _read(folder)
     report = report_on(flown, ground, footprint_m(mission.shots, mission.fov_deg), gps_until_s)
     flown.flight.notes = (report.answer,)
-    thresholds = thresholds_of(value(flown.flight.start, "decided", "rule", "sure"))
-    page = page_of(flown.flight, ground, Album([folder / "images"]), references, thresholds=thresholds)
+    page = make_flight_page(flown.flight, ground, album_of([folder / "images"]), references)
     write_whole(folder / "report.html", lambda out: out.write_text(page, "utf-8", errors="backslashreplace"))
     return report
 

@@ -103,8 +103,7 @@ def judge_by_tags(flight: LoggedFlight, tags: Mapping[str, GeoTag]) -> None:
 
 
 def _judge(query: LoggedQuery, truth: Point) -> LoggedQuery:
-    off_m = float(distance_m(*truth, *query.at)) if query.at else None
-    return replace(query, gps_at=truth, true_at=truth, off_m=off_m)
+    return replace(query, gps_at=truth, true_at=truth)
 
 
 def report_on(
