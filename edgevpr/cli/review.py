@@ -89,13 +89,13 @@ def run_export(args: Namespace) -> int:
 def run_replay(args: Namespace) -> int:
     """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs from
     the flight, but 0 with --config."""
-    from edgevpr.review.compare import beside, compare
+    from edgevpr.review.compare import compare, compare_queries
     from edgevpr.review.replay import replay
 
     again = replay(args.log, args.map, path_of(args.config))
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
     if args.config:
-        found = beside(again.flown, again.lines)
+        found = compare_queries(again.flown, again.lines)
         show({**found, **end}, args.json, of_what_if(found, again.why_ended))
         return 0
     lines, packets = compare(again.flown, again.lines), again.packets

@@ -142,7 +142,7 @@ def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator
 
 def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
     """Yield how the queries of a flight end with another configuration. `found` is the result of
-    `review.compare.beside`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
+    `review.compare.compare_queries`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
     others = found["queries"]
     yield from _first([f"{each['query']}: {_said(each['then'])}; what if: {_said(each['now'])}" for each in others])
     values = [["-" if each is None else str(each) for each in both] for both in found["summary"].values()]

@@ -17,7 +17,15 @@ from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 
 _UNPACKED = "image", "position", "pose"
-_STATE = "ended", "dropped", "refused", "latency_s", "condition", "state"
+# The attributes of a source that change, and what a replay takes them for where the tape has none.
+_STATE = {
+    "ended": False,
+    "dropped": 0,
+    "refused": {},
+    "latency_s": None,
+    "condition": Condition.RUNNING.name,
+    "state": "replayed",
+}
 
 
 class RecordedSource(Source):
@@ -70,7 +78,7 @@ class ReplayedSource(Source):
     def __getattr__(self, name: str) -> Any:
         if name not in _STATE:
             raise AttributeError(name)
-        value: Any = self._tape.read(name, lambda: None)
+        value: Any = self._tape.read(name, lambda: _STATE[name])
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:

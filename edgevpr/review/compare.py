@@ -10,26 +10,25 @@ from typing import Any
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.review.logged import FixOutcome, LoggedQuery, read_lines
+from edgevpr.review.logged import SENT, LoggedQuery, read_lines
 
 Line = dict[str, Any]
 Changes = dict[str, tuple[Any, Any]]  # by name: (value in the flight, value in the replay)
 
 _SIGNATURE_BYTES = 13
-_NOT_SENT = FixOutcome.KEPT, FixOutcome.CONTINUOUS
 _COMPARED = ("accepted", "reason", "place", "confidence", "at", "off_m")  # of a query, in a what-if
 
 # Fields of a log's first line that describe the program that flew, not the flight.
-PROGRAM = "version", "machine", "python", "libraries"
+_PROGRAM = ("version", "machine", "python", "libraries")
 
 
 @dataclass(slots=True)
 class Lines:
     """Comparison of the logs of flight and replay: the number of lines that are `alike`, the `others`, which differ,
     and the number of lines of the flight that come `after` the end of the replay. `program` has those fields of the
-    first line that describe the program (see `PROGRAM`) and differ. Each of the `others` has the `kind` of the line,
-    its time `t_mono_s`, its `query`, and either `fields`, those that differ, by dotted name (like "fix.sent"), or
-    `only_in`: "flight" or "replay" if the other log has no such line."""
+    first line that describe the program and differ. Each of the `others` has the `kind` of the line, its time
+    `t_mono_s`, its `query`, and either `fields`, those that differ, by dotted name (like "fix.sent"), or `only_in`:
+    "flight" or "replay" if the other log has no such line."""
 
     alike: int = 0
     others: list[Line] = field(default_factory=list)
@@ -53,17 +52,16 @@ def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
         else:
             fields = dict(_differing(before[key], after[key]))
             if kind == "start":
-                found.program = {name: each for name, each in fields.items() if name.partition(".")[0] in PROGRAM}
-            if others := {name: each for name, each in fields.items() if name not in found.program}:
-                found.others.append({**line, "fields": others})
+                found.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM}
+            if fields:
+                found.others.append({**line, "fields": fields})
             else:
                 found.alike += 1
     return found
 
 
 def _keyed(lines: Iterable[Line]) -> dict[tuple[Any, ...], Line]:
-    """Return the lines as a dict. A key is (kind, time, query, number): lines with equal kind, time and query are
-    numbered from 0."""
+    """Return the lines by (kind, time, query, number): lines with equal kind, time and query are numbered from 0."""
     seen: Counter[tuple[Any, ...]] = Counter()
     keyed = {}
     for line in lines:
@@ -94,14 +92,11 @@ class Packets:
         if then and now and _content(then) == _content(now):
             self.alike += 1
         elif then or now:
-            self.others.append(f"{t_s:.3f} s, {link}: said {_described(then)}, now {_described(now)}")
+            self.others.append(f"{t_s:.3f} s, {link}: sent {_described(then)}, now {_described(now)}")
 
 
 def _described(packet: bytes | None) -> str:
-    if packet is None:
-        return "nothing"
-    (message,) = mavlink.MAVLink(None).parse_buffer(packet)
-    return str(message)
+    return str(mavlink.MAVLink(None).parse_buffer(packet)[0]) if packet else "nothing"
 
 
 def _content(packet: bytes) -> bytes:
@@ -113,31 +108,31 @@ def _content(packet: bytes) -> bytes:
     return packet[:2] + packet[3:4] + packet[5 : -2 - signature_bytes]
 
 
-def beside(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:
+def compare_queries(then: Iterable[Line], now: Iterable[Line]) -> dict[str, Any]:
     """Put the queries of a flight (the lines `then`) and of its replay with another configuration (`now`) side by side.
     Returns a dict:
     - `queries`: those that end otherwise (another place accepted, or none), each with `query`, `then` and `now`
     - `summary`: by name, [a figure of the flight, that of the replay]; `alike`: number of queries that end alike
     - `apart_at_most_m`: largest distance between the two positions of a query (None: no query has two).
     """
-    flown, again = ({each.name: each for each in read_lines(lines, Path()).queries} for lines in (then, now))
-    pairs = [(name, flown.get(name), again.get(name)) for name in flown | again]
-    placed = [(one.at, other.at) for _, one, other in pairs if one and other and one.at and other.at]
-    others = [
-        {"query": name, "then": _said(one), "now": _said(other)}
-        for name, one, other in pairs
-        if not (one and other and _accepted(one) == _accepted(other))
-    ]
-    both = [_summary(list(each.values())) for each in (flown, again)]
+    flown, again = ({query.name: query for query in read_lines(lines, Path()).queries} for lines in (then, now))
+    others, apart_m = [], []
+    for name in flown | again:
+        one, other = flown.get(name), again.get(name)
+        if not (one and other and _accepted(one) == _accepted(other)):
+            others.append({"query": name, "then": _fields(one), "now": _fields(other)})
+        if one and other and one.at and other.at:
+            apart_m.append(float(distance_m(*one.at, *other.at)))
+    both = [_summary(list(queries.values())) for queries in (flown, again)]
     return {
         "queries": others,
-        "summary": {name: [each[name] for each in both] for name in both[0]},
-        "alike": len(pairs) - len(others),
-        "apart_at_most_m": max((float(distance_m(*one, *other)) for one, other in placed), default=None),
+        "summary": {name: [figures[name] for figures in both] for name in both[0]},
+        "alike": len(flown | again) - len(others),
+        "apart_at_most_m": max(apart_m, default=None),
     }
 
 
-def _said(query: LoggedQuery | None) -> Line | None:
+def _fields(query: LoggedQuery | None) -> Line | None:
     return None if query is None else {name: getattr(query, name) for name in _COMPARED}
 
 
@@ -150,7 +145,7 @@ def _summary(queries: list[LoggedQuery]) -> Line:
     return {
         "queries": len(queries),
         "accepted": sum(query.accepted for query in queries),
-        "fixes_sent": sum(bool(each.fix and each.fix.at and each.fix.outcome not in _NOT_SENT) for each in queries),
+        "fixes_sent": sum(bool(query.fix and query.fix.at and query.fix.outcome in SENT) for query in queries),
         "median_off_gps_m": round(median(off_m), 1) if off_m else None,
         "largest_off_gps_m": round(max(off_m), 1) if off_m else None,
     }

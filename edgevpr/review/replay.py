@@ -20,7 +20,7 @@ from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
 from edgevpr.review.compare import Line, Packets
-from edgevpr.review.tape import Playback, ReplayedSigning, Supposed, TapeEnded, read_tape
+from edgevpr.review.tape import Playback, ReplayedGround, ReplayedLink, ReplayedSigning, Supposed, TapeEnded, read_tape
 from edgevpr.runtime.flight.clock import Clock, taped
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightlog import flight_of, read_log
@@ -68,8 +68,8 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
             tape=playback,
             clock=taped(Clock(sleep=playback.sleep), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
-            link=playback.link,
-            ground=playback.ground,
+            link=ReplayedLink,
+            ground=ReplayedGround,
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
             tap=untapped,
             stop=Stop(playback),

@@ -12,8 +12,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Tape
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.groundlink import GroundLink
@@ -24,26 +25,13 @@ from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import Packets
 from edgevpr.runtime.flight.world import StopNow
 
-T = TypeVar("T")
 Note = list[Any]  # a line of the tape: a kind, and its values
-_CLOCKS = "mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s"
+_CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
 _RETIRED = "forms", "reread", "config"  # kinds of notes that only earlier versions wrote
 
-# Kinds of questions of a what-if: those answered by the newest answer on the tape, and those with always the same one.
-_AS_FOUND = "is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn"
-_ALWAYS: dict[str, Any] = {
-    "stop": False,
-    "log is written": True,
-    "process_cpu_s": 0.0,
-    "thread_cpu_s": 0.0,
-    "refused": {},
-    "dropped": 0,
-    "latency_s": None,
-    "condition": "RUNNING",
-    "tile": True,
-    "state": "replayed",
-}
+# Questions about the machine: in a "what if", the newest answer on the tape is given.
+_MACHINE = ("is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn")
 
 _log = logging.getLogger(__name__)
 
@@ -53,8 +41,8 @@ class TapeEnded(BaseException):
 
 
 class ReplayedLink(Link):
-    """A link without a port and a thread, whose turns come from the tape, a `Playback`. Each step of a turn, such as
-    "heard", is repeated by the method of that name, such as `_heard`."""
+    """A link without a port and a thread, whose turns come from the tape, a `Playback`. In a "what if" it receives what
+    the autopilot sent in the flight, and a packet to the autopilot counts as sent at once."""
 
     def start(self) -> None:
         """Let the playback perform the link's turns from now on."""
@@ -67,76 +55,59 @@ class ReplayedLink(Link):
         with self.turn("close"):
             self._conversation.texts.hurry()
 
-    def _perform(self, t_s: float, steps: list[Note]) -> None:
-        with self._turns.again(t_s):
-            for step, *values in steps:
-                try:
-                    getattr(self, f"_{step}")(*values)
-                except Exception:  # as in the flight, whose link went on with the next turn
-                    _log.debug("a turn of the link failed", exc_info=True)
+    def _ring(self) -> None:
+        if not self._playback.is_exact:
+            with self.turn("ring"):
+                self._send_all()
 
-    def _waits(self) -> None:
-        self._conversation.fixes.drop_stale(self._turns.now_s())
-
-    def _answers(self) -> None:
-        self._conversation.tell_of_answers()
-
-    def _heard(self, data: str, sender: list[Any] | None, verdicts: list[str | None]) -> None:
-        if verdicts:
-            cast(ReplayedSigning, self._settings.signing).verdicts = deque(verdicts)
-        self._conversation.hear(b64decode(data), self._turns.now_s(), (sender[0], sender[1]) if sender else None)
-
-    def _said(self, then: str | None) -> None:
-        packet, sending = self._conversation.next_packet() or (None, None)
-        if sending:
-            self._leaving.append(sending)
-        said = b64decode(then) if then else None
-        self._playback.packets.compare(self._turns.now_s(), self.name, said, packet)
-
-    def _departed(self, count: int) -> None:
-        departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
-        for sending in departed:
-            sending.settle(True)
-        self._conversation.note_departed(departed)
-
-    def _lost(self, count: int) -> None:
-        self._throw_away()
-        self._conversation.break_off(count)
-
-    def _closed(self, count: int) -> None:
-        self._throw_away()
-        self._conversation.end()
-
-    def _throw_away(self) -> None:
-        for sending in self._leaving:
-            sending.settle(False, LOST)
-        self._leaving.clear()
-
-
-class ReplayedGround(GroundLink, ReplayedLink):
-    """The link to the ground station, replayed as `ReplayedLink` is."""
-
-
-class SupposedLink(ReplayedLink):
-    """The link of a "what if" (see `Supposed`): it receives what the autopilot sent in the flight, and a packet to the
-    autopilot counts as sent at once."""
-
-    def _said(self, then: str | None) -> None:
+    def _send_all(self) -> None:
         while chosen := self._conversation.next_packet():
             if sending := chosen[1]:
                 sending.settle(True)
                 self._conversation.note_departed([sending])
 
-    def _departed(self, count: int) -> None:
-        pass
+    def _perform(self, t_s: float, steps: list[Note]) -> None:
+        """Repeat the `steps` of a turn at the time `t_s`, as `Link` wrote them on the tape."""
+        with self._turns.again(t_s):
+            for step in steps:
+                self._repeat(step, t_s)
 
-    def _ring(self) -> None:
-        with self.turn("ring"):
-            self._said(None)
+    def _repeat(self, step: Note, now_s: float) -> None:
+        conversation = self._conversation
+        match step:
+            case ["waits"]:
+                conversation.fixes.drop_stale(now_s)
+            case ["answers"]:
+                conversation.tell_of_answers()
+            case ["heard", data, sender, verdicts]:
+                if verdicts:
+                    cast(ReplayedSigning, self._settings.signing).verdicts = deque(verdicts)
+                try:
+                    conversation.hear(b64decode(data), now_s, tuple(sender) if sender else None)
+                except Exception:  # as in the flight, which then lost the link
+                    _log.debug("the link failed", exc_info=True)
+            case ["said", _] if not self._playback.is_exact:
+                self._send_all()
+            case ["said", then]:
+                packet, sending = conversation.next_packet() or (None, None)
+                self._leaving += [sending] if sending else []
+                self._playback.packets.compare(now_s, self.name, b64decode(then) if then else None, packet)
+            case ["departed", count]:
+                departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
+                for sending in departed:
+                    sending.settle(True)
+                conversation.note_departed(departed)
+            case ["lost" | "closed" as what, count]:
+                for sending in self._leaving:
+                    sending.settle(False, LOST)
+                self._leaving.clear()
+                conversation.break_off(count) if what == "lost" else conversation.end()
+            case _:
+                raise EdgevprError(f"The tape has a step of the link that this edgevpr does not know: {step}")
 
 
-class SupposedGround(GroundLink, SupposedLink):
-    """The link to the ground station, replayed as `SupposedLink` is."""
+class ReplayedGround(GroundLink, ReplayedLink):
+    """The link to the ground station, replayed as `ReplayedLink` is."""
 
 
 class ReplayedSigning(Signing):
@@ -162,15 +133,14 @@ class ReplayedSigning(Signing):
 class Playback(Tape):
     """A tape that is played back. `links` has, by the name of a link, the function that performs its turns, given the
     time and the steps of a turn; turns are performed in the order of the tape. `packets` compares the packets sent with
-    those of the flight. `link` and `ground` are the classes of the links that a replay uses.
+    those of the flight.
 
     Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
     the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
     questions out of order; if it is 0, the replay has asked exactly what the flight asked.
     """
 
-    link: type[ReplayedLink] = ReplayedLink
-    ground: type[GroundLink] = ReplayedGround
+    is_exact = True  # False: a "what if"
 
     def __init__(self, notes: Iterable[Note]) -> None:
         self.links: dict[str, Callable[[float, list[Note]], None]] = {}
@@ -181,7 +151,7 @@ class Playback(Tape):
         self._known: dict[str, Any] = {}
         self._is_stopping = False
 
-    def read(self, kind: str, look: Callable[[], T]) -> T:
+    def read(self, kind: str, look: Callable[[], Any]) -> Any:
         """Return the flight's answer to a question of `kind`. `look` asks the real machine: it is called only if the
         tape has no answer. Raises StopNow where the flight was stopped, and TapeEnded."""
         if self._head() == "stopped":
@@ -194,7 +164,7 @@ class Playback(Tape):
         if self._head() != kind:
             self.guessed += 1
             if not self._comes(kind):
-                return cast(T, self._guess(kind, look))
+                return self._guess(kind, look)
             while self._head() not in (kind, "stopped"):
                 self._at += 1
         head, *values = self._notes[self._at]
@@ -204,7 +174,7 @@ class Playback(Tape):
         found = self._known[kind] = values[0]
         if _is_moment(kind):
             self.t_s = max(self.t_s, found)
-        return cast(T, found)
+        return found
 
     def sleep(self, seconds: float) -> None:
         """Return at once: the time comes from the tape."""
@@ -243,16 +213,11 @@ class Playback(Tape):
 
 class Supposed(Playback):
     """Playback for a "what if": the flight with another configuration, which may ask for and send other things than the
-    recorded flight did. Its time is that of the tape and goes on from frame to frame; computing takes no time.
-    Questions about the machine get the newest answer on the tape."""
+    recorded flight did. Its time is that of the tape and goes on from frame to frame; computing takes no time."""
 
-    link, ground = SupposedLink, SupposedGround
+    is_exact = False
     _has_ended = False
     _utc_ahead_s = 0.0
-
-    def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return an answer that the flight could have got to a question of `kind`; `look` asks the real machine."""
-        return cast(T, look() if kind == "outlook" else self._answer(kind, look))
 
     def sleep(self, seconds: float) -> None:
         """Advance the time by `seconds`. The notes of that time are taken off the tape, up to the next frame."""
@@ -261,17 +226,20 @@ class Supposed(Playback):
             self._step(note)
         self.t_s = max(self.t_s, until_s)
 
-    def _answer(self, kind: str, look: Callable[[], Any]) -> Any:
+    def read(self, kind: str, look: Callable[[], Any]) -> Any:
+        """Return an answer that the flight could have got to a question of `kind`; `look` asks the real machine."""
         if kind == "frame":
             return self._frame()
         if kind == "ended":
             return self._has_ended
-        if kind in _AS_FOUND:
-            while kind not in self._known and (note := self._next()):
-                self._step(note)
-            return self._known[kind] if kind in self._known else look()
-        now_s = self.t_s + (self._utc_ahead_s if kind == "utc_s" else 0.0)
-        return _ALWAYS.get(kind, now_s)
+        if kind == "tile":
+            return True  # the flight waits until it is loaded
+        if kind in _CLOCKS:
+            times_s = {"mono_s": self.t_s, "wall_s": self.t_s, "utc_s": self.t_s + self._utc_ahead_s}
+            return times_s.get(kind, 0.0)
+        while kind in _MACHINE and kind not in self._known and (note := self._next()):
+            self._step(note)
+        return self._known[kind] if kind in _MACHINE and kind in self._known else look()
 
     def _frame(self) -> dict[str, Any] | None:
         """Return the next frame (None: the tape has no more). If the time is past several frames, return the newest of
