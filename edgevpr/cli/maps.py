@@ -252,7 +252,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     from edgevpr.mapmaking.lookalikes import look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import album_of_map
-    from edgevpr.review.mappage import MOST_ASKED, MapFindings, make_map_page
+    from edgevpr.review.mappage import MOST_ASKED, make_map_page
     from edgevpr.runtime.recognise.levelling import lens_of
 
     lens = lens_of(config_of(args, args.config).source)
@@ -264,8 +264,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
         found = look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
         alike = list(found)
     name = Path(args.map).name
-    findings = MapFindings(name=name, places=places, lines=said, recognisable=recognisable, alike=alike)
-    page = make_map_page(findings, pictures, lens)
+    page = make_map_page(name, said, places, recognisable, alike, pictures, lens)
     write_out(args.page, args.map, lambda out: out.write(page))
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")

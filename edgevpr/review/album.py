@@ -29,7 +29,7 @@ Key = tuple[str, str]  # which album, and the name of a picture in it
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class AlbumPicture:
     """A picture, uint8 (H, W[, 3]), its mask, bool (H, W), False where it shows no ground (None: nowhere), and a
     function that reads its position and attitude (None: unknown)."""
 
@@ -38,7 +38,7 @@ class Picture:
     tag: Callable[[], GeoTag | None] | None = None
 
 
-Finder = Callable[[str], Picture | None]  # returns the picture of a name; None if there is none that can be read
+Finder = Callable[[str], AlbumPicture | None]  # returns the picture of a name; None if there is none that can be read
 
 
 class Album:
@@ -68,7 +68,7 @@ class Album:
         picture = self._find(name)
         return picture.image if picture else None
 
-    def level(self, place: Place, lens: "Lens | None") -> Picture | None:
+    def level(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
         """Return the picture of a place as its pose lays it on the ground: levelled, if the `lens` is known. None if
         there is no such picture."""
         picture = self._find(place.source_image)
@@ -82,26 +82,26 @@ class Album:
         from edgevpr.frames.source import tagged
 
         level = levelled(tagged(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
-        return Picture(level.image, level.mask)
+        return AlbumPicture(level.image, level.mask)
 
-    def _find(self, name: str) -> Picture | None:
+    def _find(self, name: str) -> AlbumPicture | None:
         return next((picture for finder in self._finders if (picture := finder(name))), None)
 
 
-def _read(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> Picture | None:
+def _read(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
     from edgevpr.frames.images import read_image  # a page without pictures needs no OpenCV
 
     with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
         if path.is_file():
-            return Picture(read_image(path), tag=tag)
+            return AlbumPicture(read_image(path), tag=tag)
     return None
 
 
-def _find_recorded(recorded: Mapping[str, Path], name: str) -> Picture | None:
+def _find_recorded(recorded: Mapping[str, Path], name: str) -> AlbumPicture | None:
     return _read(recorded[name]) if name in recorded else None
 
 
-def _find_in_folder(folder: Path, name: str) -> Picture | None:
+def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
     # A log from somebody else may name any file of this machine: show only files in the folder.
     path = folder / Path(name).name
     return _read(path, lambda: _tags_in(folder).get(path))
@@ -129,7 +129,7 @@ class _Film:
         self._open = partial(open_source, str(film), live=False)
         self._source, self._passed = self._open(), ""
 
-    def __call__(self, name: str) -> Picture | None:
+    def __call__(self, name: str) -> AlbumPicture | None:
         from edgevpr.frames.source import read_to_end
 
         named = _FRAME.fullmatch(name)
@@ -142,7 +142,7 @@ class _Film:
             self._passed = frame.name
             if frame.name >= name:
                 tag = partial(self._track.tag_at, float(named[1])) if self._track else None
-                return Picture(frame.image, tag=tag) if frame.name == name else None
+                return AlbumPicture(frame.image, tag=tag) if frame.name == name else None
         return None
 
 
@@ -157,10 +157,10 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     points = [(position.lat_deg, position.lon_deg) for position, _ in known]
     orthophoto = Orthophoto(source, ground_of(points, max(pose.footprint_m for _, pose in known)))
 
-    def find(name: str) -> Picture | None:
+    def find(name: str) -> AlbumPicture | None:
         position, pose = cut.get(name, (None, None))
         with suppress(ImageError):
-            return Picture(*orthophoto.cut(position, pose.footprint_m, _CUT_PX)) if position and pose else None
+            return AlbumPicture(*orthophoto.cut(position, pose.footprint_m, _CUT_PX)) if position and pose else None
         return None
 
     return find

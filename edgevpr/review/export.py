@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, TextIO
 
 from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, point, text
@@ -18,35 +18,31 @@ def features_of(flight: LoggedFlight) -> list[Feature]:
     autopilot and GPS receiver; and the fixes sent between matches."""
     features = [feature for query in flight.queries for feature in _of_query(query)]
     for line in flight.between:
-        if at := point(line):
-            known = {"time": text(line, "time") or "", "accuracy_m": number(line, "accuracy_m")}
-            features.append(_feature("between", at, known))
+        known = {"time": text(line, "time") or "", "accuracy_m": number(line, "accuracy_m")}
+        features += _feature("between", point(line), known)
     return features
 
 
-def _of_query(query: LoggedQuery) -> Iterator[Feature]:
+def _of_query(query: LoggedQuery) -> list[Feature]:
     named = {"time": text(query.line, "time") or "", "t_s": round(query.t_s, 3), "query": query.name}
-    if query.at:
-        match = {
-            "place": query.place,
-            "reference_image": query.reference_image,
-            "score": number(query.line, "score"),
-            "confidence": query.confidence,
-            "accuracy_m": query.accuracy_m,
-            "from_gps_m": None if query.off_m is None else round(query.off_m, 2),
-        }
-        yield _feature("match", query.at, named | match)
-    if (fix := query.fix) and fix.at:
-        known = {"outcome": fix.outcome.value, "why": fix.why, "accuracy_m": fix.accuracy_m}
-        yield _feature("fix", fix.at, named | known)
-    if query.autopilot_at:
-        yield _feature("autopilot", query.autopilot_at, named)
-    if query.gps_at:
-        yield _feature("gps", query.gps_at, named)
+    match = {
+        "place": query.place,
+        "reference_image": query.reference_image,
+        "score": number(query.line, "score"),
+        "confidence": query.confidence,
+        "accuracy_m": query.accuracy_m,
+        "from_gps_m": None if query.off_m is None else round(query.off_m, 2),
+    }
+    features = _feature("match", query.at, named | match)
+    if fix := query.fix:
+        outcome = {"outcome": fix.outcome.value, "why": fix.why, "accuracy_m": fix.accuracy_m}
+        features += _feature("fix", fix.at, named | outcome)
+    return [*features, *_feature("autopilot", query.autopilot_at, named), *_feature("gps", query.gps_at, named)]
 
 
-def _feature(kind: str, at: Point, properties: dict[str, Any]) -> Feature:
-    return dict(zip(_PLACED, (kind, *at), strict=True)) | properties
+def _feature(kind: str, at: Point | None, properties: dict[str, Any]) -> list[Feature]:
+    """Return the feature of a position; nothing if it is unknown."""
+    return [{"kind": kind, "lat_deg": at[0], "lon_deg": at[1]} | properties] if at else []
 
 
 def write_geojson(features: Sequence[Feature], out: TextIO) -> None:

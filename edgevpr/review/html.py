@@ -162,24 +162,19 @@ def chart(title: str, unit: str, series: Sequence[Series], axis: Axis, top: floa
     )
 
 
-def lanes(rows: Sequence[tuple[str, str, Sequence[float]]], span_s: float) -> str:
-    """Return one lane for each row (name, colour, times in seconds): a mark at every time, and their number; "" without
-    rows."""
-    axis, lines = time_axis(span_s), ""
-    for row, (name, colour, times_s) in enumerate(rows):
-        marks = "".join(f"M{x:g} 0v{_LANE_HEIGHT:g}" for x in sorted({round(axis.x(t_s), 1) for t_s in times_s}))
-        paths = f'{axis.grid(_LANE_HEIGHT)}<path class="mark {colour}" d="{marks}" data-lane="{row}"/>'
-        drawing = _svg(f"{name}: {len(times_s)}", _LANE_HEIGHT, paths)
-        lines += f"<span>{escape(name)} <b>{len(times_s)}</b></span>{drawing}"
-    return f'<div class="lanes">{lines}<span></span>{axis.texts()}</div>' if rows else ""
+def lane(name: str, colour: str, times_s: Sequence[float], axis: Axis, attributes: str = "") -> str:
+    """Return a lane with a mark at each of `times_s`. `attributes` are those of the path of the marks."""
+    marks = "".join(f"M{x:g} 0v{_LANE_HEIGHT:g}" for x in sorted({round(axis.x(t_s), 1) for t_s in times_s}))
+    path = f'<path class="mark {colour}" d="{marks}" {attributes}/>'
+    return _svg(name, _LANE_HEIGHT, axis.grid(_LANE_HEIGHT) + path)
 
 
 def path(points: Points, form: str = "line") -> str:
     """Return SVG path data of a "line" through `points`, of an "area" inside them, or of "dots": lines of length 0,
     whose round ends make dots as wide as the line."""
     if form == "dots" or len(points) == 1:
-        return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + "z" * (form == "area")
+        return "".join(f"M{x:.2f} {y:.2f}h0" for x, y in points)
+    return "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in points) + "z" * (form == "area")
 
 
 def _round_up(value: float) -> float:

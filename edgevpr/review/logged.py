@@ -82,7 +82,7 @@ class LoggedQuery:
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
-    lines with a text for people: time, kind and text. `unusable` are times of frames that never became queries,
+    lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
     `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches, `tiles` the
     quad keys of those that were in RAM. Times are seconds after its start; it is `span_s` long. `truth` names the
     positions by which matches are judged, and `notes` are sentences for the head of its page."""
@@ -94,7 +94,7 @@ class LoggedFlight:
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)
     remarks: list[tuple[float, str, str]] = field(default_factory=list)
-    unusable: list[float] = field(default_factory=list)
+    unusable: int = 0
     learnt: list[Point] = field(default_factory=list)
     between: list[dict[str, Any]] = field(default_factory=list)
     tiles: set[str] = field(default_factory=set)
@@ -114,8 +114,7 @@ def read_flight(path: str | Path) -> LoggedFlight:
 
 def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
     """Read a flight from the lines of its log, in their order. The first time in it counts as the start."""
-    flight, queries = LoggedFlight(path=path), dict[str, LoggedQuery]()
-    start_s = None
+    flight, queries, start_s = LoggedFlight(path=path), dict[str, LoggedQuery](), None
     for line in lines:
         t_mono_s, t_s = number(line, "t_mono_s"), flight.span_s
         if t_mono_s is not None:
@@ -129,21 +128,20 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
                 flight.end = line
             case "query":
                 t_frame_s = number(line, "t_frame_s")
-                taken_s = t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0))
-                query = queries[text(line, "query") or ""] = read_query(line, taken_s)
+                query = read_query(line, t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0)))
+                queries[query.name] = query
                 flight.queries.append(query)
             case "answer":
                 if (answered := queries.get(text(line, "query") or "")) and answered.fix:
                     _apply_answer(answered.fix, line)
             case "unusable":
-                flight.unusable.append(t_s)
+                flight.unusable += 1
             case "learnt":
                 flight.learnt += filter(None, [point(line, "position")])
             case "between":
                 flight.between += [line] if point(line) else []
             case "tiles":
-                held = value(line, "held")
-                flight.tiles.update(map(str, held) if isinstance(held, list) else ())
+                flight.tiles.update(map(str, held) if isinstance(held := line.get("held"), list) else ())
             case _:
                 flight.remarks.append((t_s, str(kind), _text_of(line)))
     return flight

@@ -2,7 +2,6 @@
 them, GPS tags that do not fit, and places that look alike."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,27 +41,25 @@ _NO_PICTURES = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapFindings:
-    """Findings on a map: its `places`, `lines` of `map info`, `recognisable` (mean confidence of the right matches of a
-    place that calibration asked for, by its number), and `alike`, what looks like each of the places whose picture was
-    looked for (None: nothing does)."""
-
-    name: str
-    places: Sequence[Place]
-    lines: Sequence[str]
-    recognisable: Mapping[int, float]
-    alike: Sequence[LookAlike | None]
-
-
-def make_map_page(found: MapFindings, pictures: Album, lens: "Lens | None" = None) -> str:
-    """Return the whole page. `pictures` finds those of the map, `lens` is that of its camera (None: unknown)."""
-    ground = [place for place in found.places if place.position]
+def make_map_page(
+    name: str,
+    lines: Sequence[str],
+    places: Sequence[Place],
+    recognisable: Mapping[int, float],
+    look_alikes: Sequence[LookAlike | None],
+    pictures: Album,
+    lens: "Lens | None",
+) -> str:
+    """Return the whole page of the map `name`. `lines` are those of `map info`. `recognisable` is the mean confidence
+    of the right matches of a place that calibration asked for, by its number; `look_alikes` are what looks like each of
+    the places whose picture was looked for (None: nothing does). `pictures` finds those of the map, `lens` is that of
+    its camera (None: unknown)."""
+    ground = [place for place in places if place.position]
     points = {place.place_id: at_of(place) for place in ground}
-    tags_off_m, alike = find_tags_off(ground), {each.place_id: each for each in found.alike if each}
-    hard = {place_id for place_id, confidence in found.recognisable.items() if confidence < _HARD}
+    tags_off_m, alike = find_tags_off(ground), {each.place_id: each for each in look_alikes if each}
+    hard = {place_id for place_id, confidence in recognisable.items() if confidence < _HARD}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
-    steps = list(_steps(found, tags_off_m, alike, points))
+    steps = list(_steps(places, recognisable, tags_off_m, alike, points))
     pairs = [(points.get(each.place_id), points.get(each.other_id)) for each in alike.values()]
     tags = [(recorded_at(place), at_of(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
@@ -70,19 +67,18 @@ def make_map_page(found: MapFindings, pictures: Album, lens: "Lens | None" = Non
         Layer("look alike", "alike", [(one, other) for one, other in pairs if one and other], "line"),
         Layer("inconsistent GPS tags", "amiss", tags, "line"),
         layer_of(steps, "hard to recognise", "weak"),
-        *(layer_of(steps, f"{name} quality", name) for name in _QUALITIES),
+        *(layer_of(steps, f"{quality} quality", quality) for quality in _QUALITIES),
     ]
     known = {
-        "places": str(len(found.places)),
+        "places": str(len(places)),
         "ground seen": figure(covered_m2 / 1e4 if covered_m2 else None, "ha"),
         "coverage gaps": figure(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
-        "hard to recognise": str(len(hard)) if found.recognisable else UNKNOWN,
-        "look alike": f"{len(alike)} <small>of {len(found.alike)}</small>" if found.alike else UNKNOWN,
+        "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
+        "look alike": f"{len(alike)} <small>of {len(look_alikes)}</small>" if look_alikes else UNKNOWN,
     }
-    notes = [*_NOTES, *([] if found.alike else [_NO_PICTURES])]
+    notes = [*_NOTES, *([] if look_alikes else [_NO_PICTURES])]
     explored = Explored(
-        unit="place",
         ground=ground,
         layers=layers,
         steps=steps,
@@ -90,9 +86,9 @@ def make_map_page(found: MapFindings, pictures: Album, lens: "Lens | None" = Non
         lens=lens,
         notes=notes if ground else [],
     )
-    title, lines = f"Map {found.name}", "".join(f"<p>{foreign(line.strip())}</p>" for line in found.lines)
-    above = [heading(title, [f"{len(found.places)} places"]), figures(known)]
-    return make_page(title, above, explored, [section("What it holds", lines)])
+    title, content = f"Map {name}", "".join(f"<p>{foreign(line.strip())}</p>" for line in lines)
+    above = [heading(title, [f"{len(places)} places"]), figures(known)]
+    return make_page(title, above, explored, [section("What it holds", content)])
 
 
 def _quality(place: Place) -> str:
@@ -100,12 +96,16 @@ def _quality(place: Place) -> str:
 
 
 def _steps(
-    found: MapFindings, tags_off_m: Mapping[int, float], alike: Mapping[int, LookAlike], points: Mapping[int, Point]
+    places: Sequence[Place],
+    recognisable: Mapping[int, float],
+    tags_off_m: Mapping[int, float],
+    alike: Mapping[int, LookAlike],
+    points: Mapping[int, Point],
 ) -> Iterable[Step]:
-    images = {place.place_id: place.source_image for place in found.places}
-    for place in found.places:
+    images = {place.place_id: place.source_image for place in places}
+    for place in places:
         place_id, pose = place.place_id, place.pose
-        confidence, twin = found.recognisable.get(place_id), alike.get(place_id)
+        confidence, twin = recognisable.get(place_id), alike.get(place_id)
         is_hard, own = confidence is not None and confidence < _HARD, points.get(place_id)
         groups = {
             f"{_quality(place)} quality": True,
@@ -130,7 +130,7 @@ def _steps(
         yield Step(
             title=f"Place {place_id}: {place.source_image}",
             said=said,
-            groups=[name for name, is_so in groups.items() if is_so],
+            groups={name: "places" for name, is_so in groups.items() if is_so},
             at={name: point for name, point in {**at, _quality(place): own}.items() if point},
             circle_m=sd_m,
             place=place,

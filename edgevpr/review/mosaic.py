@@ -13,7 +13,7 @@ from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.text import progress
 from edgevpr.core.types import Place, Pose
-from edgevpr.review.album import Album, Picture
+from edgevpr.review.album import Album, AlbumPicture
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
@@ -102,7 +102,7 @@ class _Raster:
         """True unless the pictures contradict each other where they overlap."""
         return len(self.likeness) < _LEAST_PAIRS or float(np.median(self.likeness)) >= _LEAST_LIKENESS
 
-    def lay(self, picture: Picture, spot: _Spot) -> None:
+    def lay(self, picture: AlbumPicture, spot: _Spot) -> None:
         """Lay the picture of a place on the raster."""
         from edgevpr.frames.images import at_most, cv2
 

@@ -8,17 +8,16 @@ from typing import Literal
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.tilemap import TileMap
-from edgevpr.review.html import WIDTH, Points, data_url, path
+from edgevpr.review.html import Points, data_url, path
 from edgevpr.review.logged import Point
 from edgevpr.review.mosaic import Mosaic
 
 Form = Literal["dots", "line", "area"]
-_MARGIN = 0.04
+_MARGIN = 1.08  # size of the drawing to that of what is in it
 _LEAST_SHAPE = 0.55  # height of a drawing to its width
 _MOST_SHAPE = 1.8
 _MOST_VH = 80  # of the height of the window
@@ -58,35 +57,36 @@ def at_of(place: Place) -> Point:
 
 
 class Overhead:
-    """Converts positions into points of the drawing, which has north up and is 1000 x `height` units large. `points`
-    are all positions to draw; `ground` sets the room around them. `per_m`: units of the drawing in a metre."""
+    """Converts positions into points of the drawing: metres to the right of and below `origin`, with north up. `points`
+    are all positions to draw; `ground` sets the room around them. `box` is (left, top, width, height)."""
 
     def __init__(self, points: Sequence[Point], ground: Sequence[Place]) -> None:
-        footprint_m = max((place.pose.footprint_m for place in ground if place.pose), default=20.0)
         self.origin = points[0]
-        metres = self._metres(points)
-        width_m, height_m = np.ptp(metres, axis=1) + 1.5 * footprint_m
-        height_m, width_m = max(height_m, _LEAST_SHAPE * width_m), max(width_m, height_m / _MOST_SHAPE)
-        self.per_m = float(WIDTH * (1 - 2 * _MARGIN) / width_m)
-        self.height = float(WIDTH * height_m / width_m)
-        self._middle_m = (metres.min(axis=1, keepdims=True) + metres.max(axis=1, keepdims=True)) / 2
+        drawn = np.array(self.on(points))
+        footprint_m = max((place.pose.footprint_m for place in ground if place.pose), default=20.0)
+        width, height = (np.ptp(drawn, axis=0) + 1.5 * footprint_m) * _MARGIN
+        size = np.array([max(width, height / _MOST_SHAPE), max(height, _LEAST_SHAPE * width)])
+        self.box = (*((drawn.min(axis=0) + drawn.max(axis=0) - size) / 2).tolist(), *size.tolist())
 
     def on(self, points: Sequence[Point]) -> Points:
         """Convert positions into points (x, y) of the drawing."""
-        return self._drawn(self._metres(points))
+        lat_deg, lon_deg = np.array(points, dtype=float).reshape(-1, 2).T
+        east_m, north_m = offset_m(*self.origin, lat_deg, lon_deg)
+        return list(zip(east_m.tolist(), (-north_m).tolist(), strict=True))
 
     def square(self, place: Place) -> str:
         """Return SVG path data of the ground that a picture shows, drawn as a square whose side is as long as the
         longest side of the picture on the ground; "" if that is unknown."""
         if not place.pose:
             return ""
-        corners = axes_of(place.pose.up_deg) @ _SQUARE * place.pose.footprint_m
-        return path(self._drawn(self._metres([at_of(place)]) + corners), "area")
+        ((x, y),) = self.on([at_of(place)])
+        east_m, north_m = axes_of(place.pose.up_deg) @ _SQUARE * place.pose.footprint_m
+        return path(list(zip(x + east_m, y - north_m, strict=True)), "area")
 
     def draw(self, ground: Sequence[Place], layers: Sequence[Layer], mosaic: Mosaic | None) -> str:
         """Return HTML with the ground, which has the picture `mosaic` (None: it has none), and the layers over it."""
         if mosaic:
-            paths = self._picture(mosaic)
+            paths = _image(mosaic)
         else:
             squares = map(self.square, ground[:: -(-len(ground) // _MOST_PLACES) or 1])
             paths = f'<path class="footprints layer-ground" d="{"".join(squares)}"/>'
@@ -100,27 +100,18 @@ class Overhead:
             for colour, name in names.items()
         )
         hides = "".join(f".ground:has(#show-{key}:not(:checked)) .layer-{key}{{display:none}}" for key in names)
-        shape = WIDTH / self.height
+        shape, box = self.box[2] / self.box[3], " ".join(f"{each:.2f}" for each in self.box)
         return (
             f'<style>{hides}</style><div class="legend">{legend}</div>'
             f'<div class="view" style="aspect-ratio:{shape:.4f};max-width:{_MOST_VH * shape:.1f}vh">'
-            f'<svg role="img" aria-label="the ground of the map" viewBox="0 0 {WIDTH:g} {self.height:.0f}">{paths}'
-            f'<g id="now-at"></g></svg><div class="ruler" hidden></div><div class="north">N ↑</div>{_BUTTONS}</div>'
+            f'<svg role="img" aria-label="the ground of the map" viewBox="{box}">{paths}<g id="now-at"></g></svg>'
+            f'<div class="ruler" hidden></div><div class="north">N ↑</div>{_BUTTONS}</div>'
         )
 
-    def _picture(self, mosaic: Mosaic) -> str:
-        west, south, east, north = mosaic.edges_m
-        (left, top), (right, bottom) = self._drawn(np.array([[west, east], [north, south]]))
-        return (
-            f'<image class="layer-ground" x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" '
-            f'height="{bottom - top:.2f}" preserveAspectRatio="none" href="{data_url("webp", mosaic.webp)}"/>'
-        )
 
-    def _metres(self, points: Sequence[Point]) -> Doubles:
-        """Return float (2, N): how far east and north of the origin the points lie."""
-        lat_deg, lon_deg = np.array(points, dtype=float).reshape(-1, 2).T
-        return np.array(offset_m(*self.origin, lat_deg, lon_deg))
-
-    def _drawn(self, metres: Doubles) -> Points:
-        east, north = (metres - self._middle_m) * self.per_m
-        return list(zip((WIDTH / 2 + east).tolist(), (self.height / 2 - north).tolist(), strict=True))
+def _image(mosaic: Mosaic) -> str:
+    west, south, east, north = mosaic.edges_m
+    return (
+        f'<image class="layer-ground" x="{west:.2f}" y="{-north:.2f}" width="{east - west:.2f}" '
+        f'height="{north - south:.2f}" preserveAspectRatio="none" href="{data_url("webp", mosaic.webp)}"/>'
+    )

@@ -3,14 +3,14 @@
 (() => {
   const block = document.getElementById("steps");
   if (!block) return;
-  const { steps, pictures, perM } = JSON.parse(block.textContent);
+  const { steps, pictures } = JSON.parse(block.textContent);
   const find = (query, within = document) => within.querySelector(query);
   const all = (query, within = document) => [...within.querySelectorAll(query)];
   const view = find(".view"), svg = view && find("svg", view), nowAt = document.getElementById("now-at");
   const slider = document.getElementById("step"), play = document.getElementById("play");
   let shown = steps, now = steps[0], marked = [];
 
-  // ---- Zoom and pan: the part of the drawing that is seen is the viewBox of its SVG.
+  // ---- Zoom and pan: the part of the drawing that is seen is the viewBox of its SVG, in metres.
   const MOST = 60; // times
   const whole = svg ? svg.getAttribute("viewBox").split(" ").map(Number) : [0, 0, 1000, 1000];
   let box = whole;
@@ -19,14 +19,15 @@
   function look(x, y, wide) {
     wide = Math.min(Math.max(wide, whole[2] / MOST), whole[2]);
     const high = wide * whole[3] / whole[2];
-    box = [Math.min(Math.max(x, 0), whole[2] - wide), Math.min(Math.max(y, 0), whole[3] - high), wide, high];
+    const within = (least, most, value) => Math.min(Math.max(value, least), most);
+    box = [within(whole[0], whole[0] + whole[2] - wide, x), within(whole[1], whole[1] + whole[3] - high, y), wide, high];
     svg.setAttribute("viewBox", box.join(" "));
     view.style.touchAction = zoomed() > 1.01 ? "none" : "pan-x pan-y"; // unzoomed, a finger scrolls the page
-    const most = box[2] / perM / 4, power = 10 ** Math.floor(Math.log10(most)); // a quarter of the width
+    const most = box[2] / 4, power = 10 ** Math.floor(Math.log10(most)); // a quarter of the width
     const length = [5, 2, 1].map((each) => each * power).find((each) => each <= most);
     const ruler = find(".ruler", view);
     ruler.hidden = false;
-    ruler.style.width = `${100 * length * perM / box[2]}%`;
+    ruler.style.width = `${100 * length / box[2]}%`;
     ruler.textContent = length < 1000 ? `${+length.toPrecision(1)} m` : `${length / 1000} km`;
   }
   // Zoom about the point that is [across, down] of the view, 0 to 1 each.
@@ -151,6 +152,8 @@
   }
   const nearest = (among, away) => among.reduce((best, each) => (!best || away(each) < away(best) ? each : best), null);
 
+  const inLane = (marks) => shown.filter((step) => step.groups.includes(+marks.dataset.lane));
+
   // ---- Choosing steps by their groups: the others vanish from ground, lanes and slider.
   function filter() {
     const wanted = new Set(all("[data-group]:checked").map((each) => +each.dataset.group));
@@ -160,9 +163,8 @@
       const dots = view && find(`.dots.layer-${name}`, view);
       dots && dots.setAttribute("d", shown.filter((step) => step.at[name]).map(({ at }) => `M${at[name].join(" ")}h0`).join(""));
     }
-    for (const number of new Set(steps.flatMap((step) => step.lanes))) {
-      const marks = shown.filter((step) => step.lanes.includes(number)).map((step) => `M${step.x} 0v20`);
-      find(`[data-lane="${number}"]`).setAttribute("d", marks.join(""));
+    for (const marks of all("[data-lane]")) {
+      marks.setAttribute("d", inLane(marks).map((step) => `M${step.x} 0v20`).join(""));
     }
     show(shown.includes(now) ? now : shown[0]);
   }
@@ -191,10 +193,10 @@
   };
   for (const box of all("[data-group]")) box.onchange = filter;
   for (const marks of all("[data-lane]")) {
-    const lane = marks.closest("svg"), number = +marks.dataset.lane;
+    const lane = marks.closest("svg");
     lane.addEventListener("click", (event) => {
       const frame = lane.getBoundingClientRect(), x = 1000 * (event.clientX - frame.left) / frame.width;
-      const near = nearest(shown.filter((step) => step.lanes.includes(number)), (step) => Math.abs(step.x - x));
+      const near = nearest(inLane(marks), (step) => Math.abs(step.x - x));
       near && show(near);
     });
   }

@@ -5,6 +5,7 @@ Functions that return a str return HTML.
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -13,10 +14,12 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import shown
+from edgevpr.core.text import nines, shown
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album
 from edgevpr.review.html import (
+    UNKNOWN,
+    Axis,
     Series,
     chart,
     clock,
@@ -24,20 +27,37 @@ from edgevpr.review.html import (
     figures,
     foreign,
     heading,
-    lanes,
     notes,
     section,
     table,
     time_axis,
 )
-from edgevpr.review.logged import SENT, FixOutcome, LoggedFlight, LoggedQuery, number, text, value
-from edgevpr.review.queries import list_lanes, list_layers, list_steps
-from edgevpr.review.steps import Explored, make_page
+from edgevpr.review.logged import (
+    SENT,
+    FixOutcome,
+    LoggedFlight,
+    LoggedQuery,
+    number,
+    point,
+    text,
+    value,
+    without_numbers,
+)
+from edgevpr.review.overhead import Layer, at_of
+from edgevpr.review.steps import Explored, Step, layer_of, make_page
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _MOST_REMARKS = 200
+_FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
+_FIX_COLOURS = {
+    FixOutcome.TAKEN: "taken",
+    FixOutcome.UNANSWERED: "unanswered",
+    FixOutcome.REFUSED: "refused",
+    FixOutcome.CONTINUOUS: "taken",
+    FixOutcome.KEPT: "places",
+}
 _KNOWN = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 
 
@@ -46,7 +66,7 @@ def make_flight_page(
 ) -> str:
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
     `no_ground` is a sentence on why there is no `ground`."""
-    queries, rows = flight.queries, list_lanes(flight)
+    queries, axis = flight.queries, time_axis(flight.span_s)
     time = text(flight.start, "time") or next((text(query.line, "time") for query in queries), None)
     title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
     start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
@@ -55,19 +75,17 @@ def make_flight_page(
         figures(_matches(flight) | _flown(flight)),
         notes(_notes(flight, bool(ground), no_ground)),
     ]
-    steps = list_steps(ground, flight, rows)
+    steps = _steps(ground, flight)
     explored = Explored(
-        unit="query",
         ground=ground,
-        layers=list_layers(ground, flight, steps),
+        layers=_layers(ground, flight, steps),
         steps=steps,
         albums={"seen": frames, "place": references},
         lens=_lens(flight.start),
-        span_s=flight.span_s,
+        axis=axis,
     )
     below = [
-        section("What became of every query", lanes(rows, flight.span_s)),
-        section("Over time", _charts(flight)),
+        section("Over time", _charts(flight, axis)),
         section("What was said", _remarks(flight)),
         section("How it was set", _settings(flight)),
     ]
@@ -84,16 +102,89 @@ def make_match_page(
     """Return the whole page of the queries of `match`. `albums` have the pictures of queries ("seen") and of the map
     ("place"), `name` is that of the map, `lens` that of the camera."""
     title, flight = f"Matches in {name}", LoggedFlight(path=Path(), truth="GPS tags", queries=list(queries))
-    steps = list_steps(ground, flight, [])
+    steps = _steps(ground, flight)
     explored = Explored(
-        unit="query",
         ground=ground,
-        layers=list_layers(ground, flight, steps),
+        layers=_layers(ground, flight, steps),
         steps=steps,
         albums=albums,
         lens=lens,
     )
     return make_page(title, [heading(title, [f"{len(queries)} pictures"]), figures(_matches(flight))], explored, [])
+
+
+def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
+    """Return the layers of the drawing, from the bottom to the top."""
+    return [
+        Layer("places of the map", "places", [[at_of(place) for place in ground]]),
+        layer_of(steps, "places found", "found"),
+        Layer("places learnt", "learnt", [flight.learnt]),
+        Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
+        layer_of(steps, flight.truth, "gps", "line"),
+        layer_of(steps, "autopilot", "autopilot", "line"),
+        layer_of(steps, "refused there", "missed"),
+        layer_of(steps, "matches", "accepted"),
+        layer_of(steps, "fixes taken", "taken"),
+        layer_of(steps, "fixes not answered", "unanswered"),
+        layer_of(steps, "fixes refused", "refused"),
+    ]
+
+
+def _steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
+    """Return a step for each query of a flight over the places of `ground`."""
+    places = {place.place_id: place for place in ground}
+    has_link = any(query.has_link for query in flight.queries)
+    return [_step(query, places.get(query.place or 0), flight, has_link) for query in flight.queries]
+
+
+def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_link: bool) -> Step:
+    """Return the step of a query. `has_link`: the flight had a link to an autopilot."""
+    fix, verdict = query.fix, "accepted" if query.accepted else "refused"
+    points = {
+        "found": query.place_at,
+        "missed": None if query.accepted else query.true_at or query.autopilot_at,
+        "gps": query.gps_at,
+        "autopilot": query.autopilot_at,
+    }
+    reason = without_numbers(re.split(r"[:;,] ", query.reason)[0])  # its first words
+    groups = {"match accepted": "accepted"} if query.accepted else {f"match refused: {reason}": "refused"}
+    fixed = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
+    if fix:
+        groups[without_numbers(fixed)] = _FIX_COLOURS[fix.outcome]
+        if fix.outcome in SENT:
+            points[_FIX_COLOURS[fix.outcome]] = fix.at
+    if (query.off_m or 0.0) > _FAR_M:
+        groups[f"match over {_FAR_M:.0f} m from {flight.truth}"] = "refused"
+    if has_link and query.has_link is False:
+        groups["autopilot silent"] = "refused"
+    pictures = [("seen", query.name, f"seen: {query.name}")]
+    pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
+    return Step(
+        title=f"{f'{clock(query.t_s)} – ' if flight.span_s else ''}{query.name}: {verdict}",
+        said=[_place_found(query), _position(query, flight.truth), query.reason, fixed],
+        groups=groups,
+        at={name: at for name, at in {**points, "accepted": query.at}.items() if at},  # the last has the circle
+        circle_m=query.accuracy_m if query.at else None,
+        place=place,
+        t_s=query.t_s,
+        pictures=[picture for picture in pictures if picture[1]],
+    )
+
+
+def _place_found(query: LoggedQuery) -> str:
+    if query.place is None:
+        return "no place was found"
+    score = figure(number(query.line, "score"))
+    confidence = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
+    return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
+
+
+def _position(query: LoggedQuery, truth: str) -> str:
+    if not query.at:
+        return ""
+    accuracy = "" if query.accuracy_m is None else f", accurate to {figure(query.accuracy_m, 'm')}"
+    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from {truth}"
+    return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{accuracy}{off}"
 
 
 def _lens(start: Mapping[str, Any]) -> "Lens | None":
@@ -128,6 +219,7 @@ def _flown(flight: LoggedFlight) -> dict[str, str]:
     between = f" <small>and {len(flight.between)} between matches</small>" if flight.between else ""
     ends_s = [0.0, *(query.t_s for query in flight.queries if query.accepted), flight.span_s]
     return {
+        "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
         "longest without a match": figure(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
         "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT)}{between}",
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
@@ -159,7 +251,7 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
     return [*flight.notes, *(sentence for is_there, sentence in known if not is_there)]
 
 
-def _charts(flight: LoggedFlight) -> str:
+def _charts(flight: LoggedFlight, axis: Axis) -> str:
     def line(name: str, colour: str, factor: float, *keys: str) -> Series:
         values = [(query.t_s, number(query.line, *keys)) for query in flight.queries]
         return Series(name, colour, [(t_s, factor * value) for t_s, value in values if value is not None])
@@ -168,29 +260,26 @@ def _charts(flight: LoggedFlight) -> str:
         pairs = zip(flight.queries, values, strict=True)
         return Series(name, colour, [(query.t_s, value) for query, value in pairs if value is not None], True)
 
-    confidences = [
-        dots(name, name, [query.confidence if query.accepted is accepted else None for query in flight.queries])
-        for name, accepted in (("accepted", True), ("refused", False))
-    ]
-    distances = [
-        dots(f"from {flight.truth}", "gps", [query.off_m for query in flight.queries]),
-        dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in flight.queries]),
-    ]
-    times = [
-        line("encode", "gps", 1e3, "costs", "t_encode_s"),
-        line("match", "accepted", 1e3, "costs", "t_match_s"),
-        line("CPU", "taken", 1e3, "costs", "cpu_s"),
-    ]
+    queries, truth = flight.queries, flight.truth
     charts = (
-        ("Confidence", "", confidences),
-        ("Position", "m", distances),
-        ("A query", "ms", times),
+        ("Confidence", "", [
+            dots("accepted", "accepted", [query.confidence if query.accepted else None for query in queries]),
+            dots("refused", "refused", [None if query.accepted else query.confidence for query in queries]),
+        ]),
+        ("Position", "m", [
+            dots(f"from {truth}", "gps", [query.off_m for query in queries]),
+            dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
+        ]),
+        ("A query", "ms", [
+            line("encode", "gps", 1e3, "costs", "t_encode_s"),
+            line("match", "accepted", 1e3, "costs", "t_match_s"),
+            line("CPU", "taken", 1e3, "costs", "cpu_s"),
+        ]),
         ("RAM", "MB", [line("", "accepted", 1, "costs", "rss_mb")]),
         ("Charge", "mAh", [line("", "accepted", 1, "totals", "used_mah")]),
         ("Temperature", "°C", [line("", "refused", 1, "board", "temperature_c")]),
         ("Age of the newest picture", "ms", [line("", "accepted", 1e3, "totals", "latency_s")]),
-    )
-    axis = time_axis(flight.span_s)
+    )  # fmt: skip
     drawn = [chart(title, unit, series, axis, top=0.0 if unit else 1.0) for title, unit, series in charts]
     return f'<div class="charts">{"".join(drawn)}</div>' if any(drawn) else ""
 

@@ -77,7 +77,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
             recording=header["recording"],
         )
         try:
-            with _unheard(), closing(Flight.open(config, world)) as again:
+            with _quiet(), closing(Flight.open(config, world)) as again:
                 again.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
@@ -107,17 +107,14 @@ def _recorded(log: str | Path) -> tuple[list[Line], Path]:
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """Context manager: of the log messages of the replayed flight, which has printed them once, let errors through
-    only; all with --debug."""
-    log = logging.getLogger("edgevpr")
-    before = log.level
-    if not log.isEnabledFor(logging.DEBUG):
-        log.setLevel(logging.ERROR)
+def _quiet() -> Iterator[None]:
+    """Context manager: of the messages of the replayed flight, which has printed them once, let errors through only;
+    all with --debug."""
+    logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
     try:
         yield
     finally:
-        log.setLevel(before)
+        logging.disable(logging.NOTSET)
 
 
 def _picture(folder: Path, number: int) -> Image:

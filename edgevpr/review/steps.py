@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.text import shown
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album, small_pictures
-from edgevpr.review.html import WIDTH, data, foreign, page, section
+from edgevpr.review.html import Axis, data, foreign, lane, page, section
 from edgevpr.review.logged import Point
 from edgevpr.review.mosaic import lay_mosaic
 from edgevpr.review.overhead import Form, Layer, Overhead
@@ -33,18 +33,16 @@ _CONTROLS = (
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
     """One step: its `title`, the sentences `said` of it, and the reasons and outcomes (`groups`) by which the reader
-    chooses steps. `at`: positions by the colour of their layer. `circle_m`: radius around the last of them. `place`:
-    the place whose ground is outlined. `lanes`: numbers of the lanes that have a mark at `t_s`. `pictures`: (which
-    album, name, caption) of each."""
+    chooses steps, with the colour of each. `at`: positions by the colour of their layer. `circle_m`: radius around the
+    last of them. `place`: the place whose ground is outlined. `pictures`: (which album, name, caption) of each."""
 
     title: str
     said: Sequence[str]
-    groups: Sequence[str]
+    groups: Mapping[str, str]
     at: Mapping[str, Point]
     circle_m: float | None = None
     place: Place | None = None
-    t_s: float | None = None
-    lanes: Sequence[int] = ()
+    t_s: float = 0.0
     pictures: Sequence[tuple[str, str, str]] = ()
 
 
@@ -56,17 +54,16 @@ def layer_of(steps: Sequence[Step], name: str, colour: str, form: Form = "dots")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explored:
-    """Content of the ground section of a page. `unit` is what a step is called. `albums` are those of the pictures, by
-    the names that steps give them; "place" is that of the map, `lens` that of its camera (None: unknown). `span_s` is
-    the length of the lanes. `notes` are sentences below the ground."""
+    """Content of the ground section of a page. `albums` are those of the pictures, by the names that steps give them;
+    "place" is that of the map, `lens` that of its camera (None: unknown). `axis` is that of the times of the steps
+    (None: they have no time). `notes` are sentences below the ground."""
 
-    unit: str
     ground: Sequence[Place]
     layers: Sequence[Layer]
     steps: Sequence[Step]
     albums: Mapping[str, Album]
     lens: "Lens | None" = None
-    span_s: float = 0.0
+    axis: Axis | None = None
     notes: Sequence[str] = ()
 
 
@@ -94,13 +91,13 @@ def _explorer(explored: Explored, room_bytes: int) -> str:
             mosaic, lacking = lay_mosaic(explored.ground, explored.albums["place"], explored.lens, view.origin)
             notes += [lacking] if lacking else []
         drawn = view.draw(explored.ground, layers, mosaic)
-    groups = Counter(group for step in explored.steps for group in dict.fromkeys(step.groups)).most_common()
-    numbers = {group: number for number, (group, _) in enumerate(groups)}
-    rows = [_row(step, view, numbers, explored.span_s) for step in explored.steps]
+    counts = Counter(group for step in explored.steps for group in step.groups)
+    numbers = {group: number for number, (group, _) in enumerate(counts.most_common())}
+    rows = [_row(step, view, numbers, explored.axis) for step in explored.steps]
     steps, every = explored.steps, -(-len(data("", rows)) // _MOST_TEXT_BYTES)
     if every > 1:
         steps, rows = steps[::every], rows[::every]
-        notes.append(f"The page would be too large with all steps: shown is one {explored.unit} in {every}.")
+        notes.append(f"The page would be too large with all steps: one in {every} is shown.")
     room_bytes -= len(drawn) + len(data("", rows))
     wanted = [[picture[:2] for picture in step.pictures] for step in steps]
     pictures, left_out = small_pictures(wanted, explored.albums, room_bytes)
@@ -108,32 +105,40 @@ def _explorer(explored: Explored, room_bytes: int) -> str:
     at = {key: number for number, key in enumerate(pictures)}
     for step, row in zip(steps, rows, strict=True):
         row["pictures"] = [(shown(caption), at[of, name]) for of, name, caption in step.pictures if (of, name) in at]
-    known = {"steps": rows, "pictures": list(pictures.values()), "perM": view.per_m if view else 1}
-    parts = f"{drawn}{_CONTROLS if steps else ''}{_choice(groups)}"
+    known = {"steps": rows, "pictures": list(pictures.values())}
+    parts = f"{drawn}{_CONTROLS if steps else ''}{_choice(explored, numbers)}"
     parts += f'<p class="soft">{foreign(" ".join(notes))}</p>' if notes else ""
     title = "Over the ground" if drawn else "Step by step"
     return section(title, f'<div class="ground">{parts}</div>{data("steps", known)}')
 
 
-def _row(step: Step, view: Overhead | None, numbers: Mapping[str, int], span_s: float) -> dict[str, Any]:
+def _row(step: Step, view: Overhead | None, numbers: Mapping[str, int], axis: Axis | None) -> dict[str, Any]:
     """Return a step as the script reads it, without its pictures. `numbers` are those of the groups."""
-    placed = {name: [round(each, 1) for each in view.on([at])[0]] for name, at in step.at.items()} if view else {}
+    placed = {name: [round(each, 2) for each in view.on([at])[0]] for name, at in step.at.items()} if view else {}
     return {
         "title": shown(step.title),
         "said": [shown(sentence) for sentence in step.said if sentence],
-        "groups": [numbers[group] for group in dict.fromkeys(step.groups)],
+        "groups": [numbers[group] for group in step.groups],
         "at": placed,
-        "circle": round(step.circle_m * view.per_m, 2) if view and step.circle_m else None,
+        "circle": step.circle_m,
         "square": view.square(step.place) if view and step.place else "",
-        "x": None if step.t_s is None else round(WIDTH * min(step.t_s / (span_s or 1.0), 1.0), 1),
-        "lanes": list(step.lanes),
+        "x": round(axis.x(step.t_s), 1) if axis else None,
     }
 
 
-def _choice(groups: Sequence[tuple[str, int]]) -> str:
-    """Return the groups and how many steps each has, as boxes by which the reader chooses steps."""
-    boxes = "".join(
-        f'<label><input type="checkbox" data-group="{number}">{foreign(group)} <b>{count}</b></label>'
-        for number, (group, count) in enumerate(groups)
+def _choice(explored: Explored, numbers: Mapping[str, int]) -> str:
+    """Return a box for each group, by which the reader chooses steps, with their count and their times."""
+    rows, axis = "", explored.axis
+    for group, number in numbers.items():
+        steps = [step for step in explored.steps if group in step.groups]
+        box = f'<input type="checkbox" data-group="{number}">'
+        rows += f"<label>{box}{foreign(group)} <b>{len(steps)}</b></label>"
+        if axis:
+            times_s = [step.t_s for step in steps]
+            rows += lane(shown(group), steps[0].groups[group], times_s, axis, f'data-lane="{number}"')
+    if not rows:
+        return ""
+    content = (
+        f'<div class="lanes">{rows}<span></span>{axis.texts()}</div>' if axis else f'<div class="boxes">{rows}</div>'
     )
-    return f'<details class="choose" open><summary>Show only some</summary><div>{boxes}</div></details>' * bool(boxes)
+    return f'<details class="choose" open><summary>Show only some</summary>{content}</details>'

@@ -28,8 +28,6 @@ from edgevpr.runtime.flight.world import StopNow
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
-_RETIRED = "forms", "reread", "config"  # kinds of notes that only earlier versions wrote
-
 # Questions about the machine: in a "what if", the newest answer on the tape is given.
 _MACHINE = ("is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn")
 
@@ -280,5 +278,4 @@ def read_tape(path: Path) -> Iterator[Note]:
                 note = json.loads(line)
             except ValueError:
                 return
-            if note[0] not in _RETIRED:
-                yield note
+            yield note

@@ -9,7 +9,7 @@ SHARES = Axis(0.0, 1.0, [(0.0, "0"), (0.5, "half"), (1.0, "1")])
 
 def test_points_of_a_curve_lie_where_the_axis_says():
     drawn = chart("Precision", "", [Series("", "row0", [(0.0, 1.0), (0.5, 0.5), (1.0, 0.0)])], SHARES, top=1.0)
-    assert 'class="line row0" d="M0.0 0.0L500.0 50.0L1000.0 100.0"' in drawn
+    assert 'class="line row0" d="M0.00 0.00L500.00 50.00L1000.00 100.00"' in drawn
     assert re.findall(r'<span style="left:50.0%">half', drawn)
 
 

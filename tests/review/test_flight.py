@@ -6,7 +6,6 @@ import pytest
 from logs import query, write_log
 
 from edgevpr.core.appending import numbered
-from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 
@@ -41,14 +40,6 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
     assert flight.queries[1].fix.why == "denied"
 
 
-def test_the_last_of_several_flights_is_taken(tmp_path):
-    log, newer = write_log(tmp_path / "log", ("query", query("a")), end=False), tmp_path / "newer"
-    write_log(newer, ("query", query("b")), ("query", query("c")), first_s=5000)
-    with open(log, "ab") as handle:
-        handle.write(newer.read_bytes())
-    assert [each.name for each in read_flight(log).queries] == ["b", "c"]
-
-
 def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark(tmp_path):
     path = tmp_path / "flight.jsonl"
     with FlightLog(path, max_mb=0.02) as log:
@@ -69,14 +60,6 @@ def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark
     assert flight.remarks[0][:2] == (0.0, "missing")
     assert "flight.jsonl: 1." in flight.remarks[0][2]
     assert 0 < len(flight.queries) < 4
-
-
-@pytest.mark.parametrize("rest", [b'{"kind": "que', b"\xff\xfe{", b"[" * 100_000, b"{}\n[]\nnull\n3"])
-def test_a_line_that_was_cut_or_is_none_is_left_out(tmp_path, rest):
-    log = write_log(tmp_path / "log", ("query", query("a")), end=False)
-    with open(log, "ab") as handle:
-        handle.write(rest)
-    assert [each.name for each in read_flight(log).queries] == ["a"]
 
 
 def test_a_log_without_a_first_line_is_a_flight(tmp_path):
@@ -104,12 +87,3 @@ def test_values_of_a_wrong_type_are_unknown(tmp_path):
     (only,) = read_flight(log).queries
     known = only.at, only.confidence, only.autopilot_at, only.gps_at, only.place, only.fix
     assert known == (None,) * 6
-
-
-def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
-    (tmp_path / "empty").touch()
-    with pytest.raises(EdgevprError, match="no line"):
-        read_flight(tmp_path / "empty")
-    for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
-        with pytest.raises(UsageError, match="no such"):
-            read_flight(missing)
