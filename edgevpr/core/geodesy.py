@@ -54,15 +54,6 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
 
 
-def to_lines_m(east_m: Floats, north_m: Floats, begin_m: Floats, way_m: Floats) -> Floats:
-    """Return the distance of points on a plane from lines that begin at `begin_m` and end `way_m` further on: (2,), of
-    one line, or (2, N), (east, north) each. Points and lines broadcast."""
-    east_m, north_m = east_m - begin_m[0], north_m - begin_m[1]
-    share = np.clip((east_m * way_m[0] + north_m * way_m[1]) / np.maximum((way_m**2).sum(axis=0), 1e-9), 0, 1)
-    away_m: Floats = np.hypot(east_m - share * way_m[0], north_m - share * way_m[1])
-    return away_m
-
-
 def extent_of(points: Iterable[LatLon]) -> tuple[float, float, float, float]:
     """Return the bounding box of points (lat, lon): south, west, north, east. East is above 180 degrees if the shorter
     way from point to point crosses the antimeridian."""

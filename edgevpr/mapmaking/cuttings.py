@@ -1,30 +1,37 @@
 """An orthophoto as a source of frames, from which a map can be made: for each place of a regular grid it gives the
 picture that a camera looking straight down would take there, with north at the top."""
 
+import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Doubles, Image, Ints
+from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.geodesy import to_lines_m
-from edgevpr.core.quadkeys import extent_around, in_extent, keys_at
+from edgevpr.core.quadkeys import extent_around, in_extent, keys_at, ring_around
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.images import resized
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
-from edgevpr.mapmaking.georaster import CRS, WGS84, geometry_mask, local_crs, rasterio, transform
-from edgevpr.mapmaking.missions import Area
+from edgevpr.mapmaking.georaster import WGS84, Extent, local_crs, transform
+from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
+from edgevpr.mapmaking.tiles import ground_of
 from edgevpr.runtime.recognise.landmarks import describe
+
+if TYPE_CHECKING:
+    from edgevpr.mapmaking.making import Cuttings
+
+_log = logging.getLogger(__name__)
 
 SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
@@ -65,25 +72,23 @@ class Lattice:
 
 
 class OrthophotoSource(RecordingSource):
-    """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. Places of which
-    more than a tenth has no data in the orthophoto are left out and counted in `without_data`. `white` counts places
-    a third of which is white, as clouds are, and, if it `tries_seams`, `seams` those with a straight seam, of the
-    `tried_for_seams`. `only` are the names of the frames to read (None: all)."""
+    """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. `counts` are
+    those of `MappingResult`: places `without_data` are left out, since more than a tenth of them has none, and if it
+    `tries_seams`, some are tried for seams. `only` are the names of the frames to read (None: all)."""
 
     def __init__(
         self,
         orthophoto: Orthophoto,
         lattices: Sequence[Lattice],
-        clock: Callable[[], float],
         *,
         only: Collection[str] | None = None,
         tries_seams: bool = True,
     ) -> None:
         super().__init__(only)
-        self._orthophoto, self._lattices, self._clock = orthophoto, lattices, clock
+        self._orthophoto, self._lattices = orthophoto, lattices
         self.total = sum(map(len, lattices))
         self.short_name = decoded_name(orthophoto.short_name)
-        self.without_data = self.white = self.seams = self.tried_for_seams = 0
+        self.counts = {"without_data": 0, "white": 0, "seams": 0, "tried_for_seams": 0}
         self._read, self._tries_seams = 0, tries_seams
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
@@ -112,14 +117,24 @@ class OrthophotoSource(RecordingSource):
             self.refused[Refusal.DAMAGED.value] += 1
             raise
         if valid.mean() < 1 - MOST_WITHOUT_DATA:
-            self.without_data += 1
+            self.counts["without_data"] += 1
             return None
-        self.white += _white(image) > _CLOUDY
+        self.counts["white"] += _white(image) > _CLOUDY
         if self._tries_seams and self._read % max(1, self.total // _TRIED_FOR_SEAMS) == 0:
-            self.tried_for_seams += 1
-            self.seams += has_seam(*self._orthophoto.as_it_is(position, WINDOW_PX))
+            self.counts["tried_for_seams"] += 1
+            self.counts["seams"] += has_seam(*self._orthophoto.as_it_is(position, WINDOW_PX))
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
-        return Frame(image=image, name=name, t_mono_s=self._clock(), position=position, heading_deg=0.0, pose=pose)
+        return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
+
+    def begin(self, spacing_m: float, technique: Technique, shown: Callable[..., Iterable[None]]) -> None:
+        """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
+        `shown` shows progress."""
+        if _log.isEnabledFor(logging.INFO):  # it takes half a second
+            _log.info("%s", self.forecast(spacing_m, technique))
+        if to_fetch := self.to_fetch():
+            count, steps = to_fetch
+            for _ in shown(steps, count, "fetching tiles"):
+                pass
 
     def forecast(self, spacing_m: float, technique: Technique) -> str:
         """Return how much is to be done for a map, in words. It takes a few places to try."""
@@ -130,19 +145,19 @@ class OrthophotoSource(RecordingSource):
             image, _ = self._orthophoto.cut(_place_of(lattice, 0.5), lattice.footprint_m, SIDE_PX)
             technique.encode(image)
             describe(image)
-        each_s = time.perf_counter() - began_s
+        lasts_s = self.total * (time.perf_counter() - began_s)
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
         size = f"{len(lattice) * spacing_m**2 / 1e6:.2f} km2 of ground, {self.total * place_bytes / 1e6:.1f} MB"
         tiles = f", of {to_fetch[0]} tiles to fetch from {self._orthophoto.name}" if to_fetch else ""
-        whole_s = self.total * each_s
-        lasts = f"{math.ceil(whole_s)} s" if whole_s < 100 else f"{whole_s / 60:.0f} min"
         across_px = lattice.footprint_m / self._orthophoto.resolution_m
         sharp_px = across_px / self._blur(lattice, across_px)
         sharp = f"{across_px:.0f} pixels along a picture"
         sharp += "" if sharp_px == across_px else f", blurred: {sharp_px:.0f} would show as much"
         sharp += "" if sharp_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
-        return f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {lasts} without calibration"
+        return (
+            f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {math.ceil(lasts_s)} s without calibration"
+        )
 
     def _blur(self, lattice: Lattice, across_px: float) -> float:
         """Return by how much larger the pixels of the raster, `across_px` along a picture, could be, and would show as
@@ -202,13 +217,38 @@ def _lost(image: Image) -> float:
     return float(np.std(grey - back) / max(np.std(grey), 1.0))
 
 
-def require_sharp(orthophoto: Orthophoto, footprint_m: float) -> None:
-    """Raise UsageError if the raster has too few pixels for pictures with sides of `footprint_m`."""
-    if (across_px := footprint_m / orthophoto.resolution_m) < _LEAST_PX:
+def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:
+    """Open an orthophoto and choose the places, see `Cuttings.open`."""
+    key, footprints_m = cuttings.tile, _footprints_m(cuttings)
+    area = read_area(cuttings.area) if cuttings.area else None
+    if area is None and key:
+        area = Area(((ring_around(extent_around(key, cuttings.margin_m)),),), ())
+    orthophoto = _open_orthophoto(cuttings, area)
+    lattices = [lattice_of(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
+    if (across_px := footprints_m[0] / orthophoto.resolution_m) < _LEAST_PX:
         raise UsageError(
-            f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprint_m:g} m, and nothing is found "
-            f"with fewer than {_LEAST_PX}: give a sharper one."
+            f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
+            f"found with fewer than {_LEAST_PX}: give a sharper one."
         )
+    if key:
+        lattices = [within(lattice, key, cuttings.margin_m) for lattice in lattices]
+    # Seams are those of the whole raster, and to try a place takes longer than to map it.
+    return OrthophotoSource(orthophoto, lattices, only=only, tries_seams=key is None)
+
+
+def extent_of_cuttings(cuttings: "Cuttings") -> Extent:
+    """Return the bounding box of the ground that is cut, see `Cuttings.extent_deg`."""
+    area = read_area(cuttings.area) if cuttings.area else None
+    with closing(_open_orthophoto(cuttings, area)) as orthophoto:
+        return ground_of(area.points, _footprints_m(cuttings)[-1]).extent_deg if area else orthophoto.extent_deg
+
+
+def _footprints_m(cuttings: "Cuttings") -> list[float]:
+    return [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
+
+
+def _open_orthophoto(cuttings: "Cuttings", area: Area | None) -> Orthophoto:
+    return Orthophoto(cuttings.orthophoto, ground_of(area.points, _footprints_m(cuttings)[-1]) if area else None)
 
 
 def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
@@ -237,12 +277,9 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
     begin, end = np.zeros(2, int), count
     if area:
-        polygons_m = [[_metres(ring, plane) for ring in rings] for rings in area.polygons]
-        paths_m = [_metres([(way.lat_deg, way.lon_deg) for way in path], plane) for path in area.paths]
-        corners = [ring for rings in polygons_m for ring in rings]
-        corners += [path + off_m for path in paths_m for off_m in (-footprint_m, footprint_m)]
-        area_low, area_high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-        if not ((area_low <= high) & (area_high >= low)).all():  # false for what cannot be projected, too
+        ground = area.on_plane(lambda lat_deg, lon_deg: transform(WGS84, plane, lon_deg, lat_deg), 0.0, footprint_m)
+        area_low, area_high = np.reshape(ground.bounds, (2, 2))
+        if not ((area_low <= high) & (area_high >= low)).all():  # false for an empty one, whose bounds are NaN
             raise NoPlaceError(
                 f"The area does not touch {orthophoto.name}: it is at {extent_words(area.extent_deg)}, the orthophoto "
                 f"at {extent_words(orthophoto.extent_deg)}."
@@ -252,12 +289,10 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
     _require_bounded((end - begin).prod(), _MOST_POINTS if area else _MOST_PLACES, spacing_m)
     x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
     y_m = y_m[::-1]
-    wanted = np.ones((len(y_m), len(x_m)), bool)
-    if area and wanted.size:
-        wanted = _inside(polygons_m, x_m, y_m, spacing_m)
-        for path in paths_m:
-            for start, stop in zip(path, path[1:] if len(path) > 1 else path, strict=False):
-                _add_near(wanted, x_m, y_m, start, stop, footprint_m)
+    if area:
+        wanted = shapely.contains_xy(ground, x_m[None], y_m[:, None])
+    else:
+        wanted = np.ones((len(y_m), len(x_m)), bool)
     rows, columns = np.nonzero(wanted)
     _require_bounded(len(rows), _MOST_PLACES, spacing_m)
     if not len(rows):
@@ -294,28 +329,3 @@ def extent_words(extent_deg: tuple[float, float, float, float]) -> str:
     """Format a bounding box (south, west, north, east) for messages."""
     south, west, north, east = extent_deg
     return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"
-
-
-def _metres(points: Sequence[tuple[float, float]], plane: CRS) -> Doubles:
-    lat_deg, lon_deg = zip(*points, strict=True)
-    return np.column_stack(transform(WGS84, plane, lon_deg, lat_deg))
-
-
-def _inside(polygons_m: list[list[Doubles]], x_m: Doubles, y_m: Doubles, step_m: float) -> Bools:
-    """Return bool (rows, columns), True for the points of a grid, of ascending `x_m` and descending `y_m`, that are
-    inside the polygons, each of which is a list of rings (n, 2): its outline, then its holes."""
-    shape = len(y_m), len(x_m)
-    if not polygons_m:
-        return np.zeros(shape, bool)
-    grid = rasterio.Affine(step_m, 0, x_m[0] - step_m / 2, 0, -step_m, y_m[0] + step_m / 2)
-    shapes = [{"type": "Polygon", "coordinates": [ring.tolist() for ring in rings]} for rings in polygons_m]
-    inside: Bools = geometry_mask(shapes, shape, grid, invert=True)
-    return inside
-
-
-def _add_near(inside: Bools, x_m: Doubles, y_m: Doubles, begin: Doubles, end: Doubles, away_m: float) -> None:
-    """Set `inside` to True for the points of its grid within `away_m` of the line `begin` to `end`, (x, y) each."""
-    low, high = np.minimum(begin, end) - away_m, np.maximum(begin, end) + away_m
-    columns = slice(*np.searchsorted(x_m, (low[0], high[0])))
-    rows = slice(*np.searchsorted(-y_m, (-high[1], -low[1])))
-    inside[rows, columns] |= to_lines_m(x_m[columns][None], y_m[rows][:, None], begin, end - begin) <= away_m

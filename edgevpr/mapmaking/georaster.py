@@ -28,14 +28,14 @@ try:
     from rasterio.enums import ColorInterp, Resampling
     from rasterio.errors import NotGeoreferencedWarning
     from rasterio.errors import RasterioError as RasterioError
-    from rasterio.features import geometry_mask as geometry_mask
     from rasterio.io import MemoryFile as MemoryFile
     from rasterio.warp import transform as transform
     from rasterio.warp import transform_bounds
     from rasterio.windows import Window
 except ModuleNotFoundError as error:
     raise SourceError(
-        f"An orthophoto is read with rasterio, and {error.name} is not installed: run `pip install rasterio scipy`."
+        f"An orthophoto is read with rasterio, and {error.name} is not installed: run `pip install rasterio scipy "
+        "shapely`."
     ) from error
 
 logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words

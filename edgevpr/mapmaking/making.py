@@ -2,7 +2,6 @@
 confidence. This is the work of the commands `edgevpr map build`, `map refine` and `map calibrate`."""
 
 import logging
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,9 +15,8 @@ from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import Mask, mask_of
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.beforehand import require_ahead, say_what_lens, say_what_will_lack
-from edgevpr.mapmaking.display import say_what_stands_still
-from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, covered_by
+from edgevpr.mapmaking import advice
+from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import info_of
@@ -31,8 +29,6 @@ from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, techn
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
-    from edgevpr.mapmaking.missions import Area
-    from edgevpr.mapmaking.orthophoto import Orthophoto
     from edgevpr.mapmaking.refine import Refined
 
 _log = logging.getLogger(__name__)
@@ -56,6 +52,11 @@ class FlownPictures:
         step_s = 1 / self.rate_hz if self.rate_hz else None
         return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
 
+    @property
+    def folder(self) -> Path | None:
+        """The folder of images; None for a video."""
+        return Path(self.source) if Path(self.source).is_dir() else None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cuttings:
@@ -78,40 +79,16 @@ class Cuttings:
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
-        from edgevpr.core.quadkeys import extent_around, ring_around
-        from edgevpr.mapmaking.cuttings import OrthophotoSource, lattice_of, require_sharp, within
-        from edgevpr.mapmaking.missions import Area, read_area
+        from edgevpr.mapmaking.cuttings import open_cuttings  # loads GDAL, or raises if it is missing
 
-        area = Area(((ring_around(extent_around(self.tile, self.margin_m)),),), ()) if self.tile else None
-        area = read_area(self.area) if self.area else area
-        orthophoto = self._photo(area)
-        lattices = [lattice_of(orthophoto, each_m, self.spacing_m, area) for each_m in self._footprints_m]
-        require_sharp(orthophoto, self._footprints_m[0])
-        if self.tile:
-            lattices = [within(lattice, self.tile, self.margin_m) for lattice in lattices]
-        # Seams are those of the whole raster, and to try a place takes longer than to map it.
-        return OrthophotoSource(orthophoto, lattices, time.monotonic, only=only, tries_seams=self.tile is None)
-
-    @property
-    def _footprints_m(self) -> list[float]:
-        return sorted(set(self.footprint_m) if isinstance(self.footprint_m, Sequence) else {self.footprint_m})
-
-    def _photo(self, area: "Area | None") -> "Orthophoto":
-        from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
-        from edgevpr.mapmaking.tiles import ground_of
-
-        return Orthophoto(self.orthophoto, ground_of(area.points, self._footprints_m[-1]) if area else None)
+        return open_cuttings(self, only)
 
     def extent_deg(self) -> tuple[float, float, float, float]:
         """Return the bounding box of the ground that is cut: (south, west, north, east) in degrees, longitudes perhaps
         beyond the date line. Raises as `open` does."""
-        from edgevpr.mapmaking.missions import read_area
-        from edgevpr.mapmaking.tiles import ground_of
+        from edgevpr.mapmaking.cuttings import extent_of_cuttings
 
-        area = read_area(self.area) if self.area else None
-        orthophoto = self._photo(area)
-        orthophoto.close()
-        return ground_of(area.points, self._footprints_m[-1]).extent_deg if area else orthophoto.extent_deg
+        return extent_of_cuttings(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,26 +129,32 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, here, pictures = map_path(order.path), load_board("this"), order.pictures
     is_new = not (order.append and path.exists())
-    if isinstance(pictures, Cuttings) and "://" in str(pictures.orthophoto) and not pictures.attribution:
-        raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
-    mask, lens = (None, None) if isinstance(pictures, Cuttings) else (mask_of(config.source.mask), config.source.lens)
-    if is_new:
-        source, technique = _opened(order, config, None, mask)
+    place_map = None if is_new else PlaceMap.open_for_adding(path)
+    source: Source
+    counts: dict[str, int] = {}
+    if isinstance(pictures, FlownPictures):
+        mask, lens = mask_of(config.source.mask), config.source.lens
+        source, technique = _open_flown(order, pictures, config, place_map, mask)
+    else:
+        mask, lens = None, None
+        source, technique = cuttings, _ = _open_cuttings(order, pictures, config, place_map)
+        cuttings.begin(pictures.spacing_m, technique, shown)
+        counts = cuttings.counts
+    if place_map is None:
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256 if mask else None)
         place_map.record_lens(lens)
     else:
-        place_map = PlaceMap.open_for_adding(path)
-        source, technique = _opened(order, config, place_map, mask)
         warn_of_other_pictures(place_map, mask, lens)
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):
-                _say_beforehand(pictures, config, technique, source.total, len(place_map) if order.calibrate else None)
-                say_what_stands_still(pictures.source, mask)
+                is_calibrated = order.calibrate and kinds_of(technique.spec)
+                advice.warn_of_gaps(pictures, source.total, len(place_map) if is_calibrated else None)
+                advice.suggest_lens(pictures, config.source, technique)
+                advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
-                _say_and_fetch(source, pictures.spacing_m, technique, shown)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
                 replace(encoder_of(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
@@ -179,19 +162,16 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
             )
-            for name in ("without_data", "white", "seams", "tried_for_seams"):
-                setattr(result, name, getattr(source, name, 0))
         except EdgevprError:
             if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
                 remove(path)
             raise
-        if covered := covered_by(place_map):
+        if covered := measure_ground(place_map):
             _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
         refined, calibration = None, None
         if order.refine and technique.spec.looks_down and isinstance(pictures, FlownPictures):
-            images = pictures.source if Path(pictures.source).is_dir() else None
             with _if_possible("refined"):
-                refined = refine_map(place_map, technique, images, shown)
+                refined = refine_map(place_map, technique, pictures.folder, shown)
         if order.calibrate and kinds_of(technique.spec):
             with _if_possible("calibrated"):
                 calibration = calibrate_map(place_map, technique, config, pictures, shown)
@@ -199,35 +179,11 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             technique=technique.spec.name,
             places=len(place_map),
             with_position=info_of(place_map).with_position,
-            result=result,
+            result=replace(result, **counts),
             covered=covered,
             refined=refined,
             calibration=calibration,
         )
-
-
-def _say_and_fetch(source: Source, spacing_m: float, technique: Technique, shown: Shown) -> None:
-    """Say how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map."""
-    from edgevpr.mapmaking.cuttings import OrthophotoSource
-
-    assert isinstance(source, OrthophotoSource)  # opened by `Cuttings`
-    if _log.isEnabledFor(logging.INFO):  # it takes half a second
-        _log.info("%s", source.forecast(spacing_m, technique))
-    if to_fetch := source.to_fetch():
-        count, steps = to_fetch
-        for _ in shown(steps, count, "fetching tiles"):
-            pass
-
-
-def _say_beforehand(
-    pictures: FlownPictures, config: Config, technique: Technique, total: int, places: int | None
-) -> None:
-    """Say what the map will lack; `places` are those in a map that is to be calibrated."""
-    is_sure = kinds_of(technique.spec)
-    say_what_will_lack(pictures.source, pictures.positions, pictures.rate_hz, total, places if is_sure else None)
-    is_down = technique.spec.parameters.get("camera") == "nadir"
-    if is_down and config.source.fov_deg is None and config.source.lens is None and Path(pictures.source).is_dir():
-        say_what_lens(Path(pictures.source))
 
 
 def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
@@ -271,27 +227,44 @@ def calibrate_map(
     )
 
 
-def _opened(order: MapOrder, config: Config, place_map: PlaceMap | None, mask: Mask | None) -> tuple[Source, Technique]:
+def _open_flown(
+    order: MapOrder, pictures: FlownPictures, config: Config, place_map: PlaceMap | None, mask: Mask | None
+) -> tuple[Source, Technique]:
     """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
     map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so."""
-    is_cut, camera, here = isinstance(order.pictures, Cuttings), config.source.camera, load_board("this")
-    if is_cut and camera not in (None, "nadir"):
-        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
-    camera = "nadir" if is_cut else camera
-    source: Source = order.pictures.open()
-    name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS if is_cut else None)
-    asks_camera = camera is None and place_map is None and "camera" not in order.parameters
-    if isinstance(order.pictures, FlownPictures) and asks_camera and (not name or camera_setting(name, "nadir")):
-        require_ahead(order.pictures.source, mask)
-    if name is None or is_cut:
+    source, settings, camera = pictures.open(), order.parameters, config.source.camera
+    name = order.technique or (place_map.spec.name if place_map is not None else None)
+    asks_camera = camera is None and place_map is None and "camera" not in settings
+    if asks_camera and (not name or camera_setting(name, "nadir")):
+        advice.require_ahead(pictures, mask)
+    if name is None:
         with at_work("choosing a technique"):
-            name = name or picked_technique(order.board, source.total or 1, camera)
-        settings = order.parameters | camera_setting(name, camera)
-    else:  # a technique that knows no camera refuses one that was asked for
-        settings = order.parameters | ({"camera": camera} if camera else {})
+            name = picked_technique(order.board, source.total or 1, camera)
+        settings = settings | camera_setting(name, camera)
+    elif camera:  # a technique that knows no camera refuses one that was asked for
+        settings = settings | {"camera": camera}
+    return source, _make_technique(order, place_map, name, settings)
+
+
+def _open_cuttings(
+    order: MapOrder, pictures: Cuttings, config: Config, place_map: PlaceMap | None
+) -> tuple["OrthophotoSource", Technique]:
+    """Open the orthophoto, and make the technique: the one asked for, else that of the map (`place_map` None: there is
+    no map yet), else `cohog`. Raises UsageError for another camera, and for tiles whose owner is not named."""
+    if "://" in str(pictures.orthophoto) and not pictures.attribution:
+        raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
+    if (camera := config.source.camera) not in (None, "nadir"):
+        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
+    name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS)
+    settings = order.parameters | camera_setting(name, "nadir")
+    return pictures.open(), _make_technique(order, place_map, name, settings)
+
+
+def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
+    here = load_board("this")
     if place_map is not None:  # one without places is false
-        return source, technique_of(place_map, order.technique, settings, here)
-    return source, made_for(here.threads, name, settings)
+        return technique_of(place_map, order.technique, settings, here)
+    return made_for(here.threads, name, settings)
 
 
 def encoder_of(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> FrameEncoder:

@@ -98,7 +98,7 @@ class Covered:
         return f"{where}; the track is {track} long, {step} from picture to picture (median)" if is_flown else where
 
 
-def covered_by(place_map: PlaceMap) -> Covered | None:
+def measure_ground(place_map: PlaceMap) -> Covered | None:
     """Measure the ground that a map covers; None with fewer than two positions."""
     points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.outlines()]).reshape(-1, 2)
     lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T

@@ -4,16 +4,23 @@ part of an orthophoto from which a map is made, and of a map the part that a fli
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from edgevpr.core.arrays import LatLon
+import numpy as np
+
+from edgevpr.core.arrays import Doubles, LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.core.geodesy import extent_of, moved
+
+try:
+    import shapely as shapely
+except ModuleNotFoundError as error:
+    raise UsageError("Areas and missions are laid out with shapely: run `pip install shapely`.") from error
 
 _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
@@ -22,9 +29,16 @@ _WAYPOINT_COLUMNS = 12
 _FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
 _CIRCLE = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
-_CIRCLE_CORNERS, _MOST_RADIUS_M = 72, 200_000.0
+_CIRCLE_CORNERS = 72
+_MAX_RADIUS_M = 200_000.0
+_QUARTER_SEGMENTS = 64  # of a buffer's round corners: exact to 0.01 % of its width
+_FAR_M = 1e8
+_MALFORMED = (
+    ElementTree.ParseError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError,
+)  # fmt: skip
 
 Ring = list[LatLon]
+Projection = Callable[[Doubles, Doubles], tuple[Any, Any]]  # latitudes and longitudes, to x and y in metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +61,7 @@ class Area:
     @property
     def points(self) -> list[LatLon]:
         """All corners of polygons and points of paths."""
-        points = [(way.lat_deg, way.lon_deg) for path in self.paths for way in path]
+        points = [(waypoint.lat_deg, waypoint.lon_deg) for path in self.paths for waypoint in path]
         return points + [point for rings in self.polygons for ring in rings for point in ring]
 
     @property
@@ -55,33 +69,45 @@ class Area:
         """The bounding box of polygons and paths: (south, west, north, east) in degrees, see `extent_of`."""
         return extent_of(self.points)
 
+    def on_plane(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
+        """Return the ground within these margins of the polygons and of the paths, on a plane."""
+
+        def corners_m(points: Sequence[LatLon]) -> Doubles:
+            # What cannot be projected is far away.
+            corners: Doubles = np.column_stack(project(*np.array(points, float).T))
+            return np.nan_to_num(corners, nan=_FAR_M, posinf=_FAR_M)
+
+        shapes = []
+        for rings in self.polygons:
+            outline, *holes = map(corners_m, rings)
+            shapes.append((shapely.make_valid(shapely.Polygon(outline, holes)), polygon_margin_m))
+        for path in self.paths:
+            points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in (*path, path[-1])]  # a line has two or more
+            shapes.append((shapely.LineString(corners_m(points)), path_margin_m))
+        ground = shapely.union_all(
+            [shapely.buffer(shape, margin_m, quad_segs=_QUARTER_SEGMENTS) for shape, margin_m in shapes]
+        )
+        shapely.prepare(ground)
+        return ground
+
 
 def read_area(path: str | Path) -> Area:
     """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, GeoJSON in degrees, or KML; or the circle that the
-    text LAT,LON,RADIUS_M tells. Raises UsageError for a file that is none of them, holds no position, or has one beyond
-    -90..90 or -180..180 degrees."""
+    text LAT,LON,RADIUS_M describes. Raises UsageError for a file that is none of them, holds no position, or has one
+    beyond -90..90 or -180..180 degrees."""
     try:
         if _CIRCLE.fullmatch(str(path)):
             return _circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
         if text.startswith("QGC WPL"):
-            area = _of_lines(text.splitlines())
+            area = _read_waypoints(text.splitlines())
         else:
-            area = _of_kml(text) if text.lstrip().startswith("<") else _of_json(json.loads(text))
+            area = _read_kml(text) if text.lstrip().startswith("<") else _read_json(json.loads(text))
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read ({error.strerror}): give a mission file, GeoJSON, or LAT,LON,RADIUS_M."
         ) from error
-    except (
-        ElementTree.ParseError,
-        ValueError,
-        KeyError,
-        TypeError,
-        IndexError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ):
+    except _MALFORMED:
         raise UsageError(
             f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl, and no GeoJSON or KML that can "
             "be understood: save it again."
@@ -94,61 +120,60 @@ def read_area(path: str | Path) -> Area:
 
 
 def _circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
-    if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MOST_RADIUS_M):
+    if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MAX_RADIUS_M):
         raise UsageError(
             f"--area {lat_deg:g},{lon_deg:g},{radius_m:g}: write LAT,LON,RADIUS_M, in degrees of WGS-84 and metres (at "
-            f"most {_MOST_RADIUS_M:,.0f})."
+            f"most {_MAX_RADIUS_M:,.0f})."
         )
     turns = (2 * math.pi * corner / _CIRCLE_CORNERS for corner in range(_CIRCLE_CORNERS + 1))
     ring = [moved(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
     return Area(((ring,),), ())
 
 
-def _of_lines(lines: list[str]) -> Area:
-    """Read the lines of a waypoint file. The first is a heading; the columns of the others are index, current, frame,
-    command, four parameters, lat, lon, alt, autocontinue."""
+def _read_waypoints(lines: list[str]) -> Area:
+    """Read a waypoint file. The first line is a heading; the columns of the others are index, current, frame, command,
+    four parameters, lat, lon, alt, autocontinue."""
     path: list[Waypoint] = []
     for values in filter(None, map(str.split, lines[1:])):
         if len(values) != _WAYPOINT_COLUMNS:
             raise ValueError
-        path += _waypoint(int(values[3]), int(values[2]), *map(_finite, values[8:11]))
+        path += _waypoint(int(values[3]), int(values[2]), values[8:11])
     return Area((), (tuple(path),) if path else ())
 
 
-def _waypoint(command: int, frame: int, lat_deg: float, lon_deg: float, alt_m: float) -> list[Waypoint]:
+def _waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
     """Return the waypoint of a mission item in a list, empty for an item that is not flown to. `command` is a MAV_CMD,
-    `frame` a MAV_FRAME, and (0, 0) means the aircraft's present position."""
+    `frame` a MAV_FRAME, `where` latitude, longitude and altitude; (0, 0) means the aircraft's present position."""
+    lat_deg, lon_deg, alt_m = map(_finite, where)
     if command not in _FLOWN_TO or lat_deg == lon_deg == 0:
         return []
     # Height 0, as of home and a landing, is not that from which pictures are taken: it counts as not given.
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
 
 
-def _of_kml(text: str) -> Area:
+def _read_kml(text: str) -> Area:
     """Read the polygons, lines and points of KML (OGC 12-007r2), whatever they are wrapped in."""
     polygons: list[tuple[Ring, ...]] = []
     paths: list[tuple[Waypoint, ...]] = []
     for element in ElementTree.fromstring(text).iter():
-        within = [[_lat_lon(point.split(",")) for point in (each.text or "").split()] for each in _coordinates(element)]
         kind = element.tag.rpartition("}")[2]
-        if kind == "Polygon":
-            polygons.append(tuple(within))
-        elif kind in ("LineString", "Point"):
-            paths += [tuple(Waypoint(*point) for point in line) for line in within]
-    return Area(tuple(polygons), tuple(filter(None, paths)))
+        if kind in ("Polygon", "LineString", "Point"):
+            texts = [each.text or "" for each in element.findall(".//{*}coordinates")]
+            lines = [[_lat_lon(point.split(",")) for point in line.split()] for line in texts]
+            if kind == "Polygon":
+                polygons.append(tuple(lines))
+            else:
+                paths += [tuple(Waypoint(*point) for point in line) for line in lines if line]
+    return Area(tuple(polygons), tuple(paths))
 
 
-def _coordinates(element: ElementTree.Element) -> list[ElementTree.Element]:
-    return [each for each in element.iter() if each.tag.rpartition("}")[2] == "coordinates"]
-
-
-def _of_json(content: Any) -> Area:
+def _read_json(content: Any) -> Area:
     if content.get("fileType") == "Plan":
-        return _of_plan(content["mission"]["items"])
+        return _read_plan(content["mission"]["items"])
     polygons: list[tuple[Ring, ...]] = []
     paths: list[tuple[Waypoint, ...]] = []
-    for kind, within in _geometries(content):
-        parts = within if kind.startswith("Multi") else [within]
+    for kind, coordinates in _geometries(content):
+        parts = coordinates if kind.startswith("Multi") else [coordinates]
         if kind.endswith("Polygon"):
             polygons += [tuple(map(_ring, rings)) for rings in parts]
         elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString"):
@@ -181,19 +206,19 @@ def _ring(points: list[list[float]]) -> Ring:
     return [_lat_lon(point) for point in points]
 
 
-def _of_plan(items: list[dict[str, Any]]) -> Area:
+def _read_plan(items: list[dict[str, Any]]) -> Area:
     """Read the items of a plan: simple items, and surveys and corridors, which have both a polygon and the waypoints
     computed from it. A plan has null for numbers that it leaves to the autopilot."""
     path: list[Waypoint] = []
     polygons: list[tuple[Ring, ...]] = []
     for item in items:
         if item["type"] == "SimpleItem":
-            path += _waypoint(int(item["command"]), int(item["frame"]), *map(_finite, item["params"][4:7]))
+            path += _waypoint(int(item["command"]), int(item["frame"]), item["params"][4:7])
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
-        seen_from = style.get("VisualTransectPoints", ())
-        path += [Waypoint(_finite(lat_deg), _finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in seen_from]
+        points = style.get("VisualTransectPoints", ())
+        path += [Waypoint(_finite(lat_deg), _finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
         corners = [(_finite(lat_deg), _finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
         polygons += [([*corners, corners[0]],)] if corners else []
     return Area(tuple(polygons), (tuple(path),) if path else ())

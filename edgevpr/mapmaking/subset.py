@@ -2,18 +2,16 @@
 
 import shutil
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Doubles, LatLon
+from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.geodesy import offset_m, shorter_deg, to_lines_m
+from edgevpr.core.geodesy import offset_m, shorter_deg
 from edgevpr.core.quadkeys import extent_of_key, maps_in
-from edgevpr.mapmaking.missions import Area
+from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
@@ -43,7 +41,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
 
     def wanted(place_map: PlaceMap) -> list[int]:
         place_ids, lat_deg, lon_deg = positions_in(place_map)
-        there: list[int] = place_ids[near_of(area, margin_m, lat_deg, lon_deg)].tolist()
+        there: list[int] = place_ids[_is_near(area, margin_m, lat_deg, lon_deg)].tolist()
         if there:
             calibrations.append(calibration_of(place_map))
         return there
@@ -94,50 +92,13 @@ def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
     return found
 
 
-def near_of(area: Area, margin_m: float, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
+def _is_near(area: Area, margin_m: float, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
     """Return bool (N,), True for the positions in degrees, (N,) each, in an area or within `margin_m` metres of it: in
     a hole of it, too. False for NaN."""
     south, west, north, east = area.extent_deg
-    middle = (south + north) / 2, (west + east) / 2
 
-    def laid(points: Sequence[LatLon]) -> Doubles:
-        return np.array(offset_m(*middle, *np.array(points, float).T))
+    def project(lat_deg: Doubles, lon_deg: Doubles) -> tuple[Doubles, Doubles]:
+        return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
 
-    corners_m = laid(area.points)
-    low_m, high_m = corners_m.min(axis=1) - margin_m, corners_m.max(axis=1) + margin_m
-    at_m = np.array(offset_m(*middle, lat_deg, lon_deg))
-    candidates = np.flatnonzero(((at_m >= low_m[:, None]) & (at_m <= high_m[:, None])).all(axis=0))
-    at_m, is_near = at_m[:, candidates], np.zeros(len(lat_deg), bool)
-    found = np.zeros(len(candidates), bool)
-    for path in area.paths:  # a point is a path without length
-        found |= (
-            _away_m(laid([(way.lat_deg, way.lon_deg) for way in (path if len(path) > 1 else 2 * path)]), at_m)
-            <= margin_m
-        )
-    for rings in area.polygons:
-        outline, *holes = [laid([*ring, ring[0]]) for ring in rings]
-        of_this = _inside(outline, at_m) | (_away_m(outline, at_m) <= margin_m)
-        for hole in holes:
-            of_this &= ~_inside(hole, at_m) | (_away_m(hole, at_m) <= margin_m)
-        found |= of_this
-    is_near[candidates] = found
-    return is_near
-
-
-def _away_m(corners_m: Doubles, at_m: Doubles) -> Doubles:
-    """Return the distance in metres of points (2, N) from a line with these corners (2, n), float64 (N,)."""
-    away_m = np.full(at_m.shape[1], np.inf)
-    for begin, end in pairwise(corners_m.T):
-        np.minimum(away_m, to_lines_m(at_m[0], at_m[1], begin, end - begin), out=away_m)
-    return away_m
-
-
-def _inside(ring_m: Doubles, at_m: Doubles) -> Bools:
-    """Return bool (N,), True for points (2, N) in a closed ring (2, n): a ray to the east crosses it an odd number of
-    times."""
-    (east_m, north_m), inside = at_m, np.zeros(at_m.shape[1], bool)
-    for (x, y), (next_x, next_y) in pairwise(ring_m.T):
-        if y != next_y:
-            crosses = (y > north_m) != (next_y > north_m)
-            inside ^= crosses & (east_m < x + (north_m - y) * (next_x - x) / (next_y - y))
-    return inside
+    near: Bools = shapely.contains_xy(area.on_plane(project, margin_m, margin_m), *project(lat_deg, lon_deg))
+    return near

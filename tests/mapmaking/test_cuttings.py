@@ -33,7 +33,7 @@ def frames_of(source: OrthophotoSource) -> list:
 def source_of(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
     lattice = lattice_of(orthophoto, footprint_m, spacing_m, area)
-    return OrthophotoSource(orthophoto, [lattice], float, only=only)
+    return OrthophotoSource(orthophoto, [lattice], only=only)
 
 
 def off_m(lattice) -> np.ndarray:
@@ -83,7 +83,7 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 40.0)
     kept = frames_of(source)
     assert 0 < len(kept) < source.total
-    assert source.without_data == source.total - len(kept)
+    assert source.counts["without_data"] == source.total - len(kept)
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 
@@ -194,19 +194,22 @@ def test_places_under_cloud_are_counted(tmp_path):
         raster.write(np.full((1, 200, 200), 240, np.uint8), window=rasterio.windows.Window(220, 220, 200, 200))
     source = source_of(path, 100.0, 60.0)
     frames = frames_of(source)
-    assert (len(frames), source.white) == (16, 4)
+    assert (len(frames), source.counts["white"]) == (16, 4)
 
 
 def test_places_with_a_seam_are_counted(tmp_path):
     source = source_of(textured_raster(tmp_path / "o.tif", pixel_m=0.5), 100.0, 60.0)
     assert len(frames_of(source)) == 16
-    assert (source.seams, source.tried_for_seams) == (0, 16)
+    assert (source.counts["seams"], source.counts["tried_for_seams"]) == (0, 16)
     with rasterio.open(tmp_path / "o.tif", "r+") as raster:
         window = rasterio.windows.Window(0, 0, 200, 640)
         raster.write(255 - raster.read(window=window), window=window)
     source = source_of(tmp_path / "o.tif", 100.0, 60.0)
     assert len(frames_of(source)) == 16
-    assert (source.seams, source.tried_for_seams) == (12, 16)  # the pixels around the easternmost begin beyond it
+    assert (source.counts["seams"], source.counts["tried_for_seams"]) == (
+        12,
+        16,
+    )  # the pixels around the easternmost begin beyond it
 
 
 def test_one_order_cuts_every_place_at_several_footprints(tmp_path):
