@@ -110,7 +110,7 @@ def add_orthophoto(parser: ArgumentParser) -> None:
         "--orthophoto",
         metavar="FILE",
         help="GeoTIFF, VRT, MBTiles, PMTiles, the tile cache of QGroundControl or Mission Planner, a folder of tiles "
-        "(z/x/y.png), or the address of tiles (https://.../{z}/{x}/{y}.png, WMTS:https://...) that you may use",
+        "(z/x/y.png), or the address of tiles (https://.../{z}/{x}/{y}.png) that you may use",
     )
     flags.add_argument(
         "--footprint-m",

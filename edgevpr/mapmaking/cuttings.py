@@ -5,7 +5,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,6 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.quadkeys import extent_around, in_extent, keys_at, ring_around
 from edgevpr.core.text import decoded_name
 from edgevpr.core.types import Frame, Pose, Position
-from edgevpr.frames.images import resized
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import WGS84, Extent, local_crs, transform
@@ -26,7 +25,6 @@ from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
 from edgevpr.mapmaking.tiles import ground_of
-from edgevpr.runtime.recognise.landmarks import describe
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import Cuttings
@@ -37,13 +35,11 @@ SIDE_PX = 512
 MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
-_SHARP_PX, _LEAST_PX = 150, 32
-# What a sharp picture loses at least when it is halved. Those cut from the rasters of sat_marash lose .10 to .16; where
-# the rasters are halved and enlarged again .05 to .09, four times .02 to .03.
-_BLURRED = 0.07
-_WHITE, _COLOURLESS = 200, 30  # grey values
+_SHARP_PX = 150
+_LEAST_PX = 32
+_WHITE = 200  # grey values: the least, and the largest difference of colours
+_COLOURLESS = 30
 _CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
-_TRIED = 0.25, 0.5, 0.75  # places to try for blur, as shares of all
 _TRIED_FOR_SEAMS = 64  # places: it takes a tenth of a second each
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
@@ -129,47 +125,25 @@ class OrthophotoSource(RecordingSource):
     def begin(self, spacing_m: float, technique: Technique, shown: Callable[..., Iterable[None]]) -> None:
         """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
         `shown` shows progress."""
-        if _log.isEnabledFor(logging.INFO):  # it takes half a second
-            _log.info("%s", self.forecast(spacing_m, technique))
-        if to_fetch := self.to_fetch():
-            count, steps = to_fetch
-            for _ in shown(steps, count, "fetching tiles"):
-                pass
-
-    def forecast(self, spacing_m: float, technique: Technique) -> str:
-        """Return how much is to be done for a map, in words. It takes a few places to try."""
+        lat_deg, lon_deg = np.hstack([(lattice.lat_deg, lattice.lon_deg) for lattice in self._lattices])
+        widest_m = max(lattice.footprint_m for lattice in self._lattices)
+        count, steps = self._orthophoto.to_fetch(lat_deg, lon_deg, widest_m, SIDE_PX) or (0, iter(()))
         lattice = min(self._lattices, key=lambda each: each.footprint_m)
-        to_fetch = self.to_fetch()
-        began_s = time.perf_counter()
-        with suppress(ImageError):
-            image, _ = self._orthophoto.cut(_place_of(lattice, 0.5), lattice.footprint_m, SIDE_PX)
-            technique.encode(image)
-            describe(image)
-        lasts_s = self.total * (time.perf_counter() - began_s)
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
-        size = f"{len(lattice) * spacing_m**2 / 1e6:.2f} km2 of ground, {self.total * place_bytes / 1e6:.1f} MB"
-        tiles = f", of {to_fetch[0]} tiles to fetch from {self._orthophoto.name}" if to_fetch else ""
         across_px = lattice.footprint_m / self._orthophoto.resolution_m
-        sharp_px = across_px / self._blur(lattice, across_px)
-        sharp = f"{across_px:.0f} pixels along a picture"
-        sharp += "" if sharp_px == across_px else f", blurred: {sharp_px:.0f} would show as much"
-        sharp += "" if sharp_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
-        return (
-            f"{self.total} places will be cut{tiles}: {size}, {sharp}, about {math.ceil(lasts_s)} s without calibration"
+        few = "" if across_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
+        _log.info(
+            "%d places will be cut%s: %.2f km2 of ground, %.1f MB, %.0f pixels along a picture%s",
+            self.total,
+            f", of {count} tiles to fetch from {self._orthophoto.name}" if count else "",
+            len(lattice) * spacing_m**2 / 1e6,
+            self.total * place_bytes / 1e6,
+            across_px,
+            few,
         )
-
-    def _blur(self, lattice: Lattice, across_px: float) -> float:
-        """Return by how much larger the pixels of the raster, `across_px` along a picture, could be, and would show as
-        much: a power of two, 1 for a sharp one."""
-        side_px, images = min(SIDE_PX, round(across_px)), []
-        for share in _TRIED:
-            with suppress(ImageError):
-                images.append(self._orthophoto.cut(_place_of(lattice, share), lattice.footprint_m, side_px)[0])
-        halvings = 0
-        while images and side_px >> halvings >= _LEAST_PX and np.median(list(map(_lost, images))) < _BLURRED:
-            images, halvings = [resized(each, (side_px >> (halvings + 1),) * 2) for each in images], halvings + 1
-        return across_px / side_px * 2**halvings if halvings else 1.0
+        for _ in shown(steps, count, "fetching tiles") if count else ():
+            pass
 
     def ground(self, spacing_m: float) -> Iterator[bytes]:
         """Yield what the pictures are cut from: the numbers of the places, and all that the file shows around them, in
@@ -184,13 +158,6 @@ class OrthophotoSource(RecordingSource):
                 at_deg = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
                 yield photo.as_it_is(at_deg, side_px)[0].tobytes()
 
-    def to_fetch(self) -> tuple[int, Iterator[None]] | None:
-        """See `Orthophoto.to_fetch`."""
-        widest_m = max(lattice.footprint_m for lattice in self._lattices)
-        lat_deg = np.concatenate([lattice.lat_deg for lattice in self._lattices])
-        lon_deg = np.concatenate([lattice.lon_deg for lattice in self._lattices])
-        return self._orthophoto.to_fetch(lat_deg, lon_deg, widest_m, SIDE_PX)
-
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
@@ -201,20 +168,6 @@ def _white(image: Image) -> float:
     blue, green, red = cv2.split(image)
     low, high = cv2.min(cv2.min(blue, green), red), cv2.max(cv2.max(blue, green), red)
     return float(((low > _WHITE) & (high - low < _COLOURLESS)).mean())
-
-
-def _place_of(lattice: Lattice, share: float) -> Position:
-    """Return the place that comes after this share of all."""
-    at = int(share * len(lattice))
-    return Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
-
-
-def _lost(image: Image) -> float:
-    """Return what a picture loses when it is halved and doubled again: a standard deviation, as a share of its own."""
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
-    half = cv2.resize(grey, (len(grey) // 2,) * 2, interpolation=cv2.INTER_AREA)
-    back = cv2.resize(half, grey.shape[::-1], interpolation=cv2.INTER_CUBIC)
-    return float(np.std(grey - back) / max(np.std(grey), 1.0))
 
 
 def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:

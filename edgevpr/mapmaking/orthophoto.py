@@ -13,7 +13,6 @@ from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resized
-from edgevpr.mapmaking.addresses import AddressTiles, described_wmts, host_of, is_address
 from edgevpr.mapmaking.georaster import (
     CRS,
     HALF_WORLD_M,
@@ -25,8 +24,8 @@ from edgevpr.mapmaking.georaster import (
     rasterio,
     transform,
 )
-from edgevpr.mapmaking.tilefiles import tiles_in
-from edgevpr.mapmaking.tiles import TILE_PX, FolderTiles, Ground, TileRaster
+from edgevpr.mapmaking.tiles import Ground, TileRaster
+from edgevpr.mapmaking.tilestores import AddressTiles, host_of, is_address, open_tile_file
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
@@ -34,23 +33,19 @@ _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
-def _raster_of(source: str | Path, ground: Ground | None) -> GeoRaster | TileRaster:
+def _open_raster(source: str | Path, ground: Ground | None) -> GeoRaster | TileRaster:
     """Open a file, a folder of tiles, or an address, see `Orthophoto`."""
     if is_address(source):
-        address = str(source)
         if ground is None:
-            raise UsageError(f"{host_of(address)} has tiles of the whole Earth: give --area.")
-        if address.lower().startswith("wmts:"):
-            return GeoRaster(described_wmts(address), host_of(address), ground.extent_deg)
-        return TileRaster(AddressTiles(address), ground)
+            raise UsageError(f"{host_of(str(source))} has tiles of the whole Earth: give --area.")
+        return TileRaster(AddressTiles(str(source)), ground)
     path, kind = Path(source), ""
     if not path.exists() and "#" in path.name:
-        path, kind = path.with_name(path.name.rpartition("#")[0]), path.name.rpartition("#")[2]
+        name, _, kind = path.name.rpartition("#")
+        path = path.with_name(name)
     if not path.exists():
         raise SourceError(f"There is no orthophoto {source}: check the name.")
-    if path.is_dir():
-        return TileRaster(FolderTiles(path), ground)
-    store = tiles_in(path, kind)
+    store = open_tile_file(path, kind)
     return TileRaster(store, ground) if store else GeoRaster(path)
 
 
@@ -63,7 +58,7 @@ class Orthophoto:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, PMTiles, a tile cache (FILE#MAP if it has several
         maps), a folder of map tiles, or an address of tiles. `ground`: that of tiles which is wanted (None: all).
         Raises SourceError, and UsageError for an address or a map that is not said in full."""
-        self._raster = _raster_of(source, ground)
+        self._raster = _open_raster(source, ground)
         self.name, self.short_name = self._raster.name, self._raster.short_name
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
         self._turn = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
@@ -155,24 +150,18 @@ class Orthophoto:
     def to_fetch(
         self, lat_deg: Doubles, lon_deg: Doubles, footprint_m: float, side_px: int
     ) -> tuple[int, Iterator[None]] | None:
-        """Return how many tiles the pictures of `cut` and `as_it_is` at the places `lat_deg` and `lon_deg` need from an
-        address, and the steps that fetch them. GDAL, which reads WMTS, fetches them later, less those that it has kept.
-        None: it is no address."""
+        """Return how many tiles the pictures of `cut` and `as_it_is` at these places need from an address, less those
+        that are kept, and the steps that fetch them. None: it is no address."""
         raster = self._raster
-        store = raster.store if isinstance(raster, TileRaster) else None
-        if not isinstance(store, AddressTiles) and not (isinstance(raster, GeoRaster) and raster.host):
+        if not isinstance(raster, TileRaster) or not isinstance(raster.store, AddressTiles):
             return None
-        across_px = footprint_m / self.resolution_m
-        shrink = _shrink(across_px, side_px)
-        tile_px = raster.tile_px if isinstance(raster, TileRaster) else TILE_PX * shrink
+        store, across_px = raster.store, footprint_m / self.resolution_m
         middles = np.column_stack(self._in_file(*transform(WGS84, raster.crs, lon_deg, lat_deg)))
-        reach_px = max(across_px / 2 + 2 * shrink, side_px / 2)
-        low, high = (((middles + side) // tile_px).astype(int) for side in (-reach_px, reach_px))
+        reach_px = max(across_px / 2 + 2 * _shrink(across_px, side_px), side_px / 2)
+        low, high = (((middles + side) // raster.tile_px).astype(int) for side in (-reach_px, reach_px))
         steps = np.indices((high - low).max(axis=0) + 1).reshape(2, -1).T
         tiles = np.unique(np.concatenate([np.minimum(low + step, high) for step in steps]), axis=0)
-        if not isinstance(raster, TileRaster) or not isinstance(store, AddressTiles):
-            return len(tiles), iter(())
-        missing = store.missing(raster.zoom, (raster.tile_at(*each) for each in tiles.tolist()))
+        missing = store.missing(raster.zoom, (raster.tile_at(*tile) for tile in tiles.tolist()))
         return len(missing), store.fetch(raster.zoom, missing)
 
     def close(self) -> None:

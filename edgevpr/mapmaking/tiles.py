@@ -1,14 +1,11 @@
 """Map tiles: squares of the Web Mercator projection, each with a zoom and the numbers x and y.
 
-A `TileStore` gives them as files: from a folder (here), a file (`tilefiles`) or an address (`addresses`). `TileRaster`
-joins those of one zoom to one picture."""
+A `TileStore` gives them as files (see `tilestores`), and `TileRaster` joins those of one zoom to one picture."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,7 +17,6 @@ from edgevpr.frames.images import resized
 from edgevpr.mapmaking.georaster import CRS, HALF_WORLD_M, Pixel, rasterio
 
 TILE_PX = 256  # the usual side
-_ENDS = (".png", ".jpg", ".jpeg", ".webp")
 _ACROSS_PX = 640  # of a footprint, in tiles as fine as a technique can use
 _COARSER = 2  # zooms below that which still do
 _NEARLY_ALL = 0.9  # of the ground that is covered best: a finer zoom, in which holes were never looked at, has less
@@ -60,7 +56,7 @@ class Level:
     some: Sequence[Pixel]
 
 
-class TileStore(Protocol):
+class TileStore:
     """Tiles of several zooms. `name` names the store in messages, and `short_name` the pictures cut from it."""
 
     name: str
@@ -68,11 +64,14 @@ class TileStore(Protocol):
 
     def levels(self, ground: Ground | None) -> dict[int, Level]:
         """Return the tiles that touch `ground` (None: all), by zoom."""
+        raise NotImplementedError
 
     def get(self, zoom: int, x: int, y: int) -> bytes | None:
         """Return a tile, as a PNG, JPEG or WebP file; None: there is none."""
+        raise NotImplementedError
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the file, if one is held open."""
 
 
 def ground_of(points: Sequence[LatLon], footprint_m: float) -> Ground:
@@ -119,30 +118,6 @@ def levels_of(tiles: Ints, box: Box) -> dict[int, Level]:
         some = [(int(column), int(row)) for column, row in at]
         levels[zoom] = Level(count=len(at), left=left, top=top, right=right, bottom=bottom, some=some)
     return levels
-
-
-class FolderTiles:
-    """The tiles of a folder (zoom/x/y.png), see `TileStore`."""
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self.short_name = str(folder), folder.name
-        self._tiles = {
-            (int(path.parts[-3]), int(path.parts[-2]), int(path.stem)): path
-            for path in folder.glob("*/*/*")
-            if path.suffix.lower() in _ENDS and all(map(str.isdecimal, (*path.parts[-3:-1], path.stem)))
-        }
-
-    def levels(self, ground: Ground | None) -> dict[int, Level]:
-        """See `TileStore`."""
-        return levels_of(np.array(list(self._tiles), int).reshape(-1, 3), box_of(ground))
-
-    def get(self, zoom: int, x: int, y: int) -> bytes | None:
-        """See `TileStore`."""
-        path = self._tiles.get((zoom, x, y))
-        return path.read_bytes() if path else None
-
-    def close(self) -> None:
-        """Do nothing: no file is held open between tiles."""
 
 
 class TileRaster:

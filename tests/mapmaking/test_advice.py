@@ -124,11 +124,9 @@ def test_what_cannot_be_told_is_not_told(numbers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("view", [bare, drawn_over])
-def test_map_build_tells_what_to_do(tmp_path, caplog, view):
+def test_map_build_warns_of_a_display(tmp_path, caplog):
     for number in range(16):
-        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), view(number))
+        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), drawn_over(number))
     flags = "--technique", "cohog", "--camera", "nadir", "--no-refine", "--no-calibrate"
     assert main(["map", "build", str(tmp_path / "m.gpkg"), "--images", str(tmp_path), *flags]) == 0
-    assert ("of the picture stands still" in caplog.text) == (view is drawn_over)
-    assert ("--mask PNG" in caplog.text) == (view is drawn_over)
+    assert "--mask PNG" in caplog.text

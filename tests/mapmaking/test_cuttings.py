@@ -1,9 +1,7 @@
 """The places cut from an orthophoto: their grid, what is left out, what a frame says, and the memory it takes."""
 
-import re
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 
@@ -166,26 +164,19 @@ def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
     assert np.array_equal(cut[0].image, whole[2].image)
 
 
-def test_a_raster_says_how_sharp_its_pictures_are_and_one_that_shows_nothing_is_refused(tmp_path):
+def test_begin_reports_pixels_along_a_picture_and_too_few_are_refused(tmp_path, caplog):
     path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
-    fine, coarse = (Cuttings(orthophoto=str(path), footprint_m=side_m, spacing_m=20.0) for side_m in (80.0, 40.0))
-    assert ", 160 pixels along a picture, about" in fine.open().forecast(20.0, technique)
-    assert ", 80 pixels along a picture, too few to find all" in coarse.open().forecast(20.0, technique)
+    for footprint_m, expected in (
+        (80.0, ", 160 pixels along a picture"),
+        (40.0, ", 80 pixels along a picture, too few"),
+    ):
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            Cuttings(orthophoto=str(path), footprint_m=footprint_m, spacing_m=20.0).open().begin(20.0, technique, iter)
+        assert expected in caplog.text
+        assert ("too few" in caplog.text) == (footprint_m == 40)
     with pytest.raises(UsageError, match="has 30 pixels along a picture of 15 m"):
         Cuttings(orthophoto=str(path), footprint_m=15.0, spacing_m=20.0).open()
-
-
-def test_a_raster_that_was_enlarged_is_as_blurred_as_it_is(tmp_path):
-    def said(shrink):
-        path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
-        with rasterio.open(path, "r+") as raster:
-            ground = raster.read(1)
-            small = cv2.resize(ground, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-            raster.write(cv2.resize(small, ground.shape[::-1], interpolation=cv2.INTER_CUBIC), 1)
-        return Cuttings(orthophoto=str(path), footprint_m=100.0, spacing_m=20.0).open().forecast(20.0, technique)
-
-    assert ", 200 pixels along a picture, about" in said(1)
-    assert re.search(r", 200 pixels along a picture, blurred: (25|50) would show as much, too few to find all", said(4))
 
 
 def test_places_under_cloud_are_counted(tmp_path):

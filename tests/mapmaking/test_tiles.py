@@ -17,7 +17,7 @@ from rasterio.warp import transform
 from rasters import HOME
 
 from edgevpr.cli.main import main
-from edgevpr.core.errors import EdgevprError, SourceError
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Position
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.tiles import ground_of
@@ -149,26 +149,6 @@ def test_files_that_are_damaged_locked_foreign_or_empty_get_a_sentence(tmp_path)
     assert 0 < cut(holed)[1].mean() < 1
 
 
-def capabilities(port: int) -> bytes:
-    """What a WMTS says of itself: a layer with the zooms 0 to 18 of the usual tiles."""
-    matrices = "".join(
-        f"<TileMatrix><ows:Identifier>{zoom}</ows:Identifier><ScaleDenominator>{559082264.0287178 / 2**zoom}"
-        f"</ScaleDenominator><TopLeftCorner>-{HALF_WORLD_M} {HALF_WORLD_M}</TopLeftCorner><TileWidth>256</TileWidth>"
-        f"<TileHeight>256</TileHeight><MatrixWidth>{2**zoom}</MatrixWidth><MatrixHeight>{2**zoom}</MatrixHeight>"
-        "</TileMatrix>"
-        for zoom in range(ZOOM + 1)
-    )
-    return (
-        '<Capabilities xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1" '
-        'version="1.0.0"><Contents><Layer><ows:Identifier>ground</ows:Identifier><Style isDefault="true">'
-        "<ows:Identifier>s</ows:Identifier></Style><Format>image/png</Format><TileMatrixSetLink><TileMatrixSet>g"
-        '</TileMatrixSet></TileMatrixSetLink><ResourceURL format="image/png" resourceType="tile" template='
-        f'"http://127.0.0.1:{port}/{{TileMatrix}}/{{TileCol}}/{{TileRow}}.png?key={SECRET}"/></Layer><TileMatrixSet>'
-        "<ows:Identifier>g</ows:Identifier><ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS>"
-        f"{matrices}</TileMatrixSet></Contents></Capabilities>"
-    ).encode()
-
-
 class Server(http.server.ThreadingHTTPServer):
     """Gives the tiles of one zoom and of those below, and says who has asked for what."""
 
@@ -187,8 +167,6 @@ class Server(http.server.ThreadingHTTPServer):
 class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self):
         server = self.server
-        if "/wmts" in self.path:
-            return self.answer(server.status, capabilities(server.server_address[1]))
         with server.lock:
             server.asked.append(self.path)
             server.agents.add(self.headers["User-Agent"])
@@ -270,33 +248,6 @@ def test_what_is_no_address_of_tiles_gets_a_sentence(server, monkeypatch):
     server.shutdown()
     server.server_close()
     assert "cannot be reached" in refused(server.address.replace("/{z}", "/a/{z}"))
-    assert "cannot be reached" in refused(f"WMTS:http://127.0.0.1:{server.server_address[1]}/c?key={SECRET}")
-
-
-@pytest.mark.network
-def test_wmts_is_read_by_gdal_and_kept(tmp_path, server):
-    address = f"WMTS:http://127.0.0.1:{server.server_address[1]}/wmts?key={SECRET},layer=ground"
-    expected, _ = cut(folder(tmp_path / "folder", around()))
-    orthophoto = Orthophoto(address, HERE)
-    count, _ = orthophoto.to_fetch([HOME.lat_deg], [HOME.lon_deg], 100.0, 200)
-    found, valid = orthophoto.cut(HOME, 100.0, 200)
-    assert valid.all()
-    assert abs(found.astype(int) - expected).max() <= 2
-    assert 1 <= len(set(server.asked)) == len(server.asked) <= count <= 2 * len(server.asked)
-    assert server.most <= 2
-    assert all(agent.startswith("edgevpr/") for agent in server.agents)
-    server.asked.clear()
-    assert cut(address)[1].all()
-    assert not server.asked, "kept from the first time"
-    far = ground_of([(HOME.lat_deg + 1, HOME.lon_deg)], 100.0)
-    server.status = 403
-    assert "HTTP 403" in refused(address.replace("wmts?", "wmts?of=another&"))
-    server.status = 200
-    orthophoto = Orthophoto(address, far)
-    server.status = 403
-    with pytest.raises(SourceError, match="check the key"):
-        orthophoto.cut(Position(HOME.lat_deg + 1, HOME.lon_deg), 100.0, 200)
-    assert SECRET.encode() not in everything_under(tmp_path / "cache")
 
 
 @pytest.mark.network
