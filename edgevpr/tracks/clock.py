@@ -7,7 +7,6 @@ aircraft that only flies straight on says nothing.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,11 +21,15 @@ from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, describe
 
 _LANDMARKS = 500
-_WITHIN_S, _STEP_S = 180.0, 0.25  # clocks further off are set wrong, and not only drift
-_MOST_OFF = 1.0  # a movement that differs by more is wrong in the pictures or in the track
+_MAX_OFFSET_S = 180.0  # clocks further off are set wrong, and do not only drift
+_STEP_S = 0.25
+_MAX_CHANGE = 1.0  # a movement that differs by more is wrong in the pictures or in the track
 # The least number of turns (radians) that must agree, and by how much all must agree better than at any clock that is
 # further than `_NEAR_S` away: .83 on aerial_caliterra; of pictures of one flight on the track of another .95 or more.
-_FEWEST, _TURNS, _NEAR_S, _BETTER = 4, 0.3, 4.0, 0.9
+_MIN_TURNS = 4
+_TURN_RAD = 0.3
+_NEAR_S = 4.0
+_MAX_COST_RATIO = 0.9
 Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as those of a tie in `mapmaking.graph`
 
 
@@ -34,14 +37,14 @@ def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]
     """Estimate what is to be added to `times_s`, those of the pictures of `paths` in their order, to get times of the
     track: at most three minutes. None: the pictures do not tell."""
     at, changes = _changes_of(paths)
-    if len(at) < _FEWEST:
+    if len(at) < _MIN_TURNS:
         return None
-    offsets_s = np.arange(-_WITHIN_S, _WITHIN_S + _STEP_S, _STEP_S)
-    places = _places(track, np.array(times_s) + offsets_s[:, None])
+    offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + _STEP_S, _STEP_S)
+    places = _track_at(track, np.array(times_s) + offsets_s[:, None])
     costs, turning = np.array([_cost(there, at, changes) for there in places]).T
     best = int(np.argmin(costs))
     further = abs(offsets_s - offsets_s[best]) > _NEAR_S
-    if turning[best] < _FEWEST or costs[best] > _BETTER * costs[further].min():
+    if turning[best] < _MIN_TURNS or costs[best] > _MAX_COST_RATIO * costs[further].min():
         return None
     return float(offsets_s[best])
 
@@ -55,12 +58,12 @@ def _cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]
     off = np.hypot(off.real, (off.imag + np.pi) % (2 * np.pi) - np.pi)
     known = np.isfinite(off)
     return (
-        float(np.where(known, np.minimum(off, _MOST_OFF), _MOST_OFF).mean()),
-        float(np.count_nonzero(known & (abs(expected.imag) > _TURNS) & (off < _MOST_OFF / 2))),
+        float(np.where(known, np.minimum(off, _MAX_CHANGE), _MAX_CHANGE).mean()),
+        float(np.count_nonzero(known & (abs(expected.imag) > _TURN_RAD) & (off < _MAX_CHANGE / 2))),
     )
 
 
-def _places(track: Track, t_s: Doubles) -> Complexes:
+def _track_at(track: Track, t_s: Doubles) -> Complexes:
     """Return where the track is at each of `t_s`, east + i north in metres: complex of its shape, NaN outside the track
     and in its gaps."""
     known_s = np.array(track.t_s)
@@ -68,28 +71,27 @@ def _places(track: Track, t_s: Doubles) -> Complexes:
     east_m, north_m = metres(lat_deg, lon_deg)
     after = np.clip(np.searchsorted(known_s, t_s), 1, max(len(known_s) - 1, 1))
     is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MOST_GAP_S)
-    found = np.interp(t_s, known_s, east_m) + 1j * np.interp(t_s, known_s, north_m)
-    return np.where(is_known, found, np.nan)
+    return np.where(is_known, np.interp(t_s, known_s, east_m + 1j * north_m), np.nan)
 
 
 def _changes_of(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     """Return, of each three neighbouring pictures that show the same ground, the number of the first, and the logarithm
     of the factor, a complex number, by which the movement changes."""
-    moves = [_move(one, other) for one, other in pairwise(_marks(paths))]
-    found = [
-        (at, np.log(there[0] / here[0]) + here[1])
-        for at, (here, there) in enumerate(pairwise(moves))
-        if here and there and here[0] and there[0]
-    ]
-    return np.array([at for at, _ in found], int), np.array([change for _, change in found], complex)
+    moves = [_move(one, other) for one, other in pairwise(_describe(paths))]
+    changes = {
+        number: np.log(second[0] / first[0]) + first[1]
+        for number, (first, second) in enumerate(pairwise(moves))
+        if first and second and first[0] and second[0]
+    }
+    return np.array(list(changes), int), np.array(list(changes.values()), complex)
 
 
-def _marks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
+def _describe(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
     for path in paths:
-        marks = None
-        with suppress(ImageError):
-            marks = describe(read_image(path), None, _LANDMARKS)
-        yield marks
+        try:
+            yield describe(read_image(path), None, _LANDMARKS)
+        except ImageError:
+            yield None
 
 
 def _move(one: Landmarks | None, other: Landmarks | None) -> Move | None:

@@ -18,17 +18,10 @@ from edgevpr.tracks.record import Attitude, Record, require, tag_of, track_of
 
 _FIX_3D = 3  # GPS status from which on a position counts
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
-_OF_PX4 = (
-    "vehicle_global_position",
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_gps_position",
-    "sensor_gps",
-    "camera_capture",
-)
+_RECEIVERS = ("vehicle_gps_position", "sensor_gps")
+_PX4_TOPICS = (*_RECEIVERS, "vehicle_global_position", "vehicle_attitude", "vehicle_local_position", "camera_capture")
 
-Topic = dict[str, Array]  # the values of a field of a PX4 message, by its name
-Topics = dict[str, Topic]
+Topics = dict[str, dict[str, Array]]  # the values of each field of PX4's messages, by the names of message and field
 
 
 def read_ardupilot(path: Path) -> Record:
@@ -45,18 +38,14 @@ def read_ardupilot(path: Path) -> Record:
             attitude = message.Yaw, message.Roll, message.Pitch
         elif kind != "GPS" or message.Status >= _FIX_3D:
             height_m = getattr(message, "RelHomeAlt", getattr(message, "RelAlt", None))
-            own = _angles(message) if kind in ("CAM", "TRIG") else attitude
+            own = attitude
+            if kind in ("CAM", "TRIG"):  # older logs write the names out
+                is_long = hasattr(message, "Yaw")
+                own = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
             tag = tag_of(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
             lines[kind].append((message._timestamp, tag))
     shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
     return Record(kind="ArduPilot log", track=track_of(path, lines["POS"] or lines["GPS"]), shots=shots)
-
-
-def _angles(message: Any) -> Attitude:
-    """Return yaw, roll and pitch of a CAM or TRIG message; older logs write the names out."""
-    if hasattr(message, "Yaw"):
-        return message.Yaw, message.Roll, message.Pitch
-    return message.Y, message.R, message.P
 
 
 def read_telemetry(path: Path) -> Record:
@@ -111,64 +100,45 @@ def read_px4(path: Path) -> Record:
 
     try:
         with open(path, "rb") as file:
-            datasets = ULog(file, list(_OF_PX4), disable_str_exceptions=True).data_list
+            datasets = ULog(file, list(_PX4_TOPICS), disable_str_exceptions=True).data_list
     except Exception as error:  # files of any content
         raise UsageError(f"{path} is no log of PX4 ({error}): copy it again from the autopilot.") from error
     data = {each.name: each.data for each in reversed(datasets) if len(each.data["timestamp"])}  # the first of each
-    lines = list(_tags_of(data, data.get("vehicle_global_position")) or _tags_of(data, _receiver(data)))
-    shots = tuple(tag for _, tag in _tags_of(data, data.get("camera_capture")))
-    return Record(kind="PX4 log", track=track_of(path, lines), shots=shots)
+    shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
+    return Record(kind="PX4 log", track=track_of(path, _read_positions(data, "vehicle_global_position")), shots=shots)
 
 
-def _receiver(data: Topics) -> Topic | None:
-    """Return what the receiver told while it had a fix, with degrees and metres in the names and units of the estimate;
-    None if it told nothing."""
-    told = data.get("vehicle_gps_position", data.get("sensor_gps"))
-    if told is None:
-        return None
-    fixed = told["fix_type"] >= _FIX_3D
-    if "latitude_deg" in told:
-        lat_deg, lon_deg, alt_m = told["latitude_deg"], told["longitude_deg"], told["altitude_msl_m"]
-    else:
-        lat_deg, lon_deg, alt_m = told["lat"] / 1e7, told["lon"] / 1e7, told["alt"] / 1e3
-    found = {"timestamp": told["timestamp"], "lat": lat_deg, "lon": lon_deg, "alt": alt_m}
-    return {name: values[fixed] for name, values in found.items()}
-
-
-def _tags_of(data: Topics, positions: Topic | None) -> list[tuple[float, GeoTag]]:
-    """Return seconds since 1970 and a tag for each of the `positions`, with attitude and height at that time."""
-    if positions is None:
+def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
+    """Return seconds since 1970 and a tag for each position of a topic, with attitude and height at that time."""
+    if (positions := data.get(topic)) is None:
         return []
     at_us = positions["timestamp"]
-    t_utc_s = at_us / 1e6 + _behind_utc_s(data)
+    heights_m: Sequence[float | None] = [None] * len(at_us)
+    attitudes: Sequence[Attitude | None] = [None] * len(at_us)
+    if local := data.get("vehicle_local_position"):
+        heights_m = np.interp(at_us, local["timestamp"], -local["z"]).tolist()
+    if attitude := data.get("vehicle_attitude"):
+        attitudes = _attitudes_at(attitude, at_us)
     where = (positions[name].tolist() for name in ("lat", "lon", "alt"))
-    tags = map(tag_of, *where, _attitude_at(data, at_us), _heights_at(data, at_us))
-    return list(zip(t_utc_s.tolist(), tags, strict=True))
+    tags = map(tag_of, *where, attitudes, heights_m)
+    return list(zip((at_us / 1e6 + _behind_utc_s(data)).tolist(), tags, strict=True))
 
 
 def _behind_utc_s(data: Topics) -> float:
     """Return what is to be added to seconds since the start of the autopilot to get those since 1970; 0 if no receiver
-    told the time."""
-    for name in ("vehicle_gps_position", "sensor_gps"):
-        if name in data and (known := data[name]["time_utc_usec"] > 0).any():
-            utc_us = data[name]["time_utc_usec"][known].astype(np.float64)
-            return float(np.median(utc_us - data[name]["timestamp"][known])) / 1e6
+    has the time."""
+    for receiver in filter(None, map(data.get, _RECEIVERS)):
+        if (known := receiver["time_utc_usec"] > 0).any():
+            utc_us = receiver["time_utc_usec"][known].astype(np.float64)
+            return float(np.median(utc_us - receiver["timestamp"][known])) / 1e6
     return 0.0
 
 
-def _attitude_at(data: Topics, at_us: Array) -> Sequence[Attitude | None]:
-    """Return yaw, roll and pitch in degrees, those last told at each time (None: not told)."""
-    told = data.get("vehicle_attitude")
-    if told is None:
-        return [None] * len(at_us)
-    last = np.clip(np.searchsorted(told["timestamp"], at_us, side="right") - 1, 0, None)
-    w, x, y, z = (told[f"q[{axis}]"][last].astype(float) for axis in range(4))
+def _attitudes_at(attitude: dict[str, Array], at_us: Array) -> list[Attitude]:
+    """Return yaw, roll and pitch in degrees, those last reported at each time."""
+    last = np.clip(np.searchsorted(attitude["timestamp"], at_us, side="right") - 1, 0, None)
+    w, x, y, z = (attitude[f"q[{axis}]"][last].astype(float) for axis in range(4))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return list(zip(*np.degrees([yaw, roll, pitch]).tolist(), strict=True))
-
-
-def _heights_at(data: Topics, at_us: Array) -> Sequence[float | None]:
-    told = data.get("vehicle_local_position")
-    return [None] * len(at_us) if told is None else np.interp(at_us, told["timestamp"], -told["z"]).tolist()

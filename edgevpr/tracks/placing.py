@@ -80,12 +80,9 @@ def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: fl
         paths = progress([folder / name for name in looked_at], len(looked_at), "comparing pictures")
         fine_s = clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
         offset_s += fine_s or 0.0
-        found = "told by how the pictures move" if fine_s is not None else "right but for its time zone"
-        how = f"by time, the camera's clock taken to be {found}"
-    tags = {}
-    for name, t_s in times.items():
-        if (tag := track.tag_at(t_s + offset_s)).position:
-            tags[name] = _filled(replace(tag, t_utc_s=t_s + offset_s), own[name])
+        how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
+    found = {name: replace(track.tag_at(t_s + offset_s), t_utc_s=t_s + offset_s) for name, t_s in times.items()}
+    tags = {name: _filled(tag, own[name]) for name, tag in found.items() if tag.position}
     if not tags:
         raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
     return Placed(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
@@ -148,8 +145,5 @@ def rounded_m(placed: Placed) -> float | None:
     """Return to how many metres all positions are rounded, if it is much (None: not)."""
     tags = placed.track.tags if placed.track else placed.tags.values()
     parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDED_DEG
-    return (
-        float(np.radians(_ROUNDED_DEG)) * EARTH_RADIUS_M
-        if np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)
-        else None
-    )
+    is_rounded = np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)
+    return float(np.radians(_ROUNDED_DEG)) * EARTH_RADIUS_M if is_rounded else None

@@ -40,7 +40,7 @@ _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
 _PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
 
 Rows = Sequence[Sequence[str]]
-Layout = tuple[Mapping[str, int], int, Sequence[str]]  # column of each part, the first row of values, and names
+Layout = tuple[Mapping[str, int], int, Sequence[str]]  # the column of each part, the first row of values, and names
 
 
 def read_table(path: Path) -> Record:
@@ -57,10 +57,14 @@ def read_table(path: Path) -> Record:
         lines, order = lines[1:], _OF_OPENDRONEMAP
     for separator, spoken in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
-        if layout := _named_columns(rows) or _columns_without_names(rows, order):
+        if layout := _named_columns(rows):
             columns, first, names = layout
-            said = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _NEEDED)
-            return Record(kind=f"table of {said}, {spoken} between them", named=_tags_of(rows[first:], columns, path))
+        elif rows and len(rows[0]) >= len(_NEEDED) and is_image(rows[0][0].strip()):  # without names: the usual order
+            columns, first, names = {part: column for column, part in enumerate(order)}, 0, order
+        else:
+            continue
+        needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _NEEDED)
+        return Record(kind=f"table of {needed}, {spoken} between them", named=_read_rows(rows[first:], columns, path))
     raise UsageError(
         f"{path}: no columns of the picture, latitude and longitude were found: name them file, lat and lon in line 1."
     )
@@ -81,20 +85,11 @@ def _named_columns(rows: Rows) -> Layout | None:
 def _column(known: Sequence[str], names: Sequence[str]) -> int | None:
     """Return the column of the first `known` name, or of `vehicle latitude` and the like."""
     exact = [names.index(name) for name in known if name in names]
-    ending = [
-        at for at, name in enumerate(names) if name.endswith(("latitude", "longitude")) and name.endswith(known[0])
-    ]
-    return next(iter([*exact, *ending]), None)
+    angles = [at for at, name in enumerate(names) if known[0] in ("latitude", "longitude") and name.endswith(known[0])]
+    return next(iter([*exact, *angles]), None)
 
 
-def _columns_without_names(rows: Rows, order: Sequence[str]) -> Layout | None:
-    """Take the columns in the usual `order` if each row begins with a picture."""
-    if not rows or len(rows[0]) < len(_NEEDED) or not is_image(rows[0][0].strip()):
-        return None
-    return {part: column for column, part in enumerate(order)}, 0, order
-
-
-def _tags_of(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
+def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
     named = {}
     for row in rows:
         cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
