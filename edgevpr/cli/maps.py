@@ -249,7 +249,7 @@ def map_info(args: Namespace) -> int:
 
 def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, float]) -> None:
     """Write the page of a map. `said` are the lines of `map info`."""
-    from edgevpr.mapmaking.lookalikes import look_alikes
+    from edgevpr.mapmaking.calibrate import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import album_of_map
     from edgevpr.review.mappage import MOST_ASKED, make_map_page
@@ -261,7 +261,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
         pictures = album_of_map(args.map_images, places)
         asked = places[:: -(-len(places) // MOST_ASKED) or 1] if pictures else []
         level = ((place.place_id, pictures.level(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
-        found = look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
+        found = find_look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
         alike = list(found)
     name = Path(args.map).name
     page = make_map_page(name, said, places, recognisable, alike, pictures, lens)

@@ -6,8 +6,8 @@ Each picture is changed as by another day and season (see `changes`) and then lo
 * THERE: its place is in the map.
 * LEFT_OUT: without its place and all that may show the same ground. The best match is then a similar-looking place.
 * MIRRORED: as its mirror image, which shows ground that exists nowhere but looks like the country of the map. It only
-  counts in what is told of the map.
-The results tell how much the places of this map look alike. So the fit moves the part of the shipped model that says
+  counts in the figures that are reported of the map.
+The results show how much the places of this map look alike. So the fit moves the part of the shipped model that says
 which place it is (`Model.of_place`), and only as far as the results demand. The part that says whether the query shows
 ground of the map stays as shipped: pictures of foreign ground agree by chance to much the same degree in every map.
 """
@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.arrays import Mask as Shown
-from edgevpr.core.config import MatchConfig
+from edgevpr.core.config import MatchConfig, load_config
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
@@ -31,10 +31,11 @@ from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
-from edgevpr.places.layers import Layers, layers_of
+from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.rows import readable
+from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
@@ -47,10 +48,12 @@ from edgevpr.runtime.recognise.evidence import (
     FEWEST_PLACES,
     Evidence,
     MapCalibration,
+    calibration_of,
     calibration_text,
     kinds_of,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
+from edgevpr.runtime.recognise.opening import meter_of, technique_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -66,6 +69,7 @@ _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outsid
 # sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance decided
 # whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
 _PULL = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
+LEAST_ALIKE = 0.1  # confidence from which a place elsewhere looks alike
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 
@@ -100,47 +104,92 @@ def ask(
     assert rule.sure is not None  # set for a technique that has a confidence model
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
-    looks_down = technique.spec.looks_down
-    layers = layers_of(place_map)
-    near_m = overlap_m(layers, index, rule)
-    slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
+    search = _Search(technique, place_map, index, rule, meter=meter)
     for place_id, picture in pictures:
-        if (slot := slots.get(place_id)) is None:
+        if (slot := search.slots.get(place_id)) is None:
             continue
-        may_be_same = same_ground(index, slot, near_m)
+        may_be_same = search.same_ground(slot)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.only(~may_be_same)))
         for way, seen, among in (*ways, (MIRRORED, _mirrored(picture), index)):
             if not len(among):
                 continue
-            image, shown = changed(seen.image, rng, looks_down, seen.mask)
-            matcher = Matcher(among, rule, layers=layers)
-            event = looked_for(place_id, image, shown, technique, matcher, place_map, meter)
+            image, shown = changed(seen.image, rng, technique.spec.looks_down, seen.mask)
+            event = search.find(place_id, image, shown, among)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
-            best = slots[event.best.place.place_id]
-            right = way == THERE and not elsewhere(index, slot, np.array([best]), near_m)[0]
+            best = search.slots[event.best.place.place_id]
+            right = way == THERE and not elsewhere(index, slot, np.array([best]), search.near_m)[0]
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
             yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
-def looked_for(
-    place_id: int,
-    image: Image,
-    shown: Shown | None,
-    technique: Technique,
-    matcher: Matcher,
-    place_map: PlaceMap,
-    meter: QueryMeter,
-) -> Recognition:
-    """Look for a picture of the place `place_id` as a query that is alone. `shown`, bool (H, W), is False where it
-    shows no ground (None: it shows ground everywhere)."""
-    encoder = FrameEncoder(technique=technique, mask=None if shown is None else Mask(shown, sha256=""))
-    settings = WalkSettings(candidates=technique.candidates, all_evidence=True)
-    walk = Recogniser(encoder, place_map, matcher, meter, settings=settings)
-    return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
+class _Search:
+    """Looks for pictures in an open map, each as a query that is alone. `slots`: the slot of each place in `index`.
+    `near_m`: metres within which pictures of the map count as neighbours, at least a footprint."""
+
+    def __init__(
+        self, technique: Technique, place_map: PlaceMap, index: PlaceIndex, rule: AcceptRule, *, meter: QueryMeter
+    ) -> None:
+        self._technique, self._place_map, self._meter = technique, place_map, meter
+        self._index, self._rule = index, rule
+        self._layers = layers_of(place_map)
+        self.near_m = max(rule.neighbour_m, self._layers.median_m or index.spacing_m() or 0.0)
+        self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
+
+    def same_ground(self, slot: int) -> Bools:
+        """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`."""
+        index = self._index
+        away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
+        beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
+        return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * self.near_m)
+
+    def find(self, place_id: int, image: Image, shown: Shown | None, among: PlaceIndex) -> Recognition:
+        """Look for a picture of the place `place_id` among some places. `shown`, bool (H, W), is False where it shows
+        no ground (None: it shows ground everywhere)."""
+        encoder = FrameEncoder(technique=self._technique, mask=None if shown is None else Mask(shown, sha256=""))
+        matcher = Matcher(among, self._rule, layers=self._layers)
+        settings = WalkSettings(candidates=self._technique.candidates, all_evidence=True)
+        walk = Recogniser(encoder, self._place_map, matcher, self._meter, settings=settings)
+        return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class LookAlike:
+    """A place (its number), the place elsewhere that its picture was found at, and the confidence of that match."""
+
+    place_id: int
+    other_id: int
+    confidence: float
+
+
+def find_look_alikes(
+    place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Shown | None]]
+) -> Iterator[LookAlike | None]:
+    """Look for each of the `pictures` (number of a place, its picture as it was encoded, the picture's mask) among the
+    places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
+    not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
+    cannot be read."""
+    technique, config = technique_of(place_map), load_config(None, {})
+    if not kinds_of(technique.spec):
+        return
+    index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+    rule = accept_rule(technique, config.match, 1, calibration_of(place_map))
+    search = _Search(technique, place_map, index, rule, meter=meter_of(config, load_board("this")))
+    for place_id, image, mask in pictures:
+        slot = search.slots.get(place_id)
+        if slot is None or np.isnan(index.lat_deg[slot]):
+            continue
+        away = index.only(~search.same_ground(slot))
+        if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
+            continue
+        event = search.find(place_id, image, mask, away)
+        if event.best is None or event.confidence is None or event.confidence < LEAST_ALIKE:
+            yield None
+        else:
+            yield LookAlike(place_id, event.best.place.place_id, event.confidence)
 
 
 def calibrate(
@@ -290,16 +339,3 @@ def evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
 def _mirrored(picture: Levelled) -> Levelled:
     mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
     return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
-
-
-def overlap_m(layers: Layers, index: PlaceIndex, rule: AcceptRule) -> float:
-    """Return the distance in metres within which pictures of the map count as neighbours: at least a footprint."""
-    return max(rule.neighbour_m, layers.median_m or index.spacing_m() or 0.0)
-
-
-def same_ground(index: PlaceIndex, slot: int, near_m: float) -> Bools:
-    """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`. Pictures
-    are `near_m` metres wide."""
-    away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
-    beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
-    return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * near_m)

@@ -8,7 +8,7 @@ from typing import Any
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.core.types import Place, Position
+from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import identity_of
 from edgevpr.runtime.flight.flightlog import flight_of
@@ -27,7 +27,7 @@ class MapMove:
     sd_m: float
     scale: float | None
 
-    def laid(self, position: Position) -> Position:
+    def apply(self, position: Position) -> Position:
         """Return the moved position."""
         away_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
         east_m, north_m = (each / (1 + (self.scale or 0.0)) for each in map(float, away_m))
@@ -49,7 +49,7 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
             f"{log} is not of {place_map.path} as it is now: it is of another map, or this one was changed or moved "
             "since: give the log of a flight with it."
         )
-    move = _move_of(found or {}, len(place_map))
+    move = _read_move(found or {}, len(place_map))
     if move is None:
         raise UsageError(
             f"{log} does not say where the map lies: that takes some minutes with good GPS and accepted matches, in "
@@ -57,11 +57,16 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
         )
     with place_map.transaction():
         for place in list(place_map.places()):
-            _lay(place_map, place, move)
+            pose = place.pose
+            if pose:  # the recorded position moves too: another refinement must not bring it back
+                recorded = pose.recorded and move.apply(pose.recorded)
+                pose = replace(pose, footprint_m=pose.footprint_m / (1 + (move.scale or 0.0)), recorded=recorded)
+            if place.position:
+                place_map.lay(place.place_id, move.apply(place.position), pose)
     return move
 
 
-def _move_of(line: dict[str, Any], places: int) -> MapMove | None:
+def _read_move(line: dict[str, Any], places: int) -> MapMove | None:
     """Return the move by a line of kind "survey"; None if it does not say where the map lies."""
     match line:
         case {
@@ -73,13 +78,3 @@ def _move_of(line: dict[str, Any], places: int) -> MapMove | None:
             middle = lat_deg, lon_deg
             return MapMove(places=places, middle=middle, east_m=-east_m, north_m=-north_m, sd_m=sd_m, scale=scale)
     return None
-
-
-def _lay(place_map: PlaceMap, place: Place, move: MapMove) -> None:
-    if place.position is None:
-        return
-    pose = place.pose
-    if pose:  # the recorded position moves too: another refinement must not bring it back
-        recorded = pose.recorded and move.laid(pose.recorded)
-        pose = replace(pose, footprint_m=pose.footprint_m / (1 + (move.scale or 0.0)), recorded=recorded)
-    place_map.lay(place.place_id, move.laid(place.position), pose)

@@ -57,29 +57,24 @@ _KEPT = 1024  # places whose landmarks are cached
 class _Ground:
     """The N places of a map. `flight`, int (N,): the number of the pass of each, in the order of their begins, which
     are `began_s`, float (F,), inf if unknown. For each place, `spot` has those of other passes that show the same spot,
-    and `alike` those of them in the same condition."""
+    and `alike` those of them in the same condition. `judged`: the places to be judged."""
 
     places: list[Place]
     flight: Ints
     began_s: Doubles
     spot: list[set[int]]
     alike: list[set[int]]
+    judged: Collection[int]
 
     def begin_s(self, at: int) -> float:
         """Return when the pass of a place began."""
         return float(self.began_s[self.flight[at]])
 
 
-@dataclass(frozen=True, slots=True)
-class _Looked:
-    """Result of looking for the picture of a place: the number of the place `found` (None: none), and the confidence
-    reached where the picture was taken (0: the best match is elsewhere)."""
-
-    found: int | None
-    confidence: float
-
-
-_Looks = tuple[_Looked, _Looked]  # first among all other passes, then among those of which none was found
+# Result of looking for the picture of a place: the number of the place found (None: none), and the confidence reached
+# where the picture was taken (0: the best match is elsewhere).
+_Found = tuple[int | None, float]
+_NOTHING: _Found = (None, 0.0)
 
 
 def history_of(
@@ -93,17 +88,36 @@ def history_of(
         places = list(place_map.places())
         if not technique.spec.looks_down or not places:
             return History()
-        ground = _ground(place_map, places, folders)
         wanted = inside(place_map)
-        within = {place.place_id for place in places} if wanted is None else set(wanted)
-        judged = {at for at, place in enumerate(places) if place.place_id in within}
-        if len({int(ground.flight[at]) for at in judged}) < 2 or not any(ground.spot):
+        wanted = {place.place_id for place in places} if wanted is None else set(wanted)
+        judged = {at for at, place in enumerate(places) if place.place_id in wanted}
+        ground = _compare_places(place_map, places, folders, judged)
+        if len(np.unique(ground.flight[list(judged)])) < 2 or not any(ground.spot):
             return History()
-        looked = dict(_looks(place_map, technique, ground, pictures, config))
-    return _history(ground, looked, judged, folders)
+        first, again = _find_pictures(place_map, technique, ground, pictures, config)
+    linked = [set(each) for each in ground.alike]
+    worth = np.zeros(len(places))
+    for at in first:
+        for found, _ in (first[at], again[at]):
+            if found is not None:
+                linked[at].add(found)
+                linked[found].add(at)
+        if (found := first[at][0]) is not None:
+            worth[found] += first[at][1]
+    merged = _merge(ground, {at for at, (found, _) in first.items() if found is not None}, worth)
+    removed: dict[str, int | None] = {places[at].source_image: places[into].place_id for at, into in merged.items()}
+    removed |= {places[at].source_image: None for at in _faded(ground, linked, merged)}
+    confidences = {at: confidence for at, (_, confidence) in again.items()}
+    return History(
+        passes=tuple(_passes(ground, folders)),
+        removed=removed,
+        changes=tuple(_changes(ground, linked, confidences)),
+    )
 
 
-def _ground(place_map: PlaceMap, places: list[Place], folders: Mapping[str, str]) -> _Ground:
+def _compare_places(
+    place_map: PlaceMap, places: list[Place], folders: Mapping[str, str], judged: Collection[int]
+) -> _Ground:
     flight, began_s = _flights(places, folders)
 
     @lru_cache(_KEPT)
@@ -119,7 +133,7 @@ def _ground(place_map: PlaceMap, places: list[Place], folders: Mapping[str, str]
         for of in (spot, alike) if is_alike else (spot,):
             of[a].add(b)
             of[b].add(a)
-    return _Ground(places=places, flight=flight, began_s=began_s, spot=spot, alike=alike)
+    return _Ground(places=places, flight=flight, began_s=began_s, spot=spot, alike=alike, judged=judged)
 
 
 def _pairs(places: list[Place], flight: Ints) -> list[tuple[int, int]]:
@@ -155,11 +169,12 @@ def _flights(places: list[Place], folders: Mapping[str, str]) -> tuple[Ints, Dou
     return np.argsort(by_time, kind="stable")[flight], began_s[by_time]
 
 
-def _looks(
+def _find_pictures(
     place_map: PlaceMap, technique: Technique, ground: _Ground, pictures: FlownPictures | Cuttings, config: Config
-) -> Iterator[tuple[int, _Looks]]:
+) -> tuple[dict[int, _Found], dict[int, _Found]]:
     """Look for the picture of each place whose spot other passes show, among the places of all others. Those of its
-    condition hide the others: it is looked for again without the passes found, if more show its spot."""
+    condition hide the others: it is looked for again without the passes found, if more show its spot. Returns what was
+    found first, and last."""
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     at_of = {place.place_id: at for at, place in enumerate(ground.places)}
     flight = ground.flight[[at_of[place_id] for place_id in index.place_ids.tolist()]]
@@ -173,80 +188,60 @@ def _looks(
         matcher = Matcher(index.only(~np.isin(flight, list(passes))), rule, layers=layers)
         return Recogniser(encoder, place_map, matcher, meter, settings=settings, prior=at_its_height)
 
+    firsts: dict[int, _Found] = {}
+    lasts: dict[int, _Found] = {}
     for number in range(len(ground.began_s)):
         here = np.flatnonzero(ground.flight == number).tolist()
         asked = {ground.places[at].source_image: at for at in here if ground.spot[at]}
         walk = without({number})
         for frame in filter(None, read_to_end(pictures.open(asked), lambda error: None) if asked else ()):
             at = asked[frame.name]
-            first = again = _look(walk, frame, ground.places[at], at_of)
-            if first.found is not None:
-                seen = {number, *(int(ground.flight[each]) for each in ground.alike[at] | {first.found})}
+            firsts[at] = lasts[at] = found, _ = _find(walk, frame, ground.places[at], at_of)
+            if found is not None:
+                seen = {number, *(int(ground.flight[each]) for each in ground.alike[at] | {found})}
                 if any(ground.flight[each] not in seen for each in ground.spot[at]):
-                    again = _look(without(seen), frame, ground.places[at], at_of)
-            yield at, (first, again)
+                    lasts[at] = _find(without(seen), frame, ground.places[at], at_of)
+    return firsts, lasts
 
 
-def _look(walk: Recogniser, frame: Frame, place: Place, at_of: Mapping[int, int]) -> _Looked:
+def _find(walk: Recogniser, frame: Frame, place: Place, at_of: Mapping[int, int]) -> _Found:
     """Look for the picture of a place; `at_of` gives the numbers of places by their ids."""
     event, here, pose = walk.step(frame), place.position, place.pose
     best, where = event.best, event.located
     if best is None or best.place.position is None or here is None or pose is None:
-        return _Looked(None, 0.0)
+        return _NOTHING
     there = best.place.position
     away_m = float(distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg))
     confidence = event.confidence or 0.0 if away_m < pose.footprint_m else 0.0
     if where is None:
-        return _Looked(None, confidence)
+        return None, confidence
     east_m, north_m = event.view.lean_m or (0.0, 0.0)  # from the picture's middle to the aircraft
     middle = moved(where.position.lat_deg, where.position.lon_deg, -east_m, -north_m)
     sd_m = math.hypot(where.sd_m, math.sqrt((pose.covariance_m2[0] + pose.covariance_m2[2]) / 2))
     if float(distance_m(here.lat_deg, here.lon_deg, *middle)) > max(SPOT * pose.footprint_m, _ERRORS_SD * sd_m):
-        return _Looked(None, confidence)
-    return _Looked(at_of[best.place.place_id], confidence)
+        return None, confidence
+    return at_of[best.place.place_id], confidence
 
 
-def _history(
-    ground: _Ground, looked: Mapping[int, _Looks], judged: Collection[int], folders: Mapping[str, str]
-) -> History:
-    places, worth = ground.places, np.zeros(len(ground.places))
-    linked = [set(each) for each in ground.alike]
-    for at, (first, again) in looked.items():
-        for found in {each.found for each in (first, again) if each.found is not None}:
-            linked[at].add(found)
-            linked[found].add(at)
-        if first.found is not None:
-            worth[first.found] += first.confidence
-    became = _merged(ground, looked, worth, judged)
-    removed: dict[str, int | None] = {places[at].source_image: places[into].place_id for at, into in became.items()}
-    removed |= {places[at].source_image: None for at in _faded(ground, linked, became, judged)}
-    return History(
-        passes=tuple(_passes(ground, folders)),
-        removed=removed,
-        changes=tuple(_changes(ground, looked, linked, judged)),
-    )
-
-
-def _merged(ground: _Ground, looked: Mapping[int, _Looks], worth: Doubles, judged: Collection[int]) -> dict[int, int]:
+def _merge(ground: _Ground, found: Collection[int], worth: Doubles) -> dict[int, int]:
     """Return for each place that becomes part of another which one that is: of one condition of a spot the worthiest,
-    of equals the newest, takes those whose pictures were found. None that is taken takes others: no chain is one."""
-    became: dict[int, int] = {}
-    left = set(judged)
-    for at in sorted(judged, key=lambda at: (-worth[at], -ground.flight[at], at)):
+    of equals the newest, absorbs those whose pictures were `found`. A merged place absorbs no further ones, so that
+    chains of similar places are not collapsed."""
+    merged: dict[int, int] = {}
+    left = set(ground.judged)
+    for at in sorted(ground.judged, key=lambda at: (-worth[at], -ground.flight[at], at)):
         if at in left:
-            taken = {each for each in ground.alike[at] & left if each in looked and looked[each][0].found is not None}
-            became |= dict.fromkeys(taken, at)
-            left -= taken | {at}
-    return became
+            absorbed = ground.alike[at] & left & set(found)
+            merged |= dict.fromkeys(absorbed, at)
+            left -= absorbed | {at}
+    return merged
 
 
-def _faded(
-    ground: _Ground, linked: list[set[int]], became: Mapping[int, int], judged: Collection[int]
-) -> Iterator[int]:
+def _faded(ground: _Ground, linked: list[set[int]], merged: Mapping[int, int]) -> Iterator[int]:
     """Yield the places that stay, and whose spot so many later passes saw without finding it or what became part of it.
     What the newest passes saw stays: the ground is covered."""
-    parts: dict[int, set[int]] = {at: {at} for at in judged if at not in became}
-    for at, into in became.items():
+    parts: dict[int, set[int]] = {at: {at} for at in ground.judged if at not in merged}
+    for at, into in merged.items():
         parts[into].add(at)
     for at, of in sorted(parts.items()):
         seen_s = max(ground.begin_s(each) for part in of for each in (part, *linked[part]))
@@ -255,11 +250,9 @@ def _faded(
             yield at
 
 
-def _changes(
-    ground: _Ground, looked: Mapping[int, _Looks], linked: list[set[int]], judged: Collection[int]
-) -> Iterator[GroundChange]:
+def _changes(ground: _Ground, linked: list[set[int]], confidences: Mapping[int, float]) -> Iterator[GroundChange]:
     """Yield a change for each picture that was looked for, over a spot of earlier passes, and is linked with none."""
-    for at in sorted(judged & looked.keys()):
+    for at in sorted(set(ground.judged) & confidences.keys()):
         here, began_s = ground.places[at], ground.begin_s(at)
         earlier = [each for each in ground.spot[at] if ground.begin_s(each) < began_s < math.inf]
         if not earlier or any(ground.begin_s(each) < began_s for each in linked[at]):
@@ -270,7 +263,7 @@ def _changes(
                 position=here.position,
                 from_s=there.t_utc_s,
                 to_s=here.t_utc_s,
-                confidence=looked[at][1].confidence,
+                confidence=confidences[at],
                 from_image=there.source_image,
                 to_image=here.source_image,
             )

@@ -40,20 +40,22 @@ _MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degree
 # Positions that miss the shape of the ties by more than this share of their spread are held against mirror images, and
 # one that misses by so much less is the right one. As recorded, sets miss by .01 to .36, and their mirror images by 1.3
 # times as much or more, also with 20 m of noise; with lat and lon exchanged, by .18 to 1.0, and mirrored by .7 or less.
-_MISSES, _MIRRORED = 0.15, 0.75
+_MISSES = 0.15
+_MIRRORED = 0.75
 _MIRROR_ASKS = 300  # places that the mirror image is fitted to
-_AMISS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
+_INCONSISTENT_SDS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
 _NEAREST = 8  # each place is compared with so many places recorded nearest
 _BEFORE = 2  # and with so many places mapped just before
 _OVERLAPS = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
 _MOST_OVERLAPPING = 12  # pairs of one place, after the graph is solved
 # Chosen on aerial_caliterra and aerial_garfield28: of their pairs without enough landmarks, and of those of three other
 # sets, no vote with .02 or more was wrong, and of those with landmarks near the vote none at all.
-_VOTE = 0.025  # score from which a vote is used without landmarks
-_ASKED = 0.01  # score from which landmarks near the vote are compared
+_MIN_VOTE_SCORE = 0.025  # from which a vote is used without landmarks
+_MIN_SCORE = 0.01  # from which landmarks near the vote are compared
 # Standard deviations (step, turn) along one axis: of landmarks, in which tilt and relief look like turns and scalings;
 # and of a vote, which has whole cells, turns of 15 degrees, and an uncertain scale if few regions agree.
-_OF_LANDMARKS, _OF_VOTE = (0.01, 0.05), (0.016, 0.09)
+_LANDMARK_SDS = (0.01, 0.05)
+_VOTE_SDS = (0.016, 0.09)
 _TRIED = 8  # hypotheses of rotation and height for a pair
 _KEPT = 512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
 _KEPT_PICTURES = 4  # descriptors that are cached
@@ -130,7 +132,7 @@ def refine(
     sure = _is_sure(solved) & (not is_mirrored)
     _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
-    amiss = sure & ~solved.recorded_counts & (off_m > _AMISS * solved.recorded_sd_m)
+    inconsistent = sure & ~solved.recorded_counts & (off_m > _INCONSISTENT_SDS * solved.recorded_sd_m)
     return replace(
         result,
         refined=int(sure.sum()),
@@ -140,7 +142,9 @@ def refine(
         position_sd_m=_median(np.sqrt(solved.position_var[sure] / 2)),
         footprint_m=_median(np.exp(solved.log.real[sure])),
         contradictory=tuple(
-            (placed[at].place_id, placed[at].source_image, float(off_m[at])) for at in np.flatnonzero(amiss).tolist()
+            (place.place_id, place.source_image, float(off_m[at]))
+            for at, place in enumerate(placed)
+            if inconsistent[at]
         ),
         is_mirrored=is_mirrored,
     )
@@ -289,7 +293,8 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
         found = None if one is None or other is None else agreement(one, other, expected)
         if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
             return None
-        return _tie(Overlay(found.shift_share, found.rotation_deg, found.scale), _OF_LANDMARKS)
+        overlay = Overlay(found.shift_share, found.rotation_deg, found.scale)
+        return Tie(*overlay.step_and_turn, *_LANDMARK_SDS)
 
     def look(query: int, place: int) -> Tie | None:
         if tie := by_landmarks(query, place, None, PROVEN):
@@ -301,26 +306,22 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
             fine, _ = place_map.fine_part(places[place].place_id)
         except EdgevprError:
             return None
-        match = technique.match(asking, fine, _likely(technique, asking, part))
-        if match.score < _ASKED:
+        match = technique.match(asking, fine, _rank_hypotheses(technique, asking, part))
+        if match.score < _MIN_SCORE:
             return None
         (dx, dy), cells = match.shift_cells or (0.0, 0.0), technique.spec.cells or 1
         vote = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
         tie = by_landmarks(query, place, vote, CONFIRMED)
-        return tie or (_tie(vote, _OF_VOTE) if match.score >= _VOTE else None)
+        return tie or (Tie(*vote.step_and_turn, *_VOTE_SDS) if match.score >= _MIN_VOTE_SCORE else None)
 
     return look
 
 
-def _likely(technique: Technique, asking: Descriptor, part: Array) -> list[int]:
-    """Choose the hypotheses of rotation and height under which `Technique.match` should compare the query `asking` with
-    a place whose coarse part is `part`: the eight with the best scores of coarse parts, as numbers, the best first."""
-    _, by_hypothesis = technique.coarse_scores(asking, part[None], None)
+def _rank_hypotheses(technique: Technique, query: Descriptor, coarse: Array) -> list[int]:
+    """Return the hypotheses of rotation and height under which `Technique.match` should compare a query with a place,
+    by its coarse part: the eight with the best scores, as numbers, the best first."""
+    _, by_hypothesis = technique.coarse_scores(query, coarse[None], None)
     assert by_hypothesis is not None  # set by techniques for a camera that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
-    likely: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
-    return likely
-
-
-def _tie(seen: Overlay, sds: tuple[float, float]) -> Tie:
-    return Tie(*seen.step_and_turn, *sds)
+    ranked: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
+    return ranked

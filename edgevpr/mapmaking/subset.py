@@ -5,19 +5,15 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.geodesy import offset_m, shorter_deg
-from edgevpr.core.quadkeys import extent_of_key, maps_in
+from edgevpr.core.geodesy import offset_m
+from edgevpr.core.quadkeys import extent_around, maps_in
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text, of_several
-
-_DEGREE_M = 111_000.0  # of latitude, and at most of longitude
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,16 +76,13 @@ def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
     if not tiles:
         raise MapError(f"{source} is no folder of maps: give one that `edgevpr fleet build` has made.")
     south, west, north, east = area.extent_deg
-    north_deg = margin_m / _DEGREE_M
-    east_deg = north_deg / max(np.cos(np.radians(min(max(abs(south), abs(north)) + north_deg, 89.0))), 1e-3)
-    found = []
-    for key, path in tiles.items():
-        of_tile = extent_of_key(key)
-        apart_deg = abs(shorter_deg((of_tile[1] + of_tile[3]) / 2 - (west + east) / 2))
-        is_beside = apart_deg > (of_tile[3] - of_tile[1] + east - west) / 2 + east_deg
-        if not is_beside and of_tile[0] - north_deg <= north and of_tile[2] + north_deg >= south:
-            found.append(path)
-    return found
+
+    def touches(key: str) -> bool:
+        low, left, high, right = extent_around(key, margin_m)
+        overlaps = (west - left) % 360 <= right - left or (left - west) % 360 <= east - west
+        return overlaps and low <= north and high >= south
+
+    return [path for key, path in tiles.items() if touches(key)]
 
 
 def _is_near(area: Area, margin_m: float, lat_deg: Doubles, lon_deg: Doubles) -> Bools:

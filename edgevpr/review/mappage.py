@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.core.geodesy import axes_of, distance_m, moved, offset_m
 from edgevpr.core.text import nines
 from edgevpr.core.types import Place
-from edgevpr.mapmaking.lookalikes import LookAlike
+from edgevpr.mapmaking.calibrate import LookAlike
 from edgevpr.review.album import Album
 from edgevpr.review.html import UNKNOWN, figure, figures, foreign, heading, section
 from edgevpr.review.logged import Point

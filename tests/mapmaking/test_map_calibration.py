@@ -12,7 +12,6 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
-from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking import calibrate as calibrating
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fitted
 from edgevpr.mapmaking.changes import changed
@@ -80,15 +79,6 @@ def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
     assert list(ask(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
 
 
-def test_a_picture_that_says_nothing_is_an_answer_without_evidence(place_map):
-    index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
-    shown = np.zeros((240, 320), bool)
-    answers = list(
-        ask(AHEAD, place_map, index, rule, query_meter(), [(1, Levelled(frame(0).image, shown, UNKNOWN_VIEW))])
-    )
-    assert [(each.right, each.evidence) for each in answers] == [(False, None)] * 3
-
-
 def test_a_calibration_is_kept_in_the_map(place_map):
     pictures, asked = at_hand(*map(frame, range(PLACES)))
     found = calibrated(place_map, pictures)
@@ -127,18 +117,6 @@ def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
     build_map([frame(20)], FrameEncoder(technique=AHEAD), place_map)
     found = calibrated(place_map, at_hand(*map(frame, (*range(PLACES), 20)))[0])
     assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
-
-
-def test_the_mask_of_the_map_holds_for_its_pictures(tmp_path):
-    allowed = np.ones((240, 320), bool)
-    allowed[:60] = allowed[190:] = False
-    mask = Mask(allowed, sha256="display")
-    path = map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)), mask=mask)
-    with PlaceMap.open_for_adding(path) as place_map:
-        pictures, _ = at_hand(*map(frame, range(PLACES)))
-        with pytest.raises(UsageError, match="mask"):
-            calibrated(place_map, pictures)
-        assert calibrated(place_map, pictures, mask=mask).asked == 2 * PLACES
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):

@@ -173,19 +173,6 @@ def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
         assert where["accuracy_m"] < 12, event
 
 
-def test_a_build_refines_what_it_has_made(flown, tmp_path, capsys):
-    path = tmp_path / "m.gpkg"
-    flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir"]
-    assert main(["map", "build", str(path), *flags]) == 0
-    assert "28 of 28 places refined" in capsys.readouterr().out
-    with PlaceMap.open(path) as place_map:
-        poses = [place.pose for place in place_map.places()]
-    assert [pose.footprint_m for pose in poses] == pytest.approx([FOOTPRINT_M] * 28, rel=0.15)
-    assert all(pose.recorded for pose in poses)
-    assert main(["map", "info", str(path)]) == 0
-    assert "  pose        of 28 places" in capsys.readouterr().out
-
-
 def some_of(built, path, numbers, position=lambda number, place: place.position):
     """A map of some places of another, in this order, at other positions."""
     with PlaceMap.open(built) as there, PlaceMap.create(path, there.spec) as place_map:
