@@ -20,7 +20,7 @@ from mkdocs.structure.pages import Page
 from edgevpr.cli.main import EXIT_CODES, command_line
 from edgevpr.core.config import Config, Key, keys_of
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.choice import TABLES
+from edgevpr.mavlink.interview import TABLES
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = "benchmarks/results"

@@ -250,7 +250,7 @@ class FakeLink:
             self._fixes.append(sending.fix)
             self._waiting.note_sent(sending, self._clock())
             sending.settle(True)
-            self._waiting.hear(self.answer, Readiness(gps_s=0.0).why(self.answer, 0.0), self._clock())
+            self._waiting.hear(self.answer, Readiness(has_gps=True).why(self.answer), self._clock())
             self._acks[self.answer] += 1
 
 

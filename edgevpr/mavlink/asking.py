@@ -20,7 +20,8 @@ from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
 
 HEARTBEAT_S = 1.0
 HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
-TRIES, ANSWER_WAIT_S = 3, 1.0
+TRIES = 3
+ANSWER_WAIT_S = 1.0
 IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
 LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
 
@@ -31,22 +32,19 @@ _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRM
 
 
 class Inquiry(AbstractContextManager["Inquiry"]):
-    """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as every
-    companion computer does, because some ports of autopilots do not answer without. Use it as a context manager, which
-    raises LinkError when the connection is lost.
+    """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as some
+    ports of autopilots do not answer without. It is a context manager, which raises LinkError when the link is lost.
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
-    - `heard`: number of messages from the autopilot, by message name; `signed`: how many of them carry a signature.
-    - `says_version_1`: its last message was MAVLink 1.
-    - `round_trips_s`: seconds from request to answer, one number for each answered call of `message`.
-    - `others`: system ids of any other autopilots on the link; `reader` counts bytes that belong to no message.
-    """
+    - `heard`: number of messages from the autopilot, by name; `signed`: how many of them carry a signature.
+    - `says_version_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
+    - `others`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
 
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
     ) -> None:
         """Open the link. `own_id` is our component id, `system_id` that of the autopilot (None: the first one heard).
-        Raises LinkError if the port cannot be opened (see `open_port`) or its other end is missing."""
+        Raises LinkError."""
         self.system_id = system_id
         self.heard: Counter[str] = Counter()
         self.signed = 0
@@ -84,12 +82,13 @@ class Inquiry(AbstractContextManager["Inquiry"]):
             sent_s = time.monotonic()
             self._put(messages.message_request(self.system_id or 0, message_id))
             answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
-            if answer is not None:
-                self.round_trips_s.append(time.monotonic() - sent_s)
-                if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
-                    # PX4 denies what it has not anew since it last streamed it: wait for the next of the stream.
-                    answer = self._first(_STREAMED_WITHIN_S, lambda message: message.get_type() == name)
-                return answer if answer and answer.get_type() == name else None
+            if answer is None:
+                continue
+            self.round_trips_s.append(time.monotonic() - sent_s)
+            if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
+                # PX4 denies what it has not anew since it last streamed it: wait for the next of the stream.
+                answer = self._first(_STREAMED_WITHIN_S, lambda message: message.get_type() == name)
+            return answer if answer and answer.get_type() == name else None
         return None
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
@@ -99,9 +98,10 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         missing = list(dict.fromkeys(names))
         for _ in range(TRIES):
             for start in range(0, len(missing), IN_FLIGHT):
-                waiting = set(missing[start : start + IN_FLIGHT])
-                for name in missing[start : start + IN_FLIGHT]:
+                asked = missing[start : start + IN_FLIGHT]
+                for name in asked:
                     self._put(messages.parameter_request(self.system_id or 0, name))
+                waiting = set(asked)
                 while waiting and (answer := self._first(ANSWER_WAIT_S, _answers_one_of(waiting))):
                     waiting.remove(answer.param_id)
                     if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
@@ -119,9 +119,9 @@ class Inquiry(AbstractContextManager["Inquiry"]):
             now_s = time.monotonic()
             if now_s >= end_s:
                 return None
-            self._turn(now_s, min(end_s - now_s, 0.25))
+            self._receive(now_s, min(end_s - now_s, 0.25))
 
-    def _turn(self, now_s: float, wait_s: float) -> None:
+    def _receive(self, now_s: float, wait_s: float) -> None:
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
         if self._port.connected and now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + HEARTBEAT_S
@@ -132,7 +132,7 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        self._arrived.extend(each for each in self.reader.feed(data, self._port.sender) if self._is_ours(each))
+        self._arrived.extend(filter(self._is_ours, self.reader.feed(data, self._port.sender)))
 
     def _is_ours(self, message: Message) -> bool:
         beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -161,36 +161,27 @@ class Inquiry(AbstractContextManager["Inquiry"]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
-    """All that an autopilot tells about itself; None and empty stand for what it did not answer.
-
-    - `firmware`: "ardupilot", "px4" or "other"; `vehicle`: the value of a `Kind`; `version`: (major, minor, patch).
-    - `parameters`: values by name; `heard`: the names of all messages received.
-    - `gps_fix`: GPS_FIX_TYPE of both receivers; `filter_flags`: of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
-    - `origin`: of its local frame, (latitude, longitude) in degrees; `says_version_1`: it sends MAVLink 1.
-    - `signs`: its messages are signed; `is_signed_to`: ours to it are; `answers`: it has answered a question.
-    - `other_systems`: system ids of other autopilots on the link; `bad_bytes`: bytes that belong to no valid message.
-    - `round_trip_s`: median time of an answer; `clock_ahead_s`: its UTC minus that of this machine.
-    """
+    """All that an autopilot tells about itself; None and empty stand for what it did not answer."""
 
     system_id: int
-    firmware: str
-    vehicle: str
+    firmware: str  # "ardupilot", "px4" or "other"
+    vehicle: str  # the value of a `Kind`
     is_armed: bool
     version: tuple[int, int, int] | None
     version_text: str | None
     parameters: dict[str, float | int]
-    heard: tuple[str, ...]
-    gps_fix: tuple[int | None, int | None]
-    filter_flags: int | None
-    origin: tuple[float, float] | None
-    signs: bool
-    is_signed_to: bool
-    answers: bool
-    says_version_1: bool
-    other_systems: tuple[int, ...]
-    bad_bytes: int
-    round_trip_s: float | None
-    clock_ahead_s: float | None
+    heard: tuple[str, ...]  # names of all messages received
+    gps_fix: tuple[int | None, int | None]  # GPS_FIX_TYPE of both receivers
+    filter_flags: int | None  # of EKF_STATUS_REPORT or ESTIMATOR_STATUS
+    origin: tuple[float, float] | None  # of its local frame: latitude, longitude in degrees
+    signs: bool  # its messages are signed
+    is_signed_to: bool  # ours to it are
+    answers: bool  # it has answered a question
+    says_version_1: bool  # of MAVLink
+    other_systems: tuple[int, ...]  # system ids of other autopilots on the link
+    bad_bytes: int  # that belong to no valid message
+    round_trip_s: float | None  # median time of an answer
+    clock_ahead_s: float | None  # its UTC minus that of this machine
 
     @property
     def kind(self) -> Kind:
@@ -198,11 +189,8 @@ class AutopilotReading:
 
 
 def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read all that an autopilot tells about itself; return None if no heartbeat comes. `wanted` maps a firmware (as in
-    `AutopilotReading`) to the names of the parameters to be read; those that it has under another name are found too.
-
-    It takes ten seconds, or half a minute if the autopilot does not answer. Raises LinkError when the link is lost.
-    """
+    """Read all that an autopilot tells about itself, in ten seconds; return None if no heartbeat comes. `wanted` maps a
+    firmware to the names of the parameters to be read; those that it has under another name are found too."""
     beat = asking.heartbeat()
     if beat is None:
         return None

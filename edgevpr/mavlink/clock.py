@@ -11,7 +11,8 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
 OWN_CLOCK_AFTER_S = 5.0  # without an answer
-_ASK_EVERY_S, _ASK_EVERY_AT_FIRST_S = 1.0, 0.25
+_ASK_EVERY_S = 1.0
+_ASK_EVERY_AT_FIRST_S = 0.25
 _KEPT_S = 10.0  # of answers; two quartz clocks drift apart by 1 ms at most in this time
 _DRIFT_S = 1e-3
 _MAX_REQUESTS = 64  # whose answers are still awaited: those of a link that is very late
@@ -21,7 +22,8 @@ _UTC_ROUNDED_S = 5e-3  # its boot time comes in whole milliseconds
 _STAMP_OFF_S = 1.0
 # Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
 _BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
-_WRAP_MS, _NEAR_WRAP_MS = 2**32, 60_000
+_WRAP_MS = 2**32
+_NEAR_WRAP_MS = 60_000
 LATE_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
 # The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
 # `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
@@ -49,8 +51,8 @@ class _Answer(NamedTuple):
     def round_trip_s(self) -> float:
         return self.most_s - self.least_s
 
-    def overlaps(self, other: "_Answer") -> bool:
-        return self.least_s <= other.most_s + _DRIFT_S and other.least_s <= self.most_s + _DRIFT_S
+    def contradicts(self, other: "_Answer") -> bool:
+        return max(self.least_s, other.least_s) > min(self.most_s, other.most_s) + _DRIFT_S
 
 
 class AutopilotClock:
@@ -60,7 +62,7 @@ class AutopilotClock:
 
     def __init__(self) -> None:
         self._requests_ns: deque[int] = deque(maxlen=_MAX_REQUESTS)
-        self._asked_s = self._due_s = -math.inf  # first asked; when to ask again
+        self._asked_s = self._due_s = -math.inf  # first asked; when to ask next
         self._answers: list[_Answer] = []
         self._best: _Answer | None = None
         self._uses_own = False
@@ -108,13 +110,7 @@ class AutopilotClock:
 
     def boot_time_s(self, t_mono_s: float) -> float | None:
         """Return the autopilot's time since boot at `t_mono_s`; None: not known (yet)."""
-        offset_s = self._offset_s
-        return None if offset_s is None else t_mono_s + offset_s
-
-    def mono_s(self, boot_s: float) -> float | None:
-        """Return our time when the autopilot's boot was `boot_s` ago; None: not known (yet)."""
-        offset_s = self._offset_s
-        return None if offset_s is None else boot_s - offset_s
+        return t_mono_s + (self._best.least_s + self._best.most_s) / 2 if self._best else None
 
     def stamp_s(self, t_mono_s: float) -> float | None:
         """Return `t_mono_s` as a time stamp for the autopilot; None: not known yet, or perhaps that of a past boot."""
@@ -132,14 +128,10 @@ class AutopilotClock:
     def delay_s(self, boot_ms: int, now_s: float) -> float:
         """Return how long a report of the boot time `boot_ms` was on its way, seconds; 0.0 where the boot time is not
         known. It is no less than half the last round trip: if not the report, then what we send comes late."""
-        reported_s = self.mono_s(boot_ms / 1e3)
-        if reported_s is None:
+        boot_s = self.boot_time_s(now_s)
+        if boot_s is None:
             return 0.0
-        return max(math.remainder(now_s - reported_s, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
-
-    @property
-    def _offset_s(self) -> float | None:
-        return (self._best.least_s + self._best.most_s) / 2 if self._best else None
+        return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
 
     def _hear_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
         """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
@@ -152,9 +144,9 @@ class AutopilotClock:
                 return True
             self._doubt_s = None
         # One that contradicts the newest is from before a pause of either clock.
-        kept = (old for old in self._answers if now_s - old.t_s <= _KEPT_S and old.overlaps(answer))
+        kept = (old for old in self._answers if now_s - old.t_s <= _KEPT_S and not old.contradicts(answer))
         self._answers = [*kept, answer]
-        self._best = min(self._answers, key=lambda each: each.round_trip_s)
+        self._best = min(self._answers, key=lambda kept: kept.round_trip_s)
         return False
 
     def _hear_boot_time(self, kind: str, boot_ms: int) -> bool:
@@ -182,15 +174,15 @@ class AutopilotClock:
 
 
 class ForeignStamps:
-    """Finds time stamps of other programs that are not in the autopilot's time. ArduPilot has one correction of time
-    stamps for all senders of a link (`JitterCorrection`): such stamps make ours up to 0.5 s too old."""
+    """Finds time stamps of other programs that are not in the autopilot's time: by ArduPilot's one correction for all
+    senders of a link (`JitterCorrection`) they make ours up to 0.5 s too old."""
 
     def __init__(self) -> None:
         self._found: set[tuple[str, str]] = set()
 
     def find(self, message: Message, boot_s: float | None) -> str | None:
-        """Return the sender and the name of a message whose stamp is off by more than a second, the first time; None:
-        there is no such stamp in it, or its sender is known. `boot_s` is the autopilot's time since boot."""
+        """Return sender and name of a message whose stamp is off by more than a second, the first time (None: it is
+        not). `boot_s` is the autopilot's time since boot."""
         kind = message.get_type()
         if kind in _STAMPS:
             stamp_s = getattr(message, _STAMPS[kind]) / 1e6
@@ -202,10 +194,8 @@ class ForeignStamps:
         if boot_s is None or abs(stamp_s - boot_s) <= _STAMP_OFF_S or (sender, kind) in self._found:
             return None
         self._found.add((sender, kind))
-        log.warning(
-            "%s stamps its %s %.1f s off the autopilot's time since boot: ArduPilot has one time correction for all "
-            "senders of a link, so if it shares ours, fixes count as up to 0.5 s older than they are; let it take its "
-            "time from TIMESYNC, or give it a port of its own",
-            sender, kind, stamp_s - boot_s,
-        )  # fmt: skip
+        why = "ArduPilot has one time correction for all senders of a link, so fixes may count as up to 0.5 s older"
+        advice = "let it take its time from TIMESYNC, or give it a port of its own"
+        text = f"{sender} stamps its {kind} {stamp_s - boot_s:.1f} s off the autopilot's time since boot"
+        log.warning("%s: %s; %s", text, why, advice)
         return f"{sender} {kind}"

@@ -6,8 +6,9 @@ import math
 import struct
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
 from edgevpr.mavlink import messages
@@ -15,9 +16,8 @@ from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import SILENT_AFTER_S, ForeignStamps
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
-from edgevpr.mavlink.ground import PAUSED, Requests, Texts, Wish, Wished
+from edgevpr.mavlink.ground import PAUSED, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
-from edgevpr.mavlink.origin import OriginAltitude
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
@@ -29,8 +29,7 @@ HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the l
 BETWEEN_S = 0.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
-
-_NOBODY = Listener()
+FOR_PEOPLE = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +48,7 @@ class LinkSettings:
     system_id: int | None = None
     max_fix_age_s: float = MAX_FIX_WAIT_S
     clock: Callable[[], float] = time.monotonic
-    listener: Listener = _NOBODY
+    listener: Listener = field(default_factory=Listener)
     tap: Tap = untapped
     signing: Signing = NOT_SIGNING
     origin: Position | None = None
@@ -59,18 +58,19 @@ class LinkSettings:
 class Conversation:
     """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
     `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, and the count of messages `sent`, by
-    name. `copy_message` is called with every queued message, `copy_text` with every text: for the ground link."""
+    name."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
-        self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener)
-        self.fixes, self.texts, self.requests = Fixes(settings.max_fix_age_s), Texts(), Requests()
+        self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener, self._report)
+        self.fixes = Fixes(settings.max_fix_age_s, self._report)
+        self.texts, self.requests = Texts(), Requests()
         self.reader = PacketReader(settings.signing.admits, tap=settings.tap)
         self.between: deque[Sending] = deque(maxlen=MESSAGES_MAX)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0
-        self.copy_message: Callable[[Message], None] = lambda message: None
-        self.copy_text: Callable[[Severity, str, str | None], None] = lambda severity, text, topic: None
+        self._ground: Conversation | None = None
+        self._reports: list[tuple[Severity, str, str]] = []
         self._messages: deque[Message] = deque(maxlen=MESSAGES_MAX)
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
@@ -82,7 +82,7 @@ class Conversation:
         self._told_channel: Channel | None = self.channel  # the channel that the listener knows
         self._asked_for_state: bool | None = None
         self._no_origin_since_s, self._has_set_origin = math.inf, False
-        self._origin_altitude = OriginAltitude(self.announce)
+        self._has_asked_pressure = False
         self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
         self._was_late = False
 
@@ -96,12 +96,19 @@ class Conversation:
         """True if a message or a text waits to be sent, or a fix for its answer."""
         return bool(self._messages or self.texts or self.fixes)
 
+    def copy_to(self, ground: "Conversation") -> None:
+        """From now on copy health and all that is for people to the conversation with a ground station, whose requests
+        are treated like ours. Each has a queue of texts of its own: while a link is lost, its texts wait."""
+        self._ground, ground.requests = ground, self.requests
+        ground._packer.srcSystem = self._packer.srcSystem
+
     def send(self, *outgoing: Message) -> None:
         """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
         for message in outgoing:
             self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
             self._messages.append(message)
-            self.copy_message(message)
+            if self._ground and message.get_type() in FOR_PEOPLE:
+                self._ground.send(copy(message))  # packing changes a message, and each link packs it
 
     def send_fix(self, fix: Fix) -> Sending:
         """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is heard, or never."""
@@ -117,33 +124,24 @@ class Conversation:
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Queue a text for the people on the ground, one in five seconds. `topic`: what it is about (see `Texts`)."""
         self.texts.put(severity, text, topic)
-        self.copy_text(severity, text, topic)
+        if self._ground:
+            self._ground.announce(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
         """Set the health to be sent in heartbeats. It holds for ten seconds; without a new call it is then CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
+        if self._ground:
+            self._ground.set_health(health)
 
     def want_position(self) -> None:
         """From now on request the autopilot's reports of position, attitude and so on, and again whenever they stop
         or become rare."""
         self._ask_position_s = self._clock()
 
-    def offer(self, wishes: Collection[Wish]) -> None:
-        """Set which requests to the flight are accepted from ground stations from now on; at first none is."""
-        self.requests.offered = wishes
-
-    def take_wishes(self) -> tuple[Wished, ...]:
-        """Return the requests to the flight that were accepted since the last call, each with its sender."""
-        return self.requests.take()
-
-    def vehicle(self) -> Vehicle | None:
-        """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
-        return self.autopilot.vehicle
-
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, with position, roll, pitch and heading moved to `t_mono_s`, the time of a frame, as
-        far as velocity and attitude are known; None as `vehicle` does. Roll and pitch are None if no attitude was
-        received within 0.3 s of it. On a continuous channel, `t_fix_s` is now."""
+        """Return the last report of the vehicle, moved to `t_mono_s`, the time of a frame, as far as velocity and
+        attitude are known; None if it has no position. Roll and pitch are None if no attitude was received within 0.3 s
+        of it. On a continuous channel, `t_fix_s` is now."""
         vehicle = self.autopilot.vehicle_at(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
@@ -185,6 +183,8 @@ class Conversation:
             if self.autopilot.hear(message, now_s, sender):
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
+                if self._ground:
+                    self._ground._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
                     self._begin_anew("another autopilot has taken its place")
                     self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
@@ -199,7 +199,7 @@ class Conversation:
         return is_ours
 
     def tell_of_answers(self) -> None:
-        """Queue texts for the ground station about what has changed with the autopilot since the last call."""
+        """Announce what has changed with the autopilot and its answers since the last call."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)
         if is_there and self._is_there is False:
@@ -210,10 +210,10 @@ class Conversation:
         if is_there or self._is_there is not None:
             self._is_there = is_there
         self._announce_delay(now_s)
-        readiness, interview = self.autopilot.readiness, self.autopilot.interview
-        fixes_news = self.fixes.news(readiness.why_silent(), now_s)
-        for news in (*interview.take_news(), *fixes_news, *self.autopilot.heights.news()):
-            self.announce(*news)
+        self.fixes.report_silence(self.autopilot.readiness(now_s).why_silent, now_s)
+        for report in self._reports:
+            self.announce(*report)
+        self._reports.clear()
 
     def break_off(self, lost_fixes: int) -> None:
         """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
@@ -280,14 +280,29 @@ class Conversation:
         if autopilot.origin is None and here and now_s - self._no_origin_since_s > ORIGIN_WITHIN_S:
             # Again if it is not heard: an autopilot whose filter has not started yet ignores it.
             self._no_origin_since_s = now_s
-            message = self._origin_altitude.place(here, system_id, autopilot.pressure_alt_m)
-            if message.get_type() == "SET_GPS_GLOBAL_ORIGIN" and not self._has_set_origin:
-                log.warning("the autopilot has no origin: it is set to the first place of the map")
-                self._has_set_origin = True
-            return message
+            return self._place_origin(here, system_id)
         if state and state.attitude and autopilot.origin:
             return messages.odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
+
+    def _place_origin(self, here: Position, system_id: int) -> Message:
+        """Make the message that sets the origin, at the altitude of the ground or, if the map does not know that, at
+        the autopilot's pressure altitude. If neither is known, request the air pressure: an origin at a wrong altitude
+        of 0 is never set. Our positions and heights do not depend on it; altitudes above sea level in a mission do."""
+        alt_m = self.autopilot.pressure_alt_m if here.alt_m is None else here.alt_m
+        if alt_m is None:
+            if self._has_asked_pressure:
+                self.announce(Severity.WARNING, "origin altitude unknown: set EKF origin", "origin")
+            self._has_asked_pressure = True
+            return messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
+        self._has_asked_pressure = False  # an autopilot that restarts is asked again
+        if not self._has_set_origin:
+            source = "an altitude by its air pressure, which may be 150 m off" if here.alt_m is None else "the map's"
+            log.warning("the autopilot has no origin: it is set to the first place of the map, at %s", source)
+            self._has_set_origin = True
+        if here.alt_m is None:
+            self.announce(Severity.WARNING, f"origin altitude unknown: about {alt_m:.0f} m", "origin")
+        return messages.origin(system_id, here.lat_deg, here.lon_deg, alt_m)
 
     def _ask_for_position(self, system_id: int, now_s: float) -> None:
         """Queue the questions that are due, and request reports that have stopped or have become half as frequent."""
@@ -310,6 +325,9 @@ class Conversation:
         if is_silent or is_slowed or self._asked_for_state != is_continuous:
             self._asked_for_state = is_continuous
             self.send(*messages.report_requests(system_id, self.autopilot.firmware, is_continuous))
+
+    def _report(self, severity: Severity, text: str, topic: str) -> None:
+        self._reports.append((severity, text, topic))
 
     def _begin_anew(self, why: str) -> None:
         """Begin again with an autopilot that has forgotten everything. `why` goes to the fixes without an answer."""
@@ -347,17 +365,16 @@ class Conversation:
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
         if sender in (us, (us[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             return
-        if found := self._foreign_stamps.find(message, autopilot.boot_time_s(now_s)):
+        if found := self._foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
             self.announce(Severity.WARNING, f"wrong stamps: {found}", "stamps")
 
     def _hear_request(self, message: Message, now_s: float) -> None:
         self.send(*self.requests.hear(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
     def _hear_answer(self, answer: str, now_s: float) -> None:
-        readiness = self.autopilot.readiness
-        sending = self.fixes.hear(answer, readiness.why(answer, now_s), now_s)
+        sending = self.fixes.hear(answer, self.autopilot.readiness(now_s).why(answer), now_s)
         if sending and answer == "ACCEPTED":
             self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
-        if answer == "FAILED" and readiness.asks_origin(now_s):
+        if answer == "FAILED" and self.autopilot.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.send(messages.message_request(self.autopilot.system_id or 0, origin))

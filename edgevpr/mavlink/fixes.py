@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from threading import Event
 
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.mavlink.ground import News
+from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.vehicle import GPS_IN_USE, Reason
 
 FIXES_MAX = 8
-# The longest that a fix may wait, from `put` on and in all buffers together, unless the configuration says another.
-# types.FIX_MAX_AGE_S limits the age of its frame, which the autopilot is told. A fix must keep both limits.
+# The longest that a fix may wait, from `put` on and in all buffers together. types.FIX_MAX_AGE_S limits the age of its
+# frame, which the autopilot is told.
 MAX_FIX_WAIT_S = 1.0
 UNANSWERED_MAX = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
 TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent at this interval
@@ -40,7 +40,7 @@ class FixAnswer:
 
 class Sending:
     """A fix to be sent by `due_s`. `sent` is None while it waits, then True, or False with the reason in `why`.
-    `t_sent_s` is when it was handed to the port, `outcome` the answer of the autopilot; both are None until then."""
+    `t_sent_s` is when it was handed to the port, `outcome` the answer of the autopilot."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -70,7 +70,10 @@ class Fixes:
     fixes `dropped` because they were too old or too many, `withheld` because of `why_not` or a pause, and `unanswered`.
     `refusal` is the reason for the last refusal by the autopilot (None: there was none)."""
 
-    def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S) -> None:
+    def __init__(
+        self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda severity, text, topic: None
+    ) -> None:
+        self._announce = announce
         self.dropped = self.withheld = self.unanswered = 0
         self.refusal: Reason | None = None
         self._max_wait_s = max_wait_s
@@ -78,7 +81,6 @@ class Fixes:
         self._under_way: deque[tuple[float, Sending]] = deque()  # sent, without an answer; with the time of sending
         self._taken_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
         self._last_answer: tuple[str, Reason] | None = None
-        self._news: list[News] = []  # the newest about an answer
         self._sent_s = -math.inf
         self._row = 0  # fixes without an answer, in a row
         self._is_stopped = False  # as the ground station was last told
@@ -156,11 +158,10 @@ class Fixes:
         if (result, reason) != self._last_answer:
             level = logging.INFO if is_taken else logging.WARNING
             log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason.sentence)
-            if not is_taken:
-                severity = Severity.INFO if reason is GPS_IN_USE else Severity.WARNING
-                self._news = [(severity, f"fixes refused: {reason.brief}", "fixes")]
-            elif self._last_answer:
-                self._news = [(Severity.INFO, "fixes are taken again", "fixes")]
+            severity = Severity.INFO if is_taken or reason is GPS_IN_USE else Severity.WARNING
+            text = "fixes are taken again" if is_taken else f"fixes refused: {reason.brief}"
+            if self._last_answer or not is_taken:
+                self._announce(severity, text, "fixes")
         self._last_answer = result, reason
         if is_taken:
             self._taken_s = now_s
@@ -182,21 +183,20 @@ class Fixes:
         while self._under_way:
             self._give_up(reason)
 
-    def news(self, why_silent: Reason, now_s: float) -> list[News]:
-        """Return texts for the ground station about what has changed since the last call: fixes are no longer answered
-        (for the likely reason `why_silent`) or are answered again, or are answered in another way."""
+    def report_silence(self, why_silent: Reason, now_s: float) -> None:
+        """Report if fixes are no longer answered (for the likely reason `why_silent`), or are answered again."""
         self.time_out(now_s)
-        is_stopped, news = self._row >= UNANSWERED_MAX, self._news
-        self._news = []
+        is_stopped = self._row >= UNANSWERED_MAX
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
-            return news
+            return
         self._is_stopped = is_stopped
-        if not is_stopped:
+        if is_stopped:
+            often = f"one every {TRIED_AGAIN_AFTER_S:g} s is sent until one is answered"
+            log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent.sentence)
+            self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.brief}", "answers")
+        else:
             log.warning("position fixes are answered again: they are sent again")
-            return [(Severity.INFO, "fixes are answered again", "answers"), *news]
-        often = f"one every {TRIED_AGAIN_AFTER_S:g} s is sent until one is answered"
-        log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent.sentence)
-        return [(Severity.WARNING, f"fixes unanswered: {why_silent.brief}", "answers"), *news]
+            self._announce(Severity.INFO, "fixes are answered again", "answers")
 
     def _drop(self, sending: Sending, why: str) -> None:
         self.dropped += 1

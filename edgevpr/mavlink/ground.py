@@ -3,7 +3,7 @@ request that only the flight itself can fulfil, such as a pause. Used by `conver
 
 import math
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not 
 PAUSED = "not sent: paused by the ground"
 SPACING_S = 5.0
 
-News = tuple[Severity, str, str]  # a change to be announced to the ground station: severity, text and topic
+Announce = Callable[[Severity, str, str], None]  # reports to the ground station: severity, text and topic
 
 
 class Wish(IntEnum):

@@ -5,10 +5,9 @@ filter: both may be set in flight (ArduPilot `AP_AHRS::get_relative_position_D_h
 
 import logging
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
-from edgevpr.mavlink.ground import News
+from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.mavlink.wire import Message, mavlink
@@ -24,7 +23,6 @@ MAX_STANDING_CLIMB_M_S = 1.0
 JUMP_M = 2.0
 JUMP_M_PER_S = 5.0
 MAX_STEP_S = 5.0
-HOME_MOVED_M = 5.0  # smaller moves are not reported
 CONTRADICTION_M = 5.0
 CONTRADICTION_SHARE = 0.25
 CONTRADICTION_LASTS_S = 3.0  # longer than the flight over a house
@@ -42,40 +40,25 @@ class Altitudes(NamedTuple):
     climb_m_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Contradiction:
-    """Two heights above the ground that contradict each other: by the autopilot, and by its range finder."""
-
-    by_autopilot_m: float
-    by_range_finder_m: float
-
-    def __str__(self) -> str:
-        return (
-            f"height: {self.by_autopilot_m:.0f} m by the autopilot, {self.by_range_finder_m:.0f} m by the range finder"
-        )
-
-
 class Heights:
     """Follows the height above the ground through new homes and origins. The height is 0 while the vehicle stands on
     the ground, disarmed; if it is first heard in flight, its height above home is taken once.
 
-    `takeoff_m`: height above the take-off point (None: no report yet). `home_m`: height of home above the take-off
-    point. `jumped_m`: sum of jumps of the altitude since take-off that neither a new home nor a new origin explains;
-    the height leaves them out. `contradiction`: a range finder has disagreed for seconds (None: it has not)."""
+    `takeoff_m`: height above the take-off point (None: no report yet). `jumped_m`: sum of jumps of the altitude since
+    take-off that neither a new home nor a new origin explains; the height leaves them out. `contradiction_m`: by how
+    much a range finder has disagreed for seconds (None: it has not)."""
 
-    def __init__(self) -> None:
+    def __init__(self, announce: Announce) -> None:
+        self._announce = announce
         self.takeoff_m: float | None = None
-        self.home_m = self.jumped_m = 0.0
-        self.contradiction: Contradiction | None = None
+        self.jumped_m = 0.0
+        self.contradiction_m: float | None = None
         self._last: Altitudes | None = None
         self._is_standing = self._has_home = self._is_guess = self._has_jumped = False
         self._range: tuple[float, float] | None = None  # metres, time
         self._terrain: tuple[float, float] | None = None  # altitude of the ground below in metres, time
         self._takeoff_terrain_m: float | None = None  # altitude of the take-off point by the same terrain data
-        self._changing_since_s: float | None = None  # the range finder differs from what `contradiction` says
-        self._reported: Contradiction | None = None
-        self._reported_home_m = 0.0
-        self._news: list[News] = []
+        self._changing_since_s: float | None = None  # the range finder differs from what `contradiction_m` says
 
     def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
         """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
@@ -84,18 +67,15 @@ class Heights:
         elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
             in_range = message.min_distance < message.current_distance < message.max_distance
             is_good = in_range and message.signal_quality != BAD_SIGNAL_QUALITY
-            lean = 1.0
-            if attitude:
-                lean = math.cos(math.radians(attitude.roll_deg)) * math.cos(math.radians(attitude.pitch_deg))
-            self._range = (message.current_distance / 100 * max(0.0, lean), now_s) if is_good else None
+            tilts_deg = (attitude.roll_deg, attitude.pitch_deg) if attitude else ()
+            slant = math.prod(math.cos(math.radians(tilt_deg)) for tilt_deg in tilts_deg)
+            self._range = (message.current_distance / 100 * max(0.0, slant), now_s) if is_good else None
 
     def handle_altitudes(self, altitudes: Altitudes, is_armed: bool, speed_m_s: float) -> None:
         """Process the altitudes of a GLOBAL_POSITION_INT; `speed_m_s` is its speed over the ground."""
         # PX4 without a home reports the altitude above sea level as that above home.
-        was_without_home, self._has_home = (
-            not self._has_home,
-            self._has_home or (altitudes.above_sea_m != altitudes.above_home_m),
-        )
+        was_without_home = not self._has_home
+        self._has_home |= altitudes.above_sea_m != altitudes.above_home_m
         is_still = speed_m_s <= MAX_STANDING_SPEED_M_S and abs(altitudes.climb_m_s) <= MAX_STANDING_CLIMB_M_S
         self._is_standing = is_still and not is_armed
         if self._is_standing:
@@ -108,7 +88,6 @@ class Heights:
         else:
             self.takeoff_m += self._change_m(self._last, altitudes)
         self._last = altitudes
-        self._check_home(self.takeoff_m - altitudes.above_home_m)
         self._check_range(altitudes.t_s)
 
     def now(self, now_s: float) -> float:
@@ -119,13 +98,7 @@ class Heights:
     @property
     def doubt_m(self) -> float:
         """By how much the height is in doubt, metres: by its jumps, and by a contradiction."""
-        found = self.contradiction
-        return max(abs(self.jumped_m), abs(found.by_autopilot_m - found.by_range_finder_m) if found else 0.0)
-
-    def news(self) -> list[News]:
-        """Return texts for the ground station about what has changed since the last call."""
-        news, self._news = self._news, []
-        return news
+        return max(abs(self.jumped_m), self.contradiction_m or 0.0)
 
     def _change_m(self, last: Altitudes, altitudes: Altitudes) -> float:
         """Return the change of height since the `last` report: that of the altitude above sea level or, if it has
@@ -148,23 +121,8 @@ class Heights:
             return nearest_m
         jump_m = nearest_m - climbed_m
         self.jumped_m += jump_m
-        self.home_m, self._reported_home_m = self.home_m - jump_m, self._reported_home_m - jump_m
         self._report(f"altitude jumped {jump_m:+.0f} m", "the height leaves it out", "altitude")
         return climbed_m
-
-    def _check_home(self, home_m: float) -> None:
-        if not self._has_home:
-            return
-        moved_m, was_m, self.home_m = home_m - self._reported_home_m, self.home_m, home_m
-        if self._is_standing:
-            self._reported_home_m = 0.0
-        elif abs(moved_m) > HOME_MOVED_M:
-            self._reported_home_m = home_m
-            if abs(home_m - was_m) > HOME_MOVED_M / 2:
-                text = f"home moved {abs(moved_m):.0f} m {'up' if moved_m > 0 else 'down'} in flight"
-            else:
-                text = f"home is {abs(home_m):.0f} m {'above' if home_m > 0 else 'below'} take-off"
-            self._report(text, "heights stay those above the take-off", "home")
 
     def _check_range(self, now_s: float) -> None:
         """Compare the range finder with the other heights; it must differ, or agree, for some seconds."""
@@ -172,27 +130,26 @@ class Heights:
         if by_range_m is None:
             self._changing_since_s = None
             return
-        limit_m = max(CONTRADICTION_M, CONTRADICTION_SHARE * abs(by_autopilot_m))
-        differs = abs(by_range_m - by_autopilot_m) > limit_m
-        if differs == (self.contradiction is not None):
+        difference_m = abs(by_range_m - by_autopilot_m)
+        differs = difference_m > max(CONTRADICTION_M, CONTRADICTION_SHARE * abs(by_autopilot_m))
+        if differs == (self.contradiction_m is not None):
             self._changing_since_s = None
-        elif self._changing_since_s is None:
+            self.contradiction_m = difference_m if differs else None
+            return
+        if self._changing_since_s is None:
             self._changing_since_s = now_s
-        lasts = self._changing_since_s is not None and now_s - self._changing_since_s >= CONTRADICTION_LASTS_S
-        if differs and (lasts or self.contradiction):
-            is_news, self.contradiction = self.contradiction is None, Contradiction(by_autopilot_m, by_range_m)
-            if is_news:
-                _log.warning("%s", self.contradiction)
-                text = f"height {by_autopilot_m:.0f} m, by range finder {by_range_m:.0f} m"
-                self._news.append((Severity.WARNING, text, "range finder"))
-        elif lasts:
-            self.contradiction, self._changing_since_s = None, None
-            _log.info("the range finder agrees with the height again")
-            self._news.append((Severity.INFO, "height and range finder agree again", "range finder"))
+        if now_s - self._changing_since_s < CONTRADICTION_LASTS_S:
+            return
+        self.contradiction_m, self._changing_since_s = difference_m if differs else None, None
+        if differs:
+            text = f"height {by_autopilot_m:.0f} m, by range finder {by_range_m:.0f} m"
+            self._report(text, "they contradict each other", "range finder")
+        else:
+            self._announce(Severity.INFO, "height and range finder agree again", "range finder")
 
     def _report(self, text: str, consequence: str, topic: str) -> None:
         _log.warning("%s: %s", text, consequence)
-        self._news.append((Severity.WARNING, text, topic))
+        self._announce(Severity.WARNING, text, topic)
 
     def _handle_terrain(self, report: Message, now_s: float) -> None:
         # A spacing of 0 says that the autopilot has no terrain data of this place.

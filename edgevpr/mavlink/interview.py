@@ -4,15 +4,15 @@ from its answers. Used by the conversation in flight."""
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Iterator
 
 from edgevpr.mavlink import messages
+from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
 from edgevpr.mavlink.channel import Channel, Choice, Kind, kind_of
-from edgevpr.mavlink.choice import TABLES, Decision, ParameterTable
-from edgevpr.mavlink.ground import News
+from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.parameters import name_alternative
+from edgevpr.mavlink.parameters import Decision, ParameterTable, name_alternative
+from edgevpr.mavlink.px4_parameters import PX4_TABLE
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
 ASKED_AT_ONCE_MAX = 10  # ArduPilot drops what comes on top of 20 (GCS_Param.cpp, param_requests)
@@ -26,6 +26,7 @@ REPORTED_AFTER_S = 10.0
 VERSION_ASKS_MAX = 4
 TOPIC = "parameters"
 
+TABLES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT_TABLE, mavlink.MAV_AUTOPILOT_PX4: PX4_TABLE}
 _OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
 
 log = logging.getLogger(__name__)
@@ -39,14 +40,12 @@ class Interview:
     change the channel is chosen anew. Old firmware is silent about a parameter that it does not have: it is taken to be
     absent after four rounds in which others were answered, or more on a link that loses messages.
 
-    - `choice`: the channel. Until the first questions it is command 43003: that is for programs that send fixes by
-      themselves and want no reports. Then it is `Channel.NONE` until all that it depends on is known.
-    - `parameters`: the values that were read, by name.
-    """
+    `choice` is the channel. Until the first questions it is command 43003, for programs that send fixes by themselves
+    and want no reports; then `Channel.NONE` until all that it depends on is known."""
 
-    def __init__(self) -> None:
+    def __init__(self, announce: Announce) -> None:
+        self._announce = announce
         self._values: dict[str, float] = {}
-        self.parameters: Mapping[str, float] = MappingProxyType(self._values)
         self._decision = Decision(_OF_ANY)
         self._reported: Decision | None = None
         self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), Kind.OTHER
@@ -62,16 +61,10 @@ class Interview:
         self._is_begun = self._is_asking = False  # since the first questions; as long as an answer is missing
         self._missing_since_s: float | None = None
         self._has_reported_missing = False
-        self._news: list[News] = []
 
     @property
     def choice(self) -> Choice:
         return self._decision.choice
-
-    def take_news(self) -> list[News]:
-        """Return the texts for the ground station since the last call."""
-        news, self._news = self._news, []
-        return news
 
     def hear(self, message: Message) -> None:
         """Process a message from the autopilot; most kinds are ignored."""
@@ -150,12 +143,12 @@ class Interview:
             self._absent |= absent
             self._decide()
 
+    @property
     def _table(self) -> ParameterTable | None:
         return TABLES.get(self._autopilot)
 
     def _all_names(self) -> frozenset[str]:
-        table = self._table()
-        return table.all_names if table else frozenset()
+        return self._table.all_names if self._table else frozenset()
 
     def _is_known(self, name: str) -> bool:
         names = {name, name_alternative(name) or name}
@@ -164,7 +157,7 @@ class Interview:
     def _find_missing(self) -> list[str]:
         """Return the names to ask for: first those that decide the channel, then those that it needs, then the rest; of
         these first those that were asked for least. An alternative name is asked for once the first had no answer."""
-        if not (table := self._table()):
+        if not (table := self._table):
             return []
         needed = table.name_needed(table.choose(self._kind, self._values))
         rank = dict.fromkeys(needed, 1) | dict.fromkeys(table.deciding, 0)
@@ -189,7 +182,7 @@ class Interview:
         """Choose the channel anew, and report it if anything about it has changed."""
         if not self._is_begun:
             return
-        table = self._table()
+        table = self._table
         decision = table.decide(self._kind, self._values, self._is_known) if table else Decision(_OF_ANY)
         self._decision = decision
         if not decision.missing and decision != self._reported:
@@ -202,13 +195,13 @@ class Interview:
         faults = list(decision.faults)
         if choice.channel is Channel.NONE:
             log.warning("%s: %s", who, choice.reason)
-            self._news.append((Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC))
+            self._announce(Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC)
         else:
             log.info("%s: positions go to it by %s", who, choice.reason)
             if faults:
-                self._news.append((Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC))
+                self._announce(Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC)
             elif self._reported or self._has_reported_missing:
-                self._news.append((Severity.INFO, f"positions go by {choice.channel.name}", TOPIC))
+                self._announce(Severity.INFO, f"positions go by {choice.channel.name}", TOPIC)
         for fault in faults:
             log.warning("%s: %s", fault.advice, fault.rule.why)
 
@@ -222,4 +215,4 @@ class Interview:
             self._has_reported_missing = True
             log.warning("%s", self._decision.choice.reason)
             more = f" and {len(missing) - 1} more" if missing[1:] else ""
-            self._news.append((Severity.WARNING, f"no answer for {missing[0]}{more}", TOPIC))
+            self._announce(Severity.WARNING, f"no answer for {missing[0]}{more}", TOPIC)

@@ -5,26 +5,29 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Concatenate, ParamSpec, TypeVar
 
 from edgevpr.core.errors import LinkError
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.ground import Wish, Wished
+from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.ports import Line, Port, open_port
 from edgevpr.mavlink.signing import OLD
 from edgevpr.mavlink.turns import Turns
+from edgevpr.mavlink.wire import Message
 
-TURN_S = 0.25  # longest sleep of the thread when nothing wakes it
-RETRY_FIRST_S, RETRY_MAX_S = 0.2, 2.0
+SLEEP_S = 0.25  # of the thread, when nothing wakes it
+RETRY_FIRST_S = 0.2
+RETRY_MAX_S = 2.0
 WATCH_S = 0.01  # between two checks whether a fix has left the operating system
 FLUSH_S = 0.5
 
-P = ParamSpec("P")
-T = TypeVar("T")
 Step = Callable[..., None]  # records one event of a turn on the tape: its name, and its values
 
 log = logging.getLogger(__name__)
@@ -36,10 +39,8 @@ class LinkStats:
 
     `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
     from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
-    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link,
-    `refused_signatures` refusals by reason. `reopened` is how often the port was; `bad_bytes` belong to no message.
-    `used_share` is that of `Px4Use`; `answered_s` is when a command of ours was last answered, by its number.
-    """
+    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link.
+    `bad_bytes` belong to no message. `answered_s`: when a command of ours was last answered, by its number."""
 
     connected: bool
     trouble: str | None
@@ -72,37 +73,29 @@ class LinkStats:
         return self.sent.get("GLOBAL_POSITION_SENSOR", 0) + self.sent.get("ODOMETRY", 0)
 
 
-def _in_turn(
-    method: Callable[Concatenate[Conversation, P], T], *, sends: bool = False
-) -> Callable[Concatenate["Link", P], T]:
-    """Make a method of `Link` that calls one of `Conversation` inside a turn and, if it `sends`, wakes the thread."""
-
-    def done_in_turn(link: "Link", /, *values: P.args, **named: P.kwargs) -> T:
-        with link.turn(method.__name__):
-            done = method(link._conversation, *values, **named)
-        if sends:
-            link._ring()
-        return done
-
-    done_in_turn.__doc__ = method.__doc__
-    return done_in_turn
-
-
 class Link:
-    """The link to one flight controller. It sends, receives, and reopens the port whenever the connection is lost.
-    `Conversation` decides what is sent, and processes what is received.
+    """The link to one flight controller. It sends, receives, and reopens the port whenever the connection is lost. Its
+    `conversation` decides what is sent, and processes what is received; it is used inside `turns` only. Those of
+    another link are shared if given; `converse` makes the conversation.
 
     All methods but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
+    Those that are not explained here are those of `Conversation`.
     """
 
     name = "link"
 
-    def __init__(self, address: LinkAddress, settings: LinkSettings) -> None:
+    def __init__(
+        self,
+        address: LinkAddress,
+        settings: LinkSettings,
+        turns: Turns | None = None,
+        converse: type[Conversation] = Conversation,
+    ) -> None:
         self._address, self._settings = address, settings
         self._tape = settings.tape
-        self._turns = Turns(settings.clock, settings.tape)
+        self.turns = turns or Turns(settings.clock, settings.tape)
         with self.turn("begin"):
-            self._conversation = Conversation(settings, self._turns.now_s)
+            self.conversation = converse(settings, self.turns.now_s)
         self._line: Line | None = None
         self._reopened = 0
         self._retry_s = RETRY_FIRST_S
@@ -126,36 +119,66 @@ class Link:
 
     def turn(self, what: str) -> AbstractContextManager[None]:
         """Take a turn: a context manager in which the link does nothing, and its time stands still (see `Turns`)."""
-        return self._turns.taken(what)
+        return self.turns.taken(what)
 
-    send = _in_turn(Conversation.send, sends=True)
-    send_fix = _in_turn(Conversation.send_fix, sends=True)
-    announce = _in_turn(Conversation.announce, sends=True)
-    offer = _in_turn(Conversation.offer)
-    take_between = _in_turn(Conversation.take_between)
-    take_wishes = _in_turn(Conversation.take_wishes)
-    set_health = _in_turn(Conversation.set_health)
-    want_position = _in_turn(Conversation.want_position)
-    vehicle = _in_turn(Conversation.vehicle)
-    vehicle_at = _in_turn(Conversation.vehicle_at)
+    def send(self, *outgoing: Message) -> None:
+        with self._sending("send"):
+            self.conversation.send(*outgoing)
+
+    def send_fix(self, fix: Fix) -> Sending:
+        with self._sending("send_fix"):
+            return self.conversation.send_fix(fix)
+
+    def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
+        with self._sending("announce"):
+            self.conversation.announce(severity, text, topic)
+
+    def offer(self, wishes: Collection[Wish]) -> None:
+        with self.turn("offer"):
+            self.conversation.requests.offered = wishes
+
+    def take_between(self) -> list[Sending]:
+        with self.turn("take_between"):
+            return self.conversation.take_between()
+
+    def take_wishes(self) -> tuple[Wished, ...]:
+        with self.turn("take_wishes"):
+            return self.conversation.requests.take()
+
+    def set_health(self, health: Health) -> None:
+        with self.turn("set_health"):
+            self.conversation.set_health(health)
+
+    def want_position(self) -> None:
+        with self.turn("want_position"):
+            self.conversation.want_position()
+
+    def vehicle(self) -> Vehicle | None:
+        """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
+        with self.turn("vehicle"):
+            return self.conversation.autopilot.vehicle
+
+    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+        with self.turn("vehicle_at"):
+            return self.conversation.vehicle_at(t_mono_s)
 
     @property
     def channel(self) -> Channel:
-        return self._conversation.channel
+        return self.conversation.channel
 
     def listens(self) -> bool:
         """Return True if a fix can be sent now: the port is connected and the autopilot has been heard lately."""
         with self.turn("listens"):
-            return self._tape.read("port", self._port)[0] and self._conversation.autopilot.listens(self._turns.now_s())
+            return self._tape.read("port", self._port)[0] and self.conversation.autopilot.listens(self.turns.now_s())
 
     def stats(self) -> LinkStats:
         with self.turn("stats"):
-            said, autopilot, fixes = self._conversation, self._conversation.autopilot, self._conversation.fixes
+            said, autopilot, fixes = self.conversation, self.conversation.autopilot, self.conversation.fixes
             connected, trouble, reopened = self._tape.read("port", self._port)
             return LinkStats(
                 connected=connected,
                 trouble=trouble,
-                autopilot_heard=autopilot.listens(self._turns.now_s()),
+                autopilot_heard=autopilot.listens(self.turns.now_s()),
                 autopilot_system_id=autopilot.system_id,
                 sent=dict(said.sent),
                 received=dict(said.reader.received),
@@ -178,7 +201,7 @@ class Link:
     def close(self) -> None:
         """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
         with self.turn("close"):
-            self._conversation.texts.hurry()
+            self.conversation.texts.hurry()
         self._closing.set()
         self._ring()
         if self._thread.ident is None:  # never started
@@ -208,7 +231,7 @@ class Link:
                 if self._line is None:
                     self._reopen()
                 else:
-                    self._turn(self._line, timeout_s=TURN_S)
+                    self._work(self._line, timeout_s=SLEEP_S)
             except (OSError, LinkError) as error:
                 self._lose(error)
             except Exception as error:  # a flight without a link is worse than one with a link opened anew
@@ -221,22 +244,22 @@ class Link:
         if self._closing.wait(self._retry_s):
             return
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
-        with self._turns.of_link(self.name) as step:
-            self._conversation.fixes.drop_stale(self._turns.now_s())
+        with self.turns.of_link(self.name) as step:
+            self.conversation.fixes.drop_stale(self.turns.now_s())
             step("waits")
         self._line = self._opened()
         self._reopened += 1
 
-    def _turn(self, line: Line, timeout_s: float) -> None:
+    def _work(self, line: Line, timeout_s: float) -> None:
         """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
-        with self._turns.of_link(self.name) as step:
+        with self.turns.of_link(self.name) as step:
             if line.port.connected:
                 self._transmit(line, step)
-            self._conversation.tell_of_answers()
+            self.conversation.tell_of_answers()
             step("answers")
         reading: list[Port | socket.socket] = [line.port, self._bell]
         writing = [line.port] if line.unsent else []
-        timeout_s = min(timeout_s, WATCH_S) if line.leaving else self._conversation.wait_s(timeout_s)
+        timeout_s = min(timeout_s, WATCH_S) if line.leaving else self.conversation.wait_s(timeout_s)
         readable, _, _ = select.select(reading, writing, [], timeout_s)
         if self._bell in readable:
             self._bell.recv(4096)
@@ -250,15 +273,15 @@ class Link:
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
-        with self._turns.of_link(self.name) as step:
+        with self.turns.of_link(self.name) as step:
             self._note_departed(line, step)  # before its answer is read
             try:
-                beats = self._conversation.hear(data, self._turns.now_s(), line.port.sender)
+                beats = self.conversation.hear(data, self.turns.now_s(), line.port.sender)
             finally:
                 verdicts = self._settings.signing.take_verdicts()
                 step("heard", data, line.port.sender, verdicts)
             # An autopilot whose clock is old, which has the key, learns the time from what we send it.
-            is_behind = OLD in verdicts and not self._conversation.autopilot.listens(self._turns.now_s())
+            is_behind = OLD in verdicts and not self.conversation.autopilot.listens(self.turns.now_s())
         if beats or is_behind:
             line.port.answer_sender()
 
@@ -267,7 +290,7 @@ class Link:
             # Before writing: what has waited too long must not be written on.
             self._note_departed(line, step)
             if not line.unsent:
-                next_one = self._conversation.next_packet()
+                next_one = self.conversation.next_packet()
                 step("said", next_one and next_one[0])
                 if next_one is None:
                     return
@@ -279,12 +302,12 @@ class Link:
     def _note_departed(self, line: Line, step: Step) -> None:
         if departed := line.departed():
             step("departed", len(departed))
-            self._conversation.note_departed(departed)
+            self.conversation.note_departed(departed)
 
     def _lose(self, error: Exception) -> None:
-        with self._turns.of_link(self.name) as step:
+        with self.turns.of_link(self.name) as step:
             step("lost", lost_fixes := self._close_line())
-            self._conversation.break_off(lost_fixes)
+            self.conversation.break_off(lost_fixes)
         self._note_trouble(error)
 
     def _close_line(self) -> int:
@@ -302,16 +325,23 @@ class Link:
         give_up_s = time.monotonic() + FLUSH_S
         with suppress(OSError):
             while self._line and self._line.port.connected and time.monotonic() < give_up_s:
-                self._turn(self._line, timeout_s=0.01)
-                if not self._conversation.waits and self._line.is_idle:
+                self._work(self._line, timeout_s=0.01)
+                if not self.conversation.waits and self._line.is_idle:
                     break
 
     def _close_all(self) -> None:
-        with self._turns.of_link(self.name) as step:
+        with self.turns.of_link(self.name) as step:
             step("closed", self._close_line())
-            self._conversation.end()
+            self.conversation.end()
         self._bell.close()
         self._bell_button.close()
+
+    @contextmanager
+    def _sending(self, what: str) -> Iterator[None]:
+        """Context manager: take a turn, and wake the thread after it."""
+        with self.turn(what):
+            yield
+        self._ring()
 
     def _ring(self) -> None:
         with suppress(OSError):  # it rings already, or the link is closed

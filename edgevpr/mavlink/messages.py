@@ -46,8 +46,8 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A position fix: latitude and longitude of the vehicle at `t_frame_s`, when the frame was taken (monotonic clock),
-    and `accuracy_m`, the standard deviation of one axis. Raises ValueError for no position, accuracy or time."""
+    """A position fix: the vehicle's place at `t_frame_s`, when the frame was taken (monotonic clock), and `accuracy_m`,
+    the standard deviation of one axis. Raises ValueError for no position, accuracy or time."""
 
     lat_deg: float
     lon_deg: float
@@ -89,8 +89,8 @@ def heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -
 
 def position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float | None = None) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
-    The age of the fix is sent as processing time. `stamp_s` (None: `t_sent_s`) is the time of sending. It goes as a
-    float32: good to 8 ms after one day."""
+    The age of the fix is sent as processing time, `stamp_s` (None: `t_sent_s`) as that of sending: a float32, good to
+    8 ms after one day."""
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
         target_component=AUTOPILOT,
@@ -165,12 +165,9 @@ def odometry(
 ) -> Message:
     """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `origin`
     (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
-    `attitude` is (roll, pitch, yaw) in radians and must not contain NaN.
-
-    ArduPilot computes a standard deviation as the cube root of the sum of the squared variances
-    (`GCS_MAVLINK::handle_odometry`, 4.7-dev); the variances sent are those from which it gets the right one. That of
-    the height, which we do not measure, is sent as zero.
-    """
+    `attitude` is (roll, pitch, yaw) in radians. ArduPilot computes a standard deviation as the cube root of the sum of
+    the squared variances (`GCS_MAVLINK::handle_odometry`); the variances sent are those from which it gets the right
+    one. That of the height, which we do not measure, is zero."""
     east, north, down = state.velocity_m_s
     to_earth = rotmat.Matrix3()
     to_earth.from_euler(*attitude)

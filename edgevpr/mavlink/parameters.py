@@ -1,18 +1,16 @@
-"""Rules about the autopilot's parameters: the form of one row of the table that says, for every parameter that changes
-what our messages do, which values are right, and what happens with others.
+"""The tables of an autopilot's parameters: for every parameter that changes what our messages do, which values are
+right, and what happens with others; and the choice of a channel from them.
 
 The rows stand in `ardupilot_parameters` and `px4_parameters`. They serve the flight, which sends nothing while a
-dangerous row is broken, `edgevpr doctor`, and the page docs/reference/parameters.md.
+parameter is not answered or is dangerous, `edgevpr doctor`, and the page docs/reference/parameters.md.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
-from edgevpr.mavlink.channel import OLD_NAMES, Channel, Choice, own_name, read_value
-
-Parameters: TypeAlias = Mapping[str, float]
-FindChanges = Callable[[Parameters, Choice], Iterable[str]]
+from edgevpr.mavlink.channel import OLD_NAMES, Channel, Choice, Kind, Parameters, own_name, read_value
 
 # ARMING_SKIPCHK takes the place of ARMING_CHECK after ArduPilot 4.6: it names the checks to leave out.
 _ALTERNATIVES = {**OLD_NAMES, "ARMING_CHECK": "ARMING_SKIPCHK"}
@@ -20,23 +18,25 @@ MAX_OFFSET_M = 1.0  # of an antenna or a camera: a position that is moved by mor
 MAX_DELAY_MS = 50.0  # we send the position of the moment, so at 25 m/s this is wrong by 1.2 m
 
 
+class Check(NamedTuple):
+    """The `names` of the parameters that `find_changes` reads. It takes all values that were read, and the channel
+    chosen for them, and returns the changes, such as "GPS_PRIMARY=0"; none if the values are right."""
+
+    names: tuple[str, ...]
+    find_changes: Callable[[Parameters, Choice], Iterable[str]]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterRule:
-    """A row of the table.
-    - `label`: the parameters as a pilot looks for them; `names`: those that `find_changes` reads.
-    - `channels`: those that it matters for; `right`: the values that are right, in words.
-    - `is_dangerous`: with a wrong value an aircraft can be lost that would be fine alone, so nothing may be sent. Else
-      a wrong value only makes us useless, or weak. `why`: what happens then, in a sentence.
-    - `find_changes`: takes all values that were read, and the channel chosen for them. Returns the changes, such as
-      "GPS_PRIMARY=0"; none if the values are right."""
+    """A row of a table: its `label`, as a pilot looks for it, the `channels` that it matters for, the values that are
+    `right`, in words, and `why`: what happens with a wrong one, in a sentence."""
 
     label: str
-    names: tuple[str, ...]
     channels: tuple[Channel, ...]
-    right: str
     is_dangerous: bool
+    right: str
+    check: Check
     why: str
-    find_changes: FindChanges
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +56,69 @@ class ParameterFault:
         return f"set {self.changes[0]}{' ...' if self.changes[1:] else ''}"
 
 
-def find_faults(rules: Iterable[ParameterRule], choice: Choice, parameters: Parameters) -> tuple[ParameterFault, ...]:
-    """Return the rules that `parameters` break for the channel of `choice`, the dangerous ones first."""
-    ours = (rule for rule in rules if choice.channel in rule.channels)
-    found = (ParameterFault(rule, tuple(rule.find_changes(parameters, choice))) for rule in ours)
-    return tuple(sorted((fault for fault in found if fault.changes), key=lambda fault: not fault.rule.is_dangerous))
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """A choice, the `missing` parameters without which it cannot be made, and the `faults` of the channel's table rows:
+    if the first is dangerous, nothing is sent."""
+
+    choice: Choice
+    missing: tuple[str, ...] = ()
+    faults: tuple[ParameterFault, ...] = ()
+
+
+@dataclass(frozen=True)
+class ParameterTable:
+    """All about a firmware's parameters: its `name`, the parameters that are `deciding` which channel it is, the
+    `rules` for all, and the function that chooses the channel."""
+
+    name: str
+    deciding: tuple[str, ...]
+    rules: tuple[ParameterRule, ...]
+    choose: Callable[[Kind, Parameters], Choice]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of all parameters, the deciding ones first; of two names of one parameter, the new one."""
+        return self._join(self.rules)
+
+    @cached_property
+    def all_names(self) -> frozenset[str]:
+        """The names of all parameters, and those that they have in other releases."""
+        return frozenset(self.names).union(filter(None, map(name_alternative, self.names)))
+
+    def name_needed(self, choice: Choice) -> tuple[str, ...]:
+        """Return the names of the parameters that must be known before anything is sent by the channel of `choice`."""
+        return self._join(rule for rule in self.rules if choice.channel in rule.channels)
+
+    def find_faults(self, choice: Choice, parameters: Parameters) -> tuple[ParameterFault, ...]:
+        """Return the rules that `parameters` break for the channel of `choice`, the dangerous ones first."""
+        ours = (rule for rule in self.rules if choice.channel in rule.channels)
+        faults = (ParameterFault(rule, tuple(rule.check.find_changes(parameters, choice))) for rule in ours)
+        broken = (fault for fault in faults if fault.changes)
+        return tuple(sorted(broken, key=lambda fault: not fault.rule.is_dangerous))
+
+    def decide(self, kind: Kind, parameters: Parameters, is_known: Callable[[str], bool]) -> Decision:
+        """Choose the channel. `parameters` has the values that were read; `is_known` returns whether a parameter's
+        value was read, or the autopilot is known not to have it."""
+        if missing := tuple(name for name in self.deciding if not is_known(name)):
+            return _wait_for(missing)
+        choice = self.choose(kind, parameters)
+        if missing := tuple(name for name in self.name_needed(choice) if not is_known(name)):
+            return _wait_for(missing)
+        faults = self.find_faults(choice, parameters)
+        if faults and faults[0].rule.is_dangerous:
+            reason = f"not sent: {faults[0].advice}. {faults[0].rule.why}"
+            choice = replace(choice, channel=Channel.NONE, reason=reason)
+        return Decision(choice, (), faults)
+
+    def _join(self, rules: Iterable[ParameterRule]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys((*self.deciding, *(name for rule in rules for name in rule.check.names))))
+
+
+def _wait_for(missing: tuple[str, ...]) -> Decision:
+    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    reason = f"not sent: the autopilot has not answered for {', '.join(missing[:3])}{more}"
+    return Decision(Choice(Channel.NONE, reason), missing)
 
 
 def name_alternative(name: str) -> str | None:
@@ -68,17 +126,45 @@ def name_alternative(name: str) -> str | None:
     return _ALTERNATIVES.get(name)
 
 
-def demand(right: float, *names: str, allows: Callable[[float], bool] | None = None) -> FindChanges:
-    """Return a function that advises NAME=`right` for each of the parameters whose value `allows` refuses (by default
-    any value but `right`). A parameter that the autopilot does not have is right."""
+def dangerous(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
+    """Make a rule for values with which an aircraft can be lost that would be fine alone: nothing may be sent then. The
+    `label` is the name of the first parameter, unless another one is given."""
+    return replace(weak(channels, right, check, why, label), is_dangerous=True)
+
+
+def weak(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
+    """Make a rule for values with which we are only useless, or weak."""
+    label = label or check.names[0]
+    return ParameterRule(label=label, channels=channels, is_dangerous=False, right=right, check=check, why=why)
+
+
+def demand(advised: float, *names: str, allows: Callable[[float], bool] | None = None) -> Check:
+    """Return a check that advises NAME=`advised` for each of the parameters whose value `allows` refuses (by default
+    any but `advised`). A parameter that the autopilot does not have is right."""
 
     def find_changes(parameters: Parameters, _choice: Choice) -> Iterator[str]:
         for name in names:
-            value = read_value(parameters, name, right)
-            if not (value == right if allows is None else allows(value)):
-                yield f"{own_name(parameters, name)}={right:g}"
+            value = read_value(parameters, name, advised)
+            if not (value == advised if allows is None else allows(value)):
+                yield f"{own_name(parameters, name)}={advised:g}"
 
-    return find_changes
+    return Check(names, find_changes)
+
+
+def join_checks(*checks: Check) -> Check:
+    """Join checks to one that advises the changes of all."""
+    names = tuple(name for check in checks for name in check.names)
+    return Check(names, lambda *read: (change for check in checks for change in check.find_changes(*read)))
+
+
+def at_most(limit: float) -> Callable[[float], bool]:
+    """Return a function that allows values up to a limit."""
+    return lambda value: value <= limit
+
+
+def is_small_offset(value_m: float) -> bool:
+    """Return True for a coordinate of an antenna or a camera that does no harm."""
+    return abs(value_m) <= MAX_OFFSET_M
 
 
 def has_bit(value: float, bit: int) -> bool:

@@ -11,12 +11,13 @@ from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import LATE_S, SILENT_AFTER_S, AutopilotClock
+from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Use
-from edgevpr.mavlink.receivers import GPS_REPORTS, Receivers
-from edgevpr.mavlink.vehicle import Attitude, Attitudes, Certainty, Readiness
+from edgevpr.mavlink.receivers import GPS_GONE_AFTER_S, GPS_REPORTS, Receivers
+from edgevpr.mavlink.vehicle import FILTER_FRESH_S, Attitude, Attitudes, Certainty, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
@@ -29,7 +30,8 @@ _MILLI_G_M_S2 = 9.80665e-3
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
 _LATE_FOR_S = 10.0  # after the last one that came too late
-
+_ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
+_ASK_ORIGIN_AGAIN_S = 10.0
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
 
 log = logging.getLogger(__name__)
@@ -47,10 +49,9 @@ class Speaker(NamedTuple):
 
 
 class Identity:
-    """Decides which sender is our autopilot: the first one heard or, with `system_id` set, the first with that system
-    id. A sender with another system id never takes its place; one with the same at another address does so once our
-    autopilot has been silent for 30 s. `kept` is our autopilot (None: not heard yet). `has_moved`: by the last message
-    it is at another address. `foreign_messages` counts the messages of others."""
+    """Decides which sender is our autopilot, `kept`: the first one heard or, with `system_id` set, the first with that
+    system id. A sender with another system id never takes its place; one with the same at another address does so once
+    our autopilot has been silent for 30 s: then it `has_moved`. `foreign_messages` counts the messages of others."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.kept: Speaker | None = None
@@ -97,8 +98,8 @@ class Identity:
 
 
 class Listener:
-    """Base class of an object that navigates by the reports of the autopilot, and gives the positions that a continuous
-    channel sends; this one does nothing. The link's thread calls the methods, which never block and never raise."""
+    """Base class of an object that navigates by the reports of the autopilot, and gives the positions to be sent; this
+    one does nothing. The link's thread calls the methods, which never block and never raise."""
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, has restarted, or that another one has taken its place."""
@@ -127,26 +128,28 @@ class Listener:
 
 class Autopilot:
     """The state of the autopilot and its vehicle, from all messages received, of which `identity` decides whose they
-    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard).
-    `has_restarted`: the last message showed it."""
+    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
 
-    def __init__(self, own_component: int, system_id: int | None, listener: Listener) -> None:
+    def __init__(self, own_component: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.answered_s: dict[int, float] = {}  # when it last answered a command of ours, by the command's number
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
-        self._listener, self._own_component = listener, own_component
+        self._listener, self._own_component, self._announce = listener, own_component, announce
         self.heard_s = -math.inf  # the time of its last heartbeat through the port now open
         self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
-        self.has_restarted = False
+        self.has_restarted = False  # as the message heard last shows
         self._forget()
 
     def _forget(self) -> None:
-        self.interview, self.readiness = Interview(), Readiness()
+        self.interview = Interview(self._announce)
+        self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
+        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # when last heard, or asked
+        self._lacked_origin, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
-        self.attitudes, self.heights, self.certainty = Attitudes(), Heights(), Certainty()
+        self.attitudes, self.heights, self.certainty = Attitudes(), Heights(self._announce), Certainty()
         self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
         self.receivers = Receivers()
@@ -157,14 +160,6 @@ class Autopilot:
     def system_id(self) -> int | None:
         """System id of the autopilot; None until its first heartbeat."""
         return self.identity.kept.system_id if self.identity.kept else None
-
-    def boot_time_s(self, t_mono_s: float) -> float | None:
-        """Return its time since boot at `t_mono_s`, a time of our clock; None: not known (yet)."""
-        return self.clock.boot_time_s(t_mono_s)
-
-    def mono_s(self, boot_s: float) -> float | None:
-        """Return the time of our clock when it had run for `boot_s`; None: not known (yet)."""
-        return self.clock.mono_s(boot_s)
 
     def stamp_s(self, t_mono_s: float) -> float | None:
         """Return `t_mono_s` as a time stamp for it; None: not known yet. A PX4 converts stamps of our clock itself."""
@@ -178,6 +173,29 @@ class Autopilot:
         """Return True if its reports have come too late to be used in the last ten seconds."""
         return now_s - self._late_s <= _LATE_FOR_S
 
+    def asks_origin(self, now_s: float) -> bool:
+        """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
+        if now_s - self._gps_s <= GPS_GONE_AFTER_S or now_s - self._asked_origin_s < _ASK_ORIGIN_AGAIN_S:
+            return False
+        self._lacked_origin, self._asked_origin_s = self._lacks_origin(now_s), now_s
+        return True
+
+    def readiness(self, now_s: float) -> Readiness:
+        """Return what is known of its readiness to accept a fix."""
+        return Readiness(
+            is_px4=self.firmware == mavlink.MAV_AUTOPILOT_PX4,
+            is_armed=self.is_armed,
+            has_gps=now_s - self._gps_s <= GPS_GONE_AFTER_S,
+            lacks_origin=self._lacks_origin(now_s),
+            flags=self._flags if now_s - self._flags_s <= FILTER_FRESH_S else 0,
+            answers_others=bool(self.answered_s.keys() - {POSITION_FIX}),
+        )
+
+    def _lacks_origin(self, now_s: float) -> bool:
+        """Return True if it did not answer the last request for its origin, or that before as long as it may answer."""
+        is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_WITHIN_S
+        return self._origin_s < self._asked_origin_s and is_late
+
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, moved to `t_mono_s`: see `Conversation.vehicle_at`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
@@ -187,13 +205,10 @@ class Autopilot:
             vehicle = replace(vehicle, lat_deg=lat_deg, lon_deg=lon_deg)
         if vehicle is None or attitude is None:
             return vehicle
-        heading_deg = None if vehicle.heading_deg is None else attitude.yaw_deg % 360
+        _, roll_deg, pitch_deg, yaw_deg, tilting_deg_s = attitude
+        heading_deg = None if vehicle.heading_deg is None else yaw_deg % 360
         return replace(
-            vehicle,
-            roll_deg=attitude.roll_deg,
-            pitch_deg=attitude.pitch_deg,
-            tilting_deg_s=attitude.tilting_deg_s,
-            heading_deg=heading_deg,
+            vehicle, roll_deg=roll_deg, pitch_deg=pitch_deg, tilting_deg_s=tilting_deg_s, heading_deg=heading_deg
         )
 
     def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
@@ -216,11 +231,11 @@ class Autopilot:
         self.interview.hear(message)
         if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
             return False
-        self.readiness.hear(message, now_s)
         if kind == "COMMAND_ACK":
             self.answered_s[message.command] = now_s
         if beats:
             self.heard_s, self.firmware = now_s, message.autopilot
+            self.is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         else:
             self._hear_report(message, now_s)
         return beats
@@ -241,7 +256,10 @@ class Autopilot:
                 self.heights.hear(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
                 self.receivers.handle(message, now_s)
+                if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+                    self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
+                self._flags, self._flags_s = message.flags, now_s
                 self.certainty.hear(message, now_s)
                 if name == "ESTIMATOR_STATUS":
                     self.px4.hear(message, now_s, self._receiver(now_s), self._listener.believes_gps())
@@ -251,12 +269,13 @@ class Autopilot:
                 self.attitudes.hear(message, now_s)
             case "SCALED_IMU" if attitude := self.attitudes.at(now_s):
                 self.force_s = now_s
-                nose, right, down = (axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
-                self._listener.hear_force(now_s, (nose, right, down), attitude)
+                force_m_s2 = tuple(axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
+                self._listener.hear_force(now_s, force_m_s2, attitude)
             case "SCALED_PRESSURE" if _LEAST_HPA < message.press_abs < _MOST_HPA:
                 self.pressure_alt_m = 44330.8 * (1 - (message.press_abs / 1013.25) ** 0.190263)
             case "GPS_GLOBAL_ORIGIN":
                 self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                self._origin_s = now_s
 
     def _hear_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
@@ -270,8 +289,7 @@ class Autopilot:
         east_m_s, north_m_s = message.vy / 100, message.vx / 100
         above_sea_m = None if is_nowhere else message.alt / 1e3
         altitudes = Altitudes(now_s, above_sea_m, message.relative_alt / 1e3, -message.vz / 100)
-        may_fly = self.readiness.is_armed is not False  # None: no heartbeat yet
-        self.heights.handle_altitudes(altitudes, may_fly, math.hypot(east_m_s, north_m_s))
+        self.heights.handle_altitudes(altitudes, self.is_armed is not False, math.hypot(east_m_s, north_m_s))
         if is_nowhere:
             self.vehicle = None
             return

@@ -1,9 +1,6 @@
 """Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all behave alike after
-every fault: pymavlink's own connections may spin, hang or raise. Used by `link`, `asking` and the simulated autopilot.
-
-A `Line` is an open port together with the packets written into it. It makes sure that no position fix leaves late from
-a buffer, be it ours or that of the operating system.
-"""
+every fault: pymavlink's own connections may spin, hang or raise. A `Line` is an open port together with the packets
+written into it: no position fix leaves late from a buffer, be it ours or that of the operating system."""
 
 import errno
 import fcntl
@@ -187,9 +184,8 @@ _ADVICE = {  # by error, and whether the link is a serial one
 
 
 def open_port(address: LinkAddress) -> Port:
-    """Open the port of a link. Raises LinkAddressError for an address that is wrong (an unknown host, a file that is no
-    device, the address of a network), LinkError for another fault that the user must correct (a port in use, no
-    permission), and OSError for a fault that may end by itself (no device, no server)."""
+    """Open the port of a link. Raises LinkAddressError for an address that is wrong, LinkError for another fault that
+    the user must correct (a port in use, no permission), and OSError for one that may end by itself (no device)."""
     is_serial = address.kind == "serial"
     try:
         return _OPENERS[address.kind](address.where, address.number)
@@ -209,9 +205,9 @@ def open_port(address: LinkAddress) -> Port:
 
 class Line:
     """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
-    system (over TCP: when the other end has confirmed them). If that has not happened by the fix's `Sending.due_s`,
-    `departed` raises ConnectionError; closing the port then throws the bytes away. `tap` is called with each packet
-    that the port has accepted in full; `unsent` are the bytes of the last packet that it has not accepted yet."""
+    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `departed` raises
+    ConnectionError; closing the port then throws the bytes away. `tap` is called with each packet that the port has
+    accepted in full; `unsent` are the bytes of the last packet that it has not accepted yet."""
 
     def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
         self.port, self._clock, self._tap = port, clock, tap

@@ -51,14 +51,11 @@ log = logging.getLogger(__name__)
 
 class TimeStamps:
     """The largest time stamp ever sent or received, and the last one of every stream (the messages of one sender with
-    one link id). Any thread may call it.
-
-    The largest is kept in the file `path`, since a board without a clock chip starts with an old time. It is written at
-    the start, which raises ConfigError if the file is damaged or cannot be made, and from then on every half minute.
+    one link id). Any thread may call it. The largest is kept in the file `path`, since a board without a clock chip
+    starts with an old time: it is written at the start (raises ConfigError), and then every half minute.
 
     With `is_kept` False the file is only read, for a program that asks before the flight: that may run as root, and the
-    service could not overwrite a file of root. It ends within the minute that an autopilot lets a new stream be late.
-    """
+    service could not overwrite a file of root."""
 
     def __init__(
         self, path: Path, mono_s: Clock = time.monotonic, utc_s: Clock = time.time, is_kept: bool = True
@@ -78,11 +75,9 @@ class TimeStamps:
             return min(self._largest, _LATEST)
 
     def refusal(self, stream: Stream, stamp: int) -> str | None:
-        """Return in a few words why a message with this time stamp is refused, or None if it is admitted; its time
-        stamp is then kept, so the signature must be right.
-
-        Time stamps of a stream must increase. The first of a new stream must be within a minute of the largest, but the
-        very first stream may be ahead by any time: so a board without a clock chip learns the time.
+        """Return why a message with this time stamp is refused, or None if it is admitted; its time stamp is then kept,
+        so the signature must be right. Time stamps of a stream must increase. The first of a new stream must be within
+        a minute of the largest, but the very first stream may be ahead: a board without a clock chip learns the time.
         """
         with self._lock:
             now = max(self._largest, self._now())
@@ -129,8 +124,8 @@ class TimeStamps:
 
 class Signing:
     """Signs the messages that one link sends, and admits those received that are signed with the same key and not older
-    than earlier ones. `refused` counts the others by reason; each reason is logged once. Without a key (no `stamps`)
-    nothing is signed, and every message is admitted."""
+    than earlier ones. `refused` counts the others by reason. Without a key (no `stamps`) nothing is signed, and every
+    message is admitted."""
 
     def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()

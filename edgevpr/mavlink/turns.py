@@ -1,4 +1,4 @@
-"""Turns: the times in which one thread uses a conversation alone, while its clock stands still. They go to the tape."""
+"""Turns: one thread at a time uses a conversation, while its clock stands still. They go to the tape."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -42,8 +42,8 @@ class Turns:
 
     @contextmanager
     def of_link(self, name: str) -> Iterator[Callable[..., None]]:
-        """Context manager: take a turn in the thread of the link `name`. It yields a function `step(event, *values)`
-        that notes what happens in the turn, such as `step("heard", data)`. All steps go to the tape as one record."""
+        """Context manager: take a turn in the thread of the link `name`. It yields a function that notes a step of the
+        turn, such as `step("heard", data)`; all go to the tape as one record."""
         steps: list[tuple[Any, ...]] = []
         with self._lock:
             t_s = self._clock()

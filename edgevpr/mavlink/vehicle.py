@@ -3,27 +3,21 @@ and the autopilot's readiness to accept a fix, with the likely reasons for its a
 code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from edgevpr.core.geodesy import shorter_deg
-from edgevpr.mavlink.messages import POSITION_FIX
-from edgevpr.mavlink.receivers import GPS_GONE_AFTER_S, GPS_REPORTS
 from edgevpr.mavlink.wire import Message, mavlink
 
 _KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
 _MOST_KEPT = 200
-_NEAR_S = 0.3  # an attitude that is farther from the time of a frame is not used for it
+_NEAR_S = 0.3  # from an attitude to the time of a frame that it is used for
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
-_FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
-_ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
-_ASK_ORIGIN_AGAIN_S = 10.0
+FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
 
-# ArduPilot: EKF_STATUS_REPORT. PX4: ESTIMATOR_STATUS. The flags have the same values. An ArduPilot that
-# dead-reckons reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
-FILTER_REPORTS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
+# Flags of EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4), which are the same. An ArduPilot that dead-reckons
+# reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 
@@ -39,7 +33,7 @@ class Attitude(NamedTuple):
 
 
 class Attitudes:
-    """The attitudes of the last three seconds. One thread adds to them, and any thread may read them."""
+    """The attitudes of the last three seconds."""
 
     def __init__(self) -> None:
         self._kept: tuple[Attitude, ...] = ()
@@ -65,15 +59,13 @@ class Attitudes:
         step_s = after.t_s - before.t_s
         changed_deg = [shorter_deg(other - one) for one, other in zip(before[1:4], after[1:4], strict=True)]
         share = (t_s - before.t_s) / step_s
-        roll_deg, pitch_deg, yaw_deg = (
-            one + share * change for one, change in zip(before[1:4], changed_deg, strict=True)
-        )
-        return Attitude(t_s, roll_deg, pitch_deg, yaw_deg, math.hypot(*changed_deg[:2]) / step_s)
+        roll, pitch, yaw = (one + share * change for one, change in zip(before[1:4], changed_deg, strict=True))
+        return Attitude(t_s, roll, pitch, yaw, math.hypot(*changed_deg[:2]) / step_s)
 
 
 class Certainty:
-    """Estimates how accurate the autopilot's own position is, as the standard deviation of one axis: what its filter
-    reports (PX4) or, without that, what it was when last known, growing by DRIFT_M_S a second."""
+    """Estimates the standard deviation of one axis of the autopilot's own position: what its filter reports (PX4) or,
+    without that, what it was when last known, growing by DRIFT_M_S a second."""
 
     def __init__(self) -> None:
         self._known: tuple[float, float] | None = None  # standard deviation, time
@@ -81,7 +73,7 @@ class Certainty:
         self._ratio: tuple[float, float] | None = None  # innovation of measured positions over the filter's gate, time
 
     def hear(self, message: Message, now_s: float) -> None:
-        """Process a report of the autopilot's position filter, one of the `FILTER_REPORTS`."""
+        """Process a report of the autopilot's position filter: EKF_STATUS_REPORT or ESTIMATOR_STATUS."""
         is_px4 = message.get_type() == "ESTIMATOR_STATUS"
         self._ratio = (message.pos_horiz_ratio if is_px4 else message.pos_horiz_variance), now_s
         # PX4 calls it constant too while it stands still with GPS.
@@ -95,7 +87,7 @@ class Certainty:
 
     def innovation_ratio(self, now_s: float) -> float | None:
         """Return the newest ratio of the innovation of measured positions to the filter's gate; None if it is old."""
-        return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= _FILTER_FRESH_S else None
+        return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= FILTER_FRESH_S else None
 
     def note_known(self, sd_m: float, now_s: float) -> None:
         """Note that at `now_s` the position is known this well, by GPS or by an accepted fix of ours."""
@@ -103,84 +95,47 @@ class Certainty:
 
     def now(self, now_s: float) -> float | None:
         """Return the standard deviation in metres; None if it is unknown, or the autopilot has no position."""
-        if self._own and now_s - self._own[1] <= _FILTER_FRESH_S:
+        if self._own and now_s - self._own[1] <= FILTER_FRESH_S:
             return self._own[0]
         return math.hypot(self._known[0], DRIFT_M_S * (now_s - self._known[1])) if self._known else None
 
 
-@dataclass(slots=True, kw_only=True)
-class Readiness:
-    """The autopilot's readiness to accept a fix; None: unknown. Fields that end in `_s` are the time at which something
-    was last received (-inf: never). `answers_others`: it has answered another of our commands than a fix. `asked_s` is
-    when its origin was last requested, `lacked_origin` the result of `lacks_origin` just before that."""
+class Readiness(NamedTuple):
+    """What is known of an autopilot's readiness to accept a fix. `has_gps`: a receiver has lately had a 3D fix.
+    `lacks_origin`: it has not answered when asked for its origin. `flags`: those of its filter, 0 if none are fresh."""
 
     is_px4: bool = False
-    is_armed: bool | None = None
-    answers_others: bool = False
-    flags: int = 0  # of EKF_STATUS_REPORT or ESTIMATOR_STATUS
-    flags_s: float = -math.inf
-    gps_s: float = -math.inf  # when one of its receivers had a 3D fix
-    origin_s: float = -math.inf
-    asked_s: float = -math.inf
-    lacked_origin: bool = False
+    is_armed: bool | None = None  # None: unknown
+    has_gps: bool = False
+    lacks_origin: bool = False
+    flags: int = 0
+    answers_others: bool = False  # our commands that are no fixes
 
-    def hear(self, message: Message, now_s: float) -> None:
-        """Process a message of the autopilot, of any kind."""
-        kind = message.get_type()
-        if kind == "HEARTBEAT":
-            self.is_px4 = message.autopilot == mavlink.MAV_AUTOPILOT_PX4
-            self.is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        elif kind in GPS_REPORTS and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
-            self.gps_s = now_s
-        elif kind in FILTER_REPORTS:
-            self.flags, self.flags_s = message.flags, now_s
-        elif kind == "GPS_GLOBAL_ORIGIN":
-            self.origin_s = now_s
-        elif kind == "COMMAND_ACK" and message.command != POSITION_FIX:
-            self.answers_others = True
-
-    def has_gps(self, now_s: float) -> bool:
-        """Return True if a GPS receiver of the autopilot has lately reported a 3D fix."""
-        return now_s - self.gps_s <= GPS_GONE_AFTER_S
-
-    def lacks_origin(self, now_s: float) -> bool:
-        """Return True if the autopilot did not answer a request for its origin within two seconds."""
-        if self.origin_s >= self.asked_s:
-            return False
-        return self.lacked_origin or now_s - self.asked_s > _ORIGIN_WITHIN_S
-
-    def asks_origin(self, now_s: float) -> bool:
-        """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
-        if self.has_gps(now_s) or now_s - self.asked_s < _ASK_ORIGIN_AGAIN_S:
-            return False
-        self.lacked_origin, self.asked_s = self.lacks_origin(now_s), now_s
-        return True
-
-    def why(self, result: str, now_s: float) -> "Reason":
-        """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
-        if result == "FAILED":
-            return self._why_failed(now_s)
-        if result == "TEMPORARILY_REJECTED":
-            return GPS_IN_USE if self.has_gps(now_s) else OTHER_AID if self.is_px4 else UNKNOWN
-        known = {"ACCEPTED": TAKEN, "DENIED": WRONG_FORM, "UNSUPPORTED": NO_COMMAND}
-        return known.get(result) or Reason("see its log", f"it answers {result}")
-
+    @property
     def why_silent(self) -> "Reason":
+        """The likely reason why it does not answer fixes."""
         return FIXES_NOT_ANSWERED if self.answers_others else NO_COMMAND_ANSWERED
 
-    def _why_failed(self, now_s: float) -> "Reason":
+    def why(self, result: str) -> "Reason":
+        """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
+        if result == "FAILED":
+            return self._why_failed()
+        if result == "TEMPORARILY_REJECTED":
+            return GPS_IN_USE if self.has_gps else OTHER_AID if self.is_px4 else UNKNOWN
+        reasons = {"ACCEPTED": TAKEN, "DENIED": WRONG_FORM, "UNSUPPORTED": NO_COMMAND}
+        return reasons.get(result) or Reason("see its log", f"it answers {result}")
+
+    def _why_failed(self) -> "Reason":
         """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
-        has_gps, lacks_origin = self.has_gps(now_s), self.lacks_origin(now_s)
         # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
         if self.is_px4:
-            return NO_ORIGIN if lacks_origin else NOT_PLAUSIBLE
-        flags = self.flags if now_s - self.flags_s <= _FILTER_FRESH_S else 0
+            return NO_ORIGIN if self.lacks_origin else NOT_PLAUSIBLE
         causes = {
-            NO_ORIGIN: lacks_origin and not has_gps,
-            NOT_STARTED: flags & mavlink.EKF_UNINITIALIZED,
-            GPS_IN_USE: has_gps,
+            NO_ORIGIN: self.lacks_origin and not self.has_gps,
+            NOT_STARTED: self.flags & mavlink.EKF_UNINITIALIZED,
+            GPS_IN_USE: self.has_gps,
             NOT_ARMED: self.is_armed is False,
-            NOT_RECKONING: flags & mavlink.EKF_CONST_POS_MODE,
+            NOT_RECKONING: self.flags & mavlink.EKF_CONST_POS_MODE,
         }
         return next((reason for reason, is_there in causes.items() if is_there), UNKNOWN)
 
@@ -193,35 +148,21 @@ class Reason(NamedTuple):
     sentence: str
 
 
+# fmt: off
 TAKEN = Reason("", "it takes them")
 GPS_IN_USE = Reason("GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position")
 NOT_STARTED = Reason("filter not started", "its position filter has not started: a plane starts it with GPS only")
-NO_ORIGIN = Reason(
-    "no origin",
-    "it gives no origin when asked for it: it must have had GPS once, or be sent SET_GPS_GLOBAL_ORIGIN, before it can "
-    "know any position",
-)
+NO_ORIGIN = Reason("no origin", "it gives no origin when asked: it must have had GPS once, or be sent one")
 NOT_ARMED = Reason("not armed", "it is not armed: on the ground it reckons no position that a fix could correct")
-NOT_RECKONING = Reason(
-    "nothing to reckon by",
-    "it reckons no position that a fix could correct: it has neither GPS nor airspeed, optical flow or vision",
-)
+NOT_RECKONING = Reason("nothing to reckon by", "it reckons no position, with neither GPS, airspeed, flow nor vision")
 OTHER_AID = Reason("not dead reckoning", "it takes a fix only while it reckons its position without any aid")
 NOT_PLAUSIBLE = Reason("fix not plausible", "it reckons its position, and the fix does not fit, or it has no origin")
-UNKNOWN = Reason(
-    "see its log", "its GPS was in use a moment ago, it has no origin, or it has nothing to reckon by: it does not say"
-)
+UNKNOWN = Reason("see its log", "it does not say: GPS just in use, no origin, or nothing to reckon by")
 WRONG_FORM = Reason("wrong form", "it does not like their form")
-NO_COMMAND = Reason(
-    "43003 not known", "its firmware does not know command 43003, or was built without it, as for boards of 1 MB"
-)
-NO_COMMAND_ANSWERED = Reason(
-    "signing? system id?",
-    "it answers no command at all of this companion: does its port take signed messages only, does another vehicle "
-    "have its system id, or does the line carry nothing towards it?",
-)
-FIXES_NOT_ANSWERED = Reason(
-    "no command 43003?",
-    "it answers other commands: is its firmware built without command 43003, or does another program have our "
-    "component id?",
-)
+NO_COMMAND = Reason("43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB")
+NO_COMMAND_ANSWERED = Reason("signing? system id?",
+    "it answers no command of ours: does its port take signed messages only, does another vehicle have its system id, "
+    "or does the line carry nothing towards it?")
+FIXES_NOT_ANSWERED = Reason("no command 43003?",
+    "it answers other commands: is its firmware built without 43003, or does another program have our component id?")
+# fmt: on

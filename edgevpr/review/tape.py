@@ -51,7 +51,7 @@ class ReplayedLink(Link):
     def close(self) -> None:
         """Send waiting texts without delay; all else that closing does is on the tape."""
         with self.turn("close"):
-            self._conversation.texts.hurry()
+            self.conversation.texts.hurry()
 
     def _ring(self) -> None:
         if not self._playback.is_exact:
@@ -59,19 +59,19 @@ class ReplayedLink(Link):
                 self._send_all()
 
     def _send_all(self) -> None:
-        while chosen := self._conversation.next_packet():
+        while chosen := self.conversation.next_packet():
             if sending := chosen[1]:
                 sending.settle(True)
-                self._conversation.note_departed([sending])
+                self.conversation.note_departed([sending])
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
         """Repeat the `steps` of a turn at the time `t_s`, as `Link` wrote them on the tape."""
-        with self._turns.again(t_s):
+        with self.turns.again(t_s):
             for step in steps:
                 self._repeat(step, t_s)
 
     def _repeat(self, step: Note, now_s: float) -> None:
-        conversation = self._conversation
+        conversation = self.conversation
         match step:
             case ["waits"]:
                 conversation.fixes.drop_stale(now_s)

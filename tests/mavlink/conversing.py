@@ -2,16 +2,53 @@
 
 import math
 import struct
+from dataclasses import replace
 
 from fakes import FakeClock
 
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
-from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.messages import Fix, MotionState
+from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 ABS = mavlink.EKF_POS_HORIZ_ABS
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
+
+
+STATE = MotionState(
+    t_mono_s=0.0,
+    lat_deg=47.0,
+    lon_deg=8.0,
+    alt_m=500.0,
+    velocity_m_s=(1.0, 2.0, 0.0),
+    accuracy_m=3.0,
+    alt_accuracy_m=3.0,
+    speed_accuracy_m_s=0.5,
+    attitude=(0.0, 0.0, 0.5),
+)
+
+
+class Ear(Listener):
+    """Counts autopilots, notes channels and forces, and gives a `state` and a fix `between` matches."""
+
+    def __init__(self):
+        self.autopilots, self.channels, self.forces, self.state, self.between = 0, [], [], STATE, None
+
+    def hear_autopilot(self, t_s):
+        self.autopilots += 1
+
+    def hear_channel(self, channel):
+        self.channels.append(channel)
+
+    def hear_force(self, t_s, force_m_s2, attitude):
+        self.forces.append((force_m_s2, attitude.roll_deg))
+
+    def state_at(self, t_s):
+        return self.state and replace(self.state, t_mono_s=t_s)
+
+    def fix_between(self, now_s):
+        return self.between and replace(self.between, t_frame_s=now_s)
 
 
 class Autopilot:

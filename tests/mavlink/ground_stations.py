@@ -101,18 +101,11 @@ class Station:
         self._process.stdin.close()
         self._process.stdout.close()
 
-    def ask(self, line: str) -> None:
-        """Type a line."""
-        self._process.stdin.write(f"{line}\n")
-        self._process.stdin.flush()
-
-    def wait_for(self, *words: str, ask: str | None = None) -> str:
-        """Wait for a line with all these words, and return it. `ask` is typed again and again meanwhile."""
+    def wait_for(self, *words: str) -> str:
+        """Wait for a line with all these words, and return it."""
 
         def found():
             assert self._process.poll() is None, f"it has ended:\n{''.join(self.said)}"
-            if ask:
-                self.ask(ask)
             return next((line for line in self.said if all(word in line for word in words)), None)
 
         try:
@@ -125,21 +118,10 @@ class Station:
         return self._process.wait(PATIENCE_S)
 
 
-def mavsdk(port: int, folder: Path) -> Station:
-    """Start MAVSDK, as `mavsdk_watch` says."""
-    _need("mavsdk")
-    return Station([str(Path(__file__).with_name("mavsdk_watch.py")), str(port)], folder)
-
-
 def mavsdk_example(port: int, folder: Path) -> Station:
     """Start the example of MAVSDK beside edgevpr."""
     _need("mavsdk")
     return Station([str(Path(__file__).parents[2] / "examples" / "mavsdk_beside.py"), str(port)], folder)
-
-
-def mavproxy(port: int, folder: Path) -> Station:
-    """Start MAVProxy without windows; it takes its usual commands."""
-    return mavproxy_with(folder, f"--master=udpin:127.0.0.1:{port}")
 
 
 def mavproxy_with(folder: Path, *flags: str) -> Station:

@@ -56,7 +56,7 @@ class Peer:
         """Answer a TIMESYNC, without which no fix leaves."""
 
         def is_known() -> bool:
-            return link._conversation.autopilot.stamp_s(0.0) is not None
+            return link.conversation.autopilot.stamp_s(0.0) is not None
 
         while not is_known() and not self._timesyncs:
             self.read()

@@ -1,14 +1,12 @@
 """Questions to an autopilot over a real UDP link: answered, lost, refused, signed, and never answered."""
 
-import socket
-
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
 from mavlink_peers import SerialCable, free_port
 
-from edgevpr.core.errors import LinkAddressError, LinkError
+from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import asking as module
-from edgevpr.mavlink.address import LinkAddress, parse_link
+from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
@@ -75,14 +73,6 @@ def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, mo
     assert [m.param_id for m in peer.heard if m.get_type() == "PARAM_REQUEST_READ"] == ["A", "B", "A", "A"]
 
 
-def test_px4_packs_whole_numbers_into_the_bytes_of_a_float(address):
-    said, _ = read(address, ["EKF2_AGP0_CTRL", "MAV_1_RATE", "EKF2_AGP0_DELAY"], firmware=mavlink.MAV_AUTOPILOT_PX4,
-                   messages=healthy_messages((1, 17, 0), mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
-                   parameters={"EKF2_AGP0_CTRL": 1, "MAV_1_RATE": -1, "EKF2_AGP0_DELAY": 300.0})  # fmt: skip
-    assert said.firmware == "px4"
-    assert said.parameters == {"EKF2_AGP0_CTRL": 1, "MAV_1_RATE": -1, "EKF2_AGP0_DELAY": 300.0}
-
-
 @pytest.mark.parametrize("key", [None, bytes(32)])
 def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_signs(address, monkeypatch, key):
     monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.1)
@@ -104,27 +94,6 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
         assert asking.others == {3}
         assert asking.heard.keys() == {"HEARTBEAT"}
     assert {message.get_srcSystem() for message in other.heard} <= {4}
-
-
-def test_a_serial_cable_is_a_link_too(tmp_path):
-    cable = SerialCable(tmp_path)
-    cable.plug()
-    answers = {"messages": healthy_messages(), "parameters": {"GPS1_TYPE": 14}}
-    with (
-        AnsweringAutopilot(tmp_path / "b", **answers),
-        Inquiry(LinkAddress("serial", str(tmp_path / "a"), 115_200)) as asking,
-    ):
-        said = read_autopilot(asking, {"ardupilot": ["GPS1_TYPE"]})
-    cable.unplug()
-    assert (said.version, said.parameters) == ((4, 7, 0), {"GPS1_TYPE": 14})
-
-
-def test_what_cannot_be_opened_is_a_sentence():
-    server = LinkAddress("tcp", "127.0.0.1", free_port(socket.SOCK_STREAM))
-    with pytest.raises(LinkError, match="refused"):
-        Inquiry(server)
-    with pytest.raises(LinkAddressError, match="no host"):
-        Inquiry(parse_link("udpout:no-such-host.invalid:14550"))
 
 
 def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):

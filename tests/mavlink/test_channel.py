@@ -1,83 +1,40 @@
 """The channel by which an autopilot is told positions: asked for, chosen, and used."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from conversing import Autopilot
+from conversing import STATE, Autopilot, Ear
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
 from edgevpr.lab.simulate.firmware import PX4 as PX4_PARAMETERS
-from edgevpr.mavlink.channel import Channel, Kind, ardupilot_choice, px4_choice
-from edgevpr.mavlink.messages import Fix, MotionState
-from edgevpr.mavlink.peer import Listener
+from edgevpr.mavlink.ardupilot_parameters import choose_ardupilot_channel
+from edgevpr.mavlink.channel import Channel, Kind
+from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.px4_parameters import choose_px4_channel
 from edgevpr.mavlink.wire import mavlink
 
 ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
-STATE = MotionState(
-    t_mono_s=0.0,
-    lat_deg=47.0,
-    lon_deg=8.0,
-    alt_m=500.0,
-    velocity_m_s=(1.0, 2.0, 0.0),
-    accuracy_m=3.0,
-    alt_accuracy_m=3.0,
-    speed_accuracy_m_s=0.5,
-    attitude=(0.0, 0.0, 0.5),
-)
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameters", "channel"),
-    [
-        (Kind.PLANE, {}, Channel.COMMAND),
-        (Kind.PLANE, {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "VISO_TYPE": 0}, Channel.COMMAND),
-        (Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14}, Channel.GPS_INPUT),
-        (Kind.COPTER, {"GPS_TYPE": 14}, Channel.GPS_INPUT),
-        (Kind.COPTER, {"GPS1_TYPE": 1, "VISO_TYPE": 1}, Channel.ODOMETRY),
-        (Kind.ROVER, {"GPS1_TYPE": 1, "VISO_TYPE": 2}, Channel.COMMAND),
-    ],
-)
-def test_an_ardupilot_gets_what_its_operator_has_set_up_else_single_fixes(kind, parameters, channel):
-    assert ardupilot_choice(kind, parameters).channel is channel
 
 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
-    second = ardupilot_choice(Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
+    second = choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
     assert (second.receiver, second.lag_s) == (1, 0.2)
-    assert "GPS2_TYPE=14" in ardupilot_choice(Kind.COPTER, {"GPS1_TYPE": 1}).reason, "what to set up"
-    first = ardupilot_choice(Kind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
+    assert "GPS2_TYPE=14" in choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1}).reason, "what to set up"
+    first = choose_ardupilot_channel(Kind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
     assert (first.receiver, first.lag_s) == (0, 0.06)
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
-    assert px4_choice(Kind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
-    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
-    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
-    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
-    assert px4_choice(Kind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
-    assert px4_choice(Kind.PLANE, {}).channel is Channel.COMMAND
-
-
-class Ear(Listener):
-    def __init__(self):
-        self.channels, self.forces, self.state, self.between = [], [], STATE, None
-
-    def hear_channel(self, channel):
-        self.channels.append(channel)
-
-    def hear_force(self, t_s, force_m_s2, attitude):
-        self.forces.append((force_m_s2, attitude.roll_deg))
-
-    def state_at(self, t_s):
-        return self.state
-
-    def fix_between(self, now_s):
-        return self.between and replace(self.between, t_frame_s=now_s)
+    assert choose_px4_channel(Kind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
+    assert choose_px4_channel(Kind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
+    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
+    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
+    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
+    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
+    assert choose_px4_channel(Kind.PLANE, {}).channel is Channel.COMMAND
 
 
 def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
@@ -209,15 +166,6 @@ def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position
 ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
-def test_what_a_px4_uses_of_ours_is_counted_by_its_reports():
-    autopilot, _ = interviewed(PX4)
-    assert autopilot.conversation.autopilot.px4.used_share is None
-    for flags in (GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL | FUSES, GLOBAL):
-        sent(autopilot, "GLOBAL_POSITION_SENSOR", 0.5)
-        autopilot.px4_filter(2.0, flags)
-    assert autopilot.conversation.autopilot.px4.used_share == 0.75
-
-
 def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
     """With EKF2_GPS_CTRL=0 the receiver goes on, near where the aircraft is."""
     autopilot, ear = interviewed(PX4)
@@ -239,26 +187,6 @@ def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
     ear.state = STATE
     sent(autopilot, "GLOBAL_POSITION_SENSOR")
     assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
-
-
-def test_a_px4_is_left_to_a_receiver_whose_velocity_it_takes():
-    """It does not reset to GPS while positions of ours are active, so they have to stop first."""
-    autopilot, _ = interviewed(PX4, EKF2_AGP0_CTRL=1)
-
-    def has_gps_after(seconds, flags, vel_ratio, sends):
-        for _ in range(round(seconds * 5)):
-            sent(autopilot, "GLOBAL_POSITION_SENSOR", 0.2) if sends else autopilot.wait(0.2)
-            autopilot.beat()
-            autopilot.gps(h_acc=800)
-            autopilot.px4_filter(2.0, flags, vel_ratio=vel_ratio)
-        return autopilot.position().has_gps
-
-    assert not has_gps_after(5, GLOBAL | FUSES, math.nan, sends=True), "what it fuses is ours"
-    assert has_gps_after(2, GLOBAL | FUSES, 0.1, sends=True)
-    assert has_gps_after(5, GLOBAL | FUSES, 0.1, sends=False)
-    assert not has_gps_after(6, GLOBAL, 0.1, sends=False), "it does not take its position after all"
-    assert not has_gps_after(10, GLOBAL | FUSES, 0.1, sends=True), "another try waits"
-    assert has_gps_after(30, GLOBAL | FUSES, 0.1, sends=True)
 
 
 def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():

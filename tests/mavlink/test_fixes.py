@@ -1,19 +1,15 @@
-"""Which fix an answer belongs to, what becomes of those without one, and what is said of both: five without an answer
-stop the sending, one now and then asks again."""
+"""Which fix an answer belongs to, why one is refused, what becomes of those without one, and what is said of all."""
 
 import logging
 import math
-import socket
-from contextlib import closing
 
 import pytest
 from conversing import FIX_3D
-from mavlink_peers import Peer, TcpServer, free_port, link_to, wait_until
 
 from edgevpr.mavlink import vehicle as reasons
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
-from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.vehicle import GPS_IN_USE, Readiness
+from edgevpr.mavlink.messages import TEXT_BYTES, Fix
+from edgevpr.mavlink.vehicle import GPS_IN_USE, Readiness, Reason
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
@@ -38,7 +34,7 @@ def sent(fixes, *times_s):
 
 def hear(fixes, result, t_s):
     """Let an autopilot that has GPS answer."""
-    return fixes.hear(result, Readiness(gps_s=t_s).why(result, t_s), t_s)
+    return fixes.hear(result, Readiness(has_gps=True).why(result), t_s)
 
 
 def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
@@ -88,15 +84,19 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
     assert fixes.t_fix_s == 15.0
 
 
-def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop(fixes):
+def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop():
+    reports = []
+    fixes = Fixes(announce=lambda *report: reports.append(report))
     sent(fixes, 0, 1, 2, 3, 4)
     fixes.note_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
-    assert fixes.news(reasons.NO_COMMAND_ANSWERED, 8.5)
+    fixes.report_silence(reasons.NO_COMMAND_ANSWERED, 8.5)
     sent(fixes, 17.5)
     fixes.note_lost(2)
-    assert (fixes.why_not(20.0), fixes.news(reasons.NO_COMMAND_ANSWERED, 20.0)) == (UNANSWERED, [])
+    fixes.report_silence(reasons.NO_COMMAND_ANSWERED, 20.0)
+    assert fixes.why_not(20.0) == UNANSWERED
+    assert [text for _, text, _ in reports] == ["fixes unanswered: signing? system id?"]
 
 
 def fly(autopilot, count, every_s=1.0):
@@ -114,16 +114,6 @@ def test_five_unanswered_fixes_stop_the_sending_and_one_in_ten_seconds_asks_agai
     assert [number for number, sending in enumerate(sendings) if sending.sent] == [0, 1, 2, 3, 4, 14, 24, 34]
     assert {sending.why for sending in sendings if not sending.sent} == {UNANSWERED}
     assert (autopilot.conversation.sent["COMMAND_INT"], autopilot.conversation.fixes.withheld) == (8, 32)
-
-
-def test_the_stop_and_the_recovery_are_said_once_each(autopilot, caplog):
-    fly(autopilot, 30)
-    assert [text for _, text in autopilot.texts()] == ["edgevpr: fixes unanswered: signing? system id?"]
-    autopilot.answer(ACCEPTED)
-    autopilot.wait(5.0)
-    assert [text for _, text in autopilot.texts()] == ["edgevpr: fixes are answered again"]
-    assert caplog.text.count("five fixes") == caplog.text.count("answered again") == 1
-    assert [sending.sent for sending in fly(autopilot, 7)] == [True] * 5 + [False] * 2
 
 
 def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(autopilot):
@@ -203,25 +193,37 @@ def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilo
     assert autopilot.texts() == [(4, f"edgevpr: fixes unanswered: {text}")]
 
 
-def beat(link, peer):
-    before = link.stats().received.get("HEARTBEAT", 0)
-    peer.heartbeat()
-    wait_until(lambda: link.stats().received.get("HEARTBEAT", 0) > before and link.listens())
+CONST, UNINITIALIZED = {"flags": mavlink.EKF_CONST_POS_MODE}, {"flags": mavlink.EKF_UNINITIALIZED}
+REJECTED = "TEMPORARILY_REJECTED"
 
 
-@pytest.mark.network
-def test_a_link_that_is_lost_and_a_flight_that_ends_take_the_answers_along(clock):
-    number = free_port(socket.SOCK_STREAM)
-    with closing(TcpServer(number)) as server:
-        with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
-            for how in ("lost", "closed"):
-                peer = Peer(server.accept(), 7)
-                beat(link, peer)
-                sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
-                peer.expect("COMMAND_INT")
-                sending.wait(60)
-                if how == "lost":
-                    peer.port.close()
-                    wait_until(lambda: sending.outcome)  # noqa: B023
-                    assert sending.outcome == FixAnswer(None, "the link was lost before its answer came", None)
-        assert sending.outcome == FixAnswer(None, "the flight ended before its answer came", None)
+@pytest.mark.parametrize(
+    ("result", "state", "reason"),
+    [
+        ("FAILED", {}, reasons.UNKNOWN),
+        ("FAILED", {"has_gps": True, "is_armed": False}, reasons.GPS_IN_USE),
+        ("FAILED", {"lacks_origin": True, "is_armed": False}, reasons.NO_ORIGIN),
+        ("FAILED", {"is_armed": False, **CONST}, reasons.NOT_ARMED),
+        ("FAILED", {"is_armed": True, **CONST}, reasons.NOT_RECKONING),
+        ("FAILED", {"has_gps": True, **UNINITIALIZED}, reasons.NOT_STARTED),
+        ("FAILED", {"lacks_origin": True, **UNINITIALIZED}, reasons.NO_ORIGIN),
+        ("FAILED", {"lacks_origin": True, "has_gps": True}, reasons.GPS_IN_USE),
+        ("FAILED", {"is_px4": True, **UNINITIALIZED}, reasons.NOT_PLAUSIBLE),
+        ("FAILED", {"is_px4": True, "lacks_origin": True}, reasons.NO_ORIGIN),
+        ("ACCEPTED", {}, reasons.TAKEN),
+        ("DENIED", {"has_gps": True}, reasons.WRONG_FORM),
+        ("UNSUPPORTED", {}, reasons.NO_COMMAND),
+        (REJECTED, {"is_px4": True, "has_gps": True}, reasons.GPS_IN_USE),
+        (REJECTED, {"is_px4": True}, reasons.OTHER_AID),
+        (REJECTED, {}, reasons.UNKNOWN),
+        ("99", {}, Reason("see its log", "it answers 99")),
+    ],
+)
+def test_why_returns_the_first_reason_that_applies(result, state, reason):
+    assert Readiness(**state).why(result) == reason
+
+
+def test_every_reason_fits_a_status_text():
+    known = [each for each in vars(reasons).values() if isinstance(each, Reason)]
+    assert len(known) > 10
+    assert all(len(f"edgevpr: fixes unanswered: {each.brief}".encode()) <= TEXT_BYTES for each in known)

@@ -5,10 +5,8 @@ from contextlib import closing
 import pytest
 from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.address import LinkAddress, parse_link
-from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.groundlink import GroundLink
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import (
     Fix,
     Health,
@@ -59,19 +57,6 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     assert [message.get_type() for message in station.expect_text("end")] == mirrored
     names = [message.get_type() for message in autopilot.expect_text("end")]
     assert names.count("COMMAND_INT") == 1
-
-
-def test_the_ground_hears_texts_while_the_flight_controller_s_cable_is_out(clock, tmp_path):
-    with closing(UdpPort()) as port:
-        flight = Link(LinkAddress("serial", str(tmp_path / "absent"), 57_600), LinkSettings(clock=clock))
-        with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight):
-            station = Peer(port, system_id=255)
-            flight.announce(Severity.WARNING, "link lost", "link")
-            station.expect_text("edgevpr: link lost")
-            assert not flight.stats().connected
-            clock.now_s += 6.0
-            flight.announce(Severity.INFO, "link back", "link")
-            station.expect_text("edgevpr: link back")
 
 
 def test_both_ends_hear_the_same_vehicle_component_and_health(two, clock):

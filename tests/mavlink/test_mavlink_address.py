@@ -3,7 +3,6 @@ import socket
 
 import pytest
 
-from edgevpr.cli.main import main
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
 from edgevpr.mavlink.ports import open_port
@@ -68,11 +67,6 @@ def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
     with pytest.raises(LinkAddressError) as caught:
         open_port(parse_link(link))
     assert caught.value.exit_code == 2
-
-
-def test_an_empty_link_is_refused_and_not_taken_for_none(tmp_path, capsys):
-    assert main(["run", "--source", str(tmp_path), "--map", "no.gpkg", "--link", ""]) == 2
-    assert "'' is no" in capsys.readouterr().err
 
 
 def test_what_may_end_by_itself_is_no_wrong_request():

@@ -1,4 +1,4 @@
-"""No fix leaves a buffer late, be it the link's, the system's or the serial driver's."""
+"""Links that are held up, cut or pulled out: no fix leaves a buffer late, and a device that comes back is opened."""
 
 import os
 import pty
@@ -9,7 +9,8 @@ import tty
 from contextlib import closing
 
 import pytest
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
+import serial
+from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, free_port, link_to, wait_until
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.fixes import Sending
@@ -62,16 +63,6 @@ def drained(port: socket.socket) -> bytes:
     return got
 
 
-def test_over_tcp_a_fix_has_left_when_the_other_end_has_it(line, clock):
-    line, far = line
-    fix = sending(clock)
-    line.put(b"the fix", fix)
-    line.write()
-    wait_until(lambda: line.departed() == [fix], "the confirmation")
-    assert fix.sent
-    assert far.recv(100) == b"the fix"
-
-
 def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_the_connection(line, clock):
     line, far = line
     hold_up(line)
@@ -89,56 +80,6 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     got = drained(far)
     assert got
     assert b"the fix" not in got, "closing throws away what cannot leave"
-
-
-def test_a_tcp_peer_that_reads_late_finds_no_fix_that_was_called_unsent(narrow_server):
-    number = narrow_server._listener.getsockname()[1]
-    with link_to(f"tcp:127.0.0.1:{number}", max_fix_age_s=0.2) as link:
-        far = narrow_server.accept()
-        peer = Peer(far, 7)
-        peer.heartbeat()
-        peer.synchronise(link)
-        # So much text that the fixes behind it cannot leave.
-        wait_until(lambda: (link.send(*[status_text(Severity.INFO, "x" * 50)] * 9), _held(link))[1], "filling the line")
-        fixes = []
-        while link.stats().trouble is None:
-            fixes.append(link.send_fix(Fix(10.0 + len(fixes), 8.0, 20.0, time.monotonic())))
-            time.sleep(0.01)
-        assert link.stats().trouble in ("a position fix has waited too long in it", "the port takes no more bytes")
-        for each in fixes:
-            each.wait(60)
-        found = set()
-        for message in peer.receiver.feed(drained(far)):
-            if message.get_type() == "COMMAND_INT":
-                found.add(message.x / 1e7)
-        assert found <= {each.fix.lat_deg for each in fixes if each.sent}
-        assert not all(each.sent for each in fixes)
-        assert link.stats().fixes_sent == sum(each.sent for each in fixes)
-        unanswered = link._conversation.fixes._row
-        assert unanswered == link.stats().fixes_sent, "what was thrown away waits for no answer"
-
-
-def _held(link) -> bool:
-    line = link._line
-    return line is None or line.port.unsent() > 4000
-
-
-@pytest.mark.parametrize(("max_age_s", "leaves"), [(0.3, False), (0.6, True)])
-def test_the_longest_wait_is_the_configurations(clock, max_age_s, leaves):
-    with (
-        closing(UdpPort()) as port,
-        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, max_fix_age_s=max_age_s) as link,
-    ):
-        peer = Peer(port)
-        peer.expect("HEARTBEAT")
-        fix = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
-        clock.now_s += 0.5
-        peer.heartbeat()
-        peer.synchronise(link)
-        wait_until(lambda: fix.sent is not None)
-        assert fix.sent is leaves
-        if not leaves:
-            assert "0.3 s" in fix.why
 
 
 def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
@@ -173,3 +114,51 @@ class _Terminal:
 
     def send(self, data: bytes) -> int:
         return os.write(self._number, data)
+
+
+BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+
+
+def losses_told(caplog) -> int:
+    told = [record.getMessage() for record in caplog.records if record.name == "edgevpr.mavlink.link"]
+    return sum("the device is gone" in message for message in told)
+
+
+def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplog):
+    cable = SerialCable(tmp_path)
+    here, there = (f"serial:{end}:57600" for end in cable.ends)
+    with link_to(here) as link:
+        assert link.stats().trouble  # absent at the start: no error
+        for times in (1, 2):
+            cable.plug()
+            autopilot = AutopilotThread(there)
+            wait_until(lambda: link.stats().autopilot_heard and link.stats().trouble is None, "hearing the autopilot")
+            beats = link.stats().sent["HEARTBEAT"]
+            wait_until(lambda beats=beats: link.stats().sent["HEARTBEAT"] > beats, "a heartbeat as its companion")
+            link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
+            wait_until(lambda times=times: link.stats().acks == {"ACCEPTED": times}, "the answer to the fix")
+            cable.unplug()
+            wait_until(lambda times=times: losses_told(caplog) == times, "noticing the loss")
+            summary = autopilot.join()  # a cut line ends it
+            assert (summary.companion, summary.fixes_accepted) == ("1/197", 1)
+            assert (summary.bad_bytes, summary.lost_packets) == (0, 0)
+        assert link.stats().reopened == 2
+        assert link.stats().bad_bytes == 0
+
+
+def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tmp_path):
+    """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
+    device = tmp_path / "ttyACM0"
+    with link_to(f"serial:{device}:57600") as link:
+        assert link.stats().trouble
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        with serial.Serial(os.ttyname(slave), exclusive=True):
+            device.symlink_to(os.ttyname(slave))
+            wait_until(lambda: "in use by another program" in link.stats().trouble, "finding it in use")
+        wait_until(lambda: link.stats().connected, "opening it")
+        os.write(master, BEAT.pack(mavlink.MAVLink(None, 7, 1)))
+        wait_until(link.listens, "hearing the autopilot")
+        assert link.stats().trouble is None
+    os.close(master)
+    os.close(slave)

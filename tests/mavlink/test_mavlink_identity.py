@@ -1,13 +1,8 @@
 """Which autopilot is ours: the one kept, others refused, and the rule by which one takes the place of another."""
 
-import logging
-import socket
-
 import pytest
-from fakes import FakeClock
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.peer import Identity, Speaker
 from edgevpr.mavlink.wire import mavlink
@@ -61,122 +56,28 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
     assert identity.kept == Speaker(1, THERE)
 
 
-@pytest.fixture
-def listening(clock):
-    """A link that listens, and a call that makes an autopilot at a port of its own."""
-    number, ports = free_port(), []
-
-    def autopilot(system_id: int) -> Peer:
-        ports.append(UdpPort(to=number))
-        return Peer(ports[-1], system_id)
-
-    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
-        yield link, autopilot
-    for port in ports:
-        port.close()
-
-
-def speak(link: Link, peer: Peer, clock: FakeClock, beats: int, **sender: int) -> None:
-    """Let an autopilot send a heartbeat a second."""
-    for _ in range(beats):
-        clock.now_s += 1.0
-        before = link.stats().received.get("HEARTBEAT", 0)
-        peer.heartbeat(**sender)
-        wait_until(lambda before=before: link.stats().received.get("HEARTBEAT", 0) > before, "the heartbeat")
-
-
-def became_of_a_fix(link: Link, clock: FakeClock) -> bool:
-    """Send a fix; tell whether it left."""
-    sending = link.send_fix(Fix(50.0, 8.0, 20.0, clock.now_s))
-    if not link.listens():
-        clock.now_s += 1.1
-        wait_until(lambda: sending.sent is not None, "giving up the fix")
-    sending.wait(60)
-    return bool(sending.sent)
-
-
-def names(peer: Peer) -> list[str]:
-    """Names of all messages that have come by now."""
-    peer.port._sock.setblocking(False)
-    try:
-        while True:
-            peer.read()
-    except BlockingIOError:
-        return [message.get_type() for message in peer.seen]
-
-
-@pytest.mark.network
-def test_a_second_socket_with_our_autopilots_number_gets_no_fix_while_ours_speaks(listening, clock, caplog):
-    link, autopilot = listening
-    ours, thief = autopilot(1), autopilot(1)
-    speak(link, ours, clock, 1)
-    ours.synchronise(link)
+def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed(autopilot, caplog):
+    autopilot.conversation.requests.offered = tuple(Wish)
+    autopilot.put_fix()
     for _ in range(40):
-        speak(link, thief, clock, 1)
-        thief.answer_fix(mavlink.MAV_RESULT_ACCEPTED)
-        speak(link, ours, clock, 1)
-        assert became_of_a_fix(link, clock)
-        assert ours.expect("COMMAND_INT").target_system == 1
-        ours.answer_fix(mavlink.MAV_RESULT_FAILED)
-    wait_until(lambda: link.stats().acks.get("FAILED") == 40)
-    assert names(thief) == []
-    assert link.stats().acks == {"FAILED": 40}, "nor is it believed"
-    assert link.stats().foreign_messages == 80
-    assert caplog.text.count("another autopilot, system 1") == 1
+        autopilot.wait(1.0)
+        autopilot.beat(address=THERE)
+        autopilot.say(
+            mavlink.MAVLink_command_ack_message(43003, 0, target_system=7, target_component=197), address=THERE
+        )
+        autopilot.say(mavlink.MAVLink_command_long_message(7, 197, 31010, 0, 1, 0, 0, 0, 0, 0, 0), 255, 190, THERE)
+        autopilot.beat()
+    assert autopilot.put_fix().sent
+    assert autopilot.conversation.autopilot.acks == {}
+    assert autopilot.conversation.requests.take() == ()
+    assert autopilot.conversation.autopilot.identity.foreign_messages == 120
+    assert caplog.text.count("another autopilot, system 7") == 1
 
 
-@pytest.mark.network
-def test_an_autopilot_that_comes_back_from_elsewhere_is_taken_and_the_ground_is_told(listening, clock):
-    link, autopilot = listening
-    before = autopilot(1)
-    speak(link, before, clock, 2)
-    before.synchronise(link)
-    assert became_of_a_fix(link, clock)
-    clock.now_s += 20.0
-    after = autopilot(1)
-    speak(link, after, clock, 7)
-    assert not became_of_a_fix(link, clock)
-    speak(link, after, clock, 7)
-    after.synchronise(link)
-    assert became_of_a_fix(link, clock)
-    after.expect_text("edgevpr: autopilot has another address")
-    assert after.expect("COMMAND_INT").target_system == 1
-    assert names(before).count("COMMAND_INT") == 1
-
-
-@pytest.mark.network
-def test_the_configured_system_is_our_own_number_from_the_start_and_the_only_one_sent_to(clock):
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}", clock=clock, system_id=5) as link:
-        port = UdpPort(to=number)
-        peer = Peer(port, system_id=9)
-        speak(link, peer, clock, 40)
-        assert peer.expect("HEARTBEAT").get_srcSystem() == 5
-        assert not became_of_a_fix(link, clock)
-        assert link.stats().autopilot_system_id is None
-        speak(link, peer, clock, 1, system_id=5)
-        peer.synchronise(link)
-        assert became_of_a_fix(link, clock)
-        assert peer.expect("COMMAND_INT").target_system == 5
-        port.close()
-
-
-@pytest.mark.network
-def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(clock, caplog):
-    caplog.set_level(logging.INFO, "edgevpr.mavlink")
-    number = free_port(socket.SOCK_STREAM)
-    server = TcpServer(number)
-    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
-        ours = Peer(server.accept(), 1)
-        speak(link, ours, clock, 1)
-        ours.synchronise(link)
-        server.close()
-        wait_until(lambda: not link.stats().connected, "noticing the loss")
-        server = TcpServer(number)
-        stranger = Peer(server.accept(), 2)
-        speak(link, stranger, clock, 3)
-        assert not became_of_a_fix(link, clock), "ours was heard 4 s ago, but over another connection"
-        speak(link, stranger, clock, 1, system_id=1)
-        stranger.synchronise(link)
-        assert became_of_a_fix(link, clock)
-    server.close()
+@pytest.mark.parametrize(("system_id", "sent"), [(2, None), (7, True)])
+def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(autopilot, system_id, sent):
+    autopilot.conversation.break_off(0)
+    autopilot.beat(system_id=system_id)
+    sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 20.0, autopilot.clock.now_s))
+    autopilot.told()
+    assert sending.sent is sent

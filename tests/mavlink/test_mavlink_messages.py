@@ -1,14 +1,13 @@
 """Messages that we send, as they are read at the other end."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from edgevpr.core.geodesy import moved
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.messages import SENSOR_ID, Fix, MotionState, Severity
+from edgevpr.mavlink.messages import Fix, MotionState, Severity
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 STATE = MotionState(
@@ -152,12 +151,3 @@ def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airfram
     assert math.degrees(angle ** (1 / 3)) == pytest.approx(5.0)
     assert heard.velocity_covariance[0] == pytest.approx(0.16)
     assert not any(map(math.isnan, (*heard.pose_covariance, *heard.velocity_covariance)))
-
-
-def test_a_sensor_says_accuracy_and_no_altitude():
-    heard = sent_and_received(messages.position_sensor(replace(STATE, lat_deg=47.5, lon_deg=8.25, accuracy_m=4.0)))
-    assert (heard.lat, heard.lon, heard.eph) == (475_000_000, 82_500_000, 4.0)
-    assert math.isnan(heard.alt)
-    assert math.isnan(heard.epv)
-    assert heard.id == SENSOR_ID != 0, "EKF2_AGP0_ID 0 is a slot that is off"
-    assert heard.source == mavlink.GLOBAL_POSITION_SRC_VISION

@@ -7,7 +7,8 @@ import time
 from contextlib import ExitStack, closing, suppress
 
 import pytest
-from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
+from conversing import Autopilot
+from mavlink_peers import free_port, link_to, wait_until
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.messages import Fix
@@ -137,17 +138,6 @@ def test_the_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
     assert admitted(signing, Signer(stamp=NOW, link_id=1).packet()) == [False]
 
 
-def test_our_time_stamps_grow_with_every_message_and_with_time(signing, clock):
-    packer = mavlink.MAVLink(None, 1, 197)
-    stamps = []
-    for step_s in (0, 0, 1, 0):
-        clock.now_s += step_s
-        signing.stamp(packer)
-        stamps.append(packer.signing.timestamp)
-    assert stamps == [NOW + 1, NOW + 2, NOW + TICKS_S, NOW + TICKS_S + 1]
-    assert (packer.signing.link_id, packer.signing.secret_key) == (TO_AUTOPILOT, KEY)
-
-
 @pytest.fixture
 def key_file(tmp_path):
     path = tmp_path / "signing.key"
@@ -223,22 +213,11 @@ def received(sock: socket.socket) -> bytes:
     return b""
 
 
-@pytest.mark.parametrize("key", [None, OTHER_KEY])
-@pytest.mark.network
-def test_no_fix_goes_to_who_has_not_the_key(key, tmp_path, clock):
-    signing = Signing(KEY, TimeStamps(tmp_path / "time", clock, lambda: UTC_S))
-    with (
-        closing(UdpPort()) as port,
-        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock, signing=signing) as link,
-    ):
-        peer = Peer(port, system_id=7)
-        peer.expect("HEARTBEAT")
-        signer = Signer(key) if key else None
-        for count in (1, 2):
-            port.send(signer.packet() if signer else unsigned())
-            wait_until(lambda count=count: link.stats().refused_signatures == {WRONG if key else UNSIGNED: count})
-        assert not link.stats().autopilot_heard
-        assert link.stats().received == {}
+def test_no_fix_goes_to_who_has_not_the_key(signing):
+    autopilot = Autopilot(signing=signing)
+    assert autopilot.put_fix().sent is None
+    assert signing.refused[UNSIGNED] > 1
+    assert autopilot.conversation.reader.received == {}
 
 
 def test_without_a_key_everything_is_admitted_and_nothing_signed():

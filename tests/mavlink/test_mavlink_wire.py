@@ -16,20 +16,6 @@ def a_packet_of_every_kind(rng: random.Random, system_id: int = 1) -> list[bytes
     return packets
 
 
-def test_every_message_of_the_dialect_arrives_however_the_stream_is_cut():
-    rng = random.Random(1)
-    packets = a_packet_of_every_kind(rng)
-    stream = b"".join(packets)
-    receiver = PacketReader()
-    heard = 0
-    while stream:
-        cut = rng.randrange(1, 600)
-        heard += sum(1 for _ in receiver.feed(stream[:cut]))
-        stream = stream[cut:]
-    assert heard == len(packets) > 300
-    assert receiver.bad_bytes == 0
-
-
 def test_damaged_packets_and_noise_never_raise_and_are_counted():
     rng = random.Random(2)
     packets = a_packet_of_every_kind(rng)

@@ -4,7 +4,7 @@ import pytest
 
 from edgevpr.lab.simulate.firmware import ARDUPILOT, PX4
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, Kind
-from edgevpr.mavlink.choice import TABLES
+from edgevpr.mavlink.interview import TABLES
 from edgevpr.mavlink.wire import mavlink
 
 ARDUPILOT_TABLE = TABLES[mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA]

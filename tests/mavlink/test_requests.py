@@ -1,13 +1,12 @@
-"""Requests to this companion: what is answered, field by field, what is obeyed, and what is not. Whatever a message
-holds, there is an answer, and it can be sent."""
+"""The people on the ground: requests to this companion, each with an answer that can be sent, and texts for them."""
 
 import itertools
 import math
 
 import pytest
-from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
 
-from edgevpr.mavlink.ground import ANSWERED_MAX, PAUSED, Requests, Wish
+from edgevpr.mavlink.ground import ANSWERED_MAX, PAUSED, Requests, Texts, Wish
+from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import mavlink
 
 US, STATION = (7, 197), (255, 190)
@@ -41,7 +40,7 @@ def answered(autopilot, message):
 
 @pytest.fixture
 def requests(autopilot):
-    autopilot.conversation.offer(tuple(Wish))
+    autopilot.conversation.requests.offered = tuple(Wish)
     return autopilot.conversation.requests
 
 
@@ -64,10 +63,10 @@ def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, reque
 
 def test_a_wish_is_rejected_for_the_time_being_where_nobody_flies_or_learns(autopilot):
     assert answered(autopilot, command_long(31010, 1)) == "TEMPORARILY_REJECTED"
-    autopilot.conversation.offer((Wish.PAUSE, Wish.RESUME))
+    autopilot.conversation.requests.offered = (Wish.PAUSE, Wish.RESUME)
     assert answered(autopilot, command_long(31010, 3)) == "TEMPORARILY_REJECTED"
     assert answered(autopilot, command_long(31010, 2)) == "ACCEPTED"
-    assert [each.wish for each in autopilot.conversation.take_wishes()] == [Wish.RESUME]
+    assert [each.wish for each in autopilot.conversation.requests.take()] == [Wish.RESUME]
 
 
 def test_of_wishes_that_contradict_each_other_the_newest_is_left_and_others_stay(autopilot, requests):
@@ -126,42 +125,50 @@ def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():
         assert ack.result == (mavlink.MAV_RESULT_ACCEPTED if wishes else refusal)
 
 
-@pytest.mark.slow
-def test_every_other_command_is_unsupported():
-    for command in set(range(65_536)) - {31010}:
-        (ack,), _, _ = react(command_long(command, 1))
-        assert ack.result == mavlink.MAV_RESULT_UNSUPPORTED
+WARNING, INFO = Severity.WARNING, Severity.INFO
 
 
-def test_of_all_other_messages_those_that_are_for_us_are_ignored_and_those_that_are_not_do_not_concern_us():
-    concerned = 0
-    for kind in mavlink.mavlink_map.values():
-        message = kind.__new__(kind)
-        for name in kind.fieldnames:
-            setattr(message, name, {"target_system": US[0], "target_component": US[1]}.get(name, 0))
-        message._type, message._header = kind.msgname, mavlink.MAVLink_header(kind.id)
-        if kind.msgname in ("COMMAND_LONG", "COMMAND_INT", "TIMESYNC", "COMMAND_ACK"):
-            continue
-        is_for_us = {"target_system", "target_component"} <= set(kind.fieldnames)
-        answers, requests, _ = react(message)
-        assert (answers, requests.ignored) == ((), is_for_us), kind.msgname
-        concerned += is_for_us
-    assert concerned > 30
+@pytest.fixture
+def texts():
+    """Texts of which one has just been sent, at second 0."""
+    texts = Texts()
+    texts.put(INFO, "first")
+    assert texts.next(0.0).text == "edgevpr: first"
+    return texts
 
 
-@pytest.mark.network
-def test_over_a_port_that_listens_only_the_autopilots_address_commands(clock):
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}", clock=clock) as link:
-        port, stranger = UdpPort(to=number), UdpPort(to=number)
-        peer, other = Peer(port, system_id=7), Peer(stranger, system_id=255)
-        peer.heartbeat()
-        wait_until(link.listens)
-        link.offer(tuple(Wish))
-        other.send(command_long(31010, 1), component_id=190)
-        wait_until(lambda: link.stats().foreign_messages == 1)
-        assert link.take_wishes() == ()
-        peer.send(command_long(31010, 1), *STATION)
-        assert peer.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
-        port.close()
-        stranger.close()
+def told(texts: Texts, from_s: float = 0.0) -> list[tuple[int, str]]:
+    """All that is told from a moment on, asked ten times a second."""
+    said = []
+    for tenth in range(round(from_s * 10), 10 * 200):
+        if message := texts.next(tenth / 10):
+            said.append((tenth / 10, message.text.removeprefix("edgevpr: ")))
+    return said
+
+
+def test_one_text_in_five_seconds_is_sent(texts):
+    for name in "abc":
+        texts.put(INFO, name)
+    assert told(texts) == [(5.0, "a"), (10.0, "b"), (15.0, "c")]
+    texts.put(INFO, "late")
+    assert texts.next(500.0).text == "edgevpr: late", "after a silence at once"
+
+
+def test_the_newest_text_of_a_topic_takes_the_place_of_one_that_waits(texts):
+    texts.put(WARNING, "camera lost", "camera")
+    texts.put(WARNING, "map left", "map")
+    texts.put(WARNING, "camera frozen", "camera")
+    assert [text for _, text in told(texts)] == ["camera frozen", "map left"]
+    texts.put(INFO, "map found again", "map")
+    texts.put(WARNING, "map left", "map")
+    assert told(texts, 100.0) == [], "what comes and goes again before its turn is no change"
+
+
+def test_a_new_warning_ends_the_note_that_all_is_well(texts):
+    texts.put(WARNING, "camera lost", "camera")
+    texts.put(INFO, "camera is back", "camera")
+    texts.put(WARNING, "camera frozen", "camera")
+    assert [text for _, text in told(texts)] == ["camera frozen"]
+    texts.put(WARNING, "camera lost", "camera")
+    texts.put(INFO, "camera is back", "camera")
+    assert [text for _, text in told(texts, 100.0)] == ["camera lost", "camera is back"], "a note hides no warning"

@@ -1,8 +1,7 @@
 """An autopilot that restarts is a new one, and one whose link is lost for some seconds is not."""
 
 import pytest
-from conversing import Autopilot
-from test_autopilot_clock import Still
+from conversing import Autopilot, Ear
 
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.firmware import ARDUPILOT
@@ -10,21 +9,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.wire import mavlink
 
 IMU = mavlink.MAVLINK_MSG_ID_SCALED_IMU
-VERSION = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 RECEIVER, VISION = {"GPS1_TYPE": 1, "GPS2_TYPE": 14}, {"GPS2_TYPE": 0, "VISO_TYPE": 1}
-
-
-class Ear(Still):
-    """Notes what it is told."""
-
-    def __init__(self):
-        self.autopilots, self.channels = 0, []
-
-    def hear_autopilot(self, t_s):
-        self.autopilots += 1
-
-    def hear_channel(self, channel):
-        self.channels.append(channel)
 
 
 class Aircraft(Autopilot):
@@ -47,8 +32,8 @@ class Aircraft(Autopilot):
         self.has_origin = False
         self.forget()
 
-    def live(self, seconds, answers=True):
-        """Live on, as far as its messages reach us; `answers`: ours reach it, too. Returns the texts."""
+    def live(self, seconds):
+        """Live on, and return the texts that were sent meanwhile."""
         texts = []
         for tick in range(round(seconds * 10)):
             if tick % 10 == 0:
@@ -58,24 +43,14 @@ class Aircraft(Autopilot):
             if self.says_boot_time and mavlink.MAVLINK_MSG_ID_ATTITUDE in self.rates:
                 self.attitude()
                 self.position()
-            for message in self.told() if answers else ():
+            for message in self.reply(ARDUPILOT | self.parameters):
                 self.received.append(message)
                 texts += [message.text] if message.get_type() == "STATUSTEXT" else []
-                self.obey(message)
+                self.has_origin |= message.get_type() == "SET_GPS_GLOBAL_ORIGIN"
+                if getattr(message, "command", None) == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                    self.rates.add(int(message.param1))
             self.wait(0.1)
         return texts
-
-    def obey(self, message):
-        known = ARDUPILOT | self.parameters
-        if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in known:
-            self.say(self.parameter(message.param_id, known[message.param_id]))
-        elif message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self.rates.add(int(message.param1))
-        elif message.get_type() == "COMMAND_LONG" and message.param1 == VERSION:
-            nothing = [bytes(8)] * 3
-            self.say(mavlink.MAVLink_autopilot_version_message(0, 4 << 24, 0, 0, 0, *nothing, 0, 0, 0))
-        elif message.get_type() == "SET_GPS_GLOBAL_ORIGIN":
-            self.has_origin = True
 
     def names(self):
         return [message.get_type() for message in self.received]

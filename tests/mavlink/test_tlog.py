@@ -10,16 +10,13 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from fakes import FakeClock
 from full_disk import no_file_larger_than
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
+from mavlink_peers import Peer, UdpPort, link_to, wait_until
 
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink import messages, tlog
-from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import Fix, Health
-from edgevpr.mavlink.ports import Line, open_port
 from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
@@ -107,25 +104,6 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
     fix = next(message for message in read(path) if message.get_type() == "COMMAND_INT")
     assert (fix.get_srcSystem(), fix.get_srcComponent(), fix.command) == (1, 197, messages.POSITION_FIX)
     assert began_us / 1e6 - 1 < fix._timestamp < time.time() + 1
-
-
-@pytest.mark.network
-def test_a_packet_is_in_the_log_when_the_port_has_taken_all_of_it():
-    server, taken = TcpServer(number := free_port()), []
-    line = Line(open_port(parse_link(f"tcp:127.0.0.1:{number}")), FakeClock(), taken.append)
-    with closing(server):
-        far = server.accept()
-        line.put(big := bytes(1_000_000), None)
-        line.write()
-        assert line.unsent
-        assert not taken
-        reader = threading.Thread(target=lambda: all(iter(lambda: far.recv(1_000_000), b"")))
-        reader.start()
-        wait_until(lambda: line.write() or not line.unsent)
-        line.write()
-        assert taken == [big]
-        line.close()
-        reader.join()
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ class ClosedLoop:
         self.conversation = Conversation(settings, self._clock) if edgevpr else None
         if self.conversation:
             self.conversation.want_position()
-            self.conversation.offer(tuple(Wish))
+            self.conversation.requests.offered = tuple(Wish)
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._waiting, self._last_frame = [], None
 

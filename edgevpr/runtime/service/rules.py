@@ -5,32 +5,15 @@ Every rule of ArduPilot is based on the sources of 4.7-dev, every rule of PX4 on
 were flown in simulation with GPS taken away, with PX4 1.17.0 and 1.18-beta1.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_RULES
+from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE, MAVLINK_GPS, RECEIVERS, SECOND
 from edgevpr.mavlink.asking import AutopilotReading
-from edgevpr.mavlink.channel import (
-    CONTROL,
-    FUSES_POSITION,
-    MAVLINK_GPS,
-    RECEIVERS,
-    SECOND,
-    VISION_CONTROL,
-    Channel,
-    Choice,
-    Kind,
-    ardupilot_choice,
-    own_name,
-    px4_choice,
-)
-from edgevpr.mavlink.choice import TABLES
-from edgevpr.mavlink.parameters import ParameterRule, find_faults
-from edgevpr.mavlink.px4_parameters import PX4_RULES
-from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters, own_name
+from edgevpr.mavlink.parameters import ParameterTable
+from edgevpr.mavlink.px4_parameters import CONTROL, FUSES_POSITION, PX4_TABLE, VISION_CONTROL
 from edgevpr.runtime.service.finding import Finding, fine, judged, wrong
-
-Parameters = Mapping[str, float | int]
 
 _SWITCHES = (1, 4)  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
 _FROM_FLOW, _FROM_VISION = 5, 6  # values of EK3_SRCn_...
@@ -52,7 +35,7 @@ class FirmwareRules:
 
 
 def _ardupilot_findings(reading: AutopilotReading, sends_fixes: bool) -> Iterator[Finding]:
-    choice = ardupilot_choice(reading.kind, reading.parameters)
+    choice = ARDUPILOT_TABLE.choose(reading.kind, reading.parameters)
     if choice.channel.is_continuous and not sends_fixes:
         yield _dry(choice, reading)
     elif choice.channel is Channel.GPS_INPUT:
@@ -65,13 +48,13 @@ def _ardupilot_findings(reading: AutopilotReading, sends_fixes: bool) -> Iterato
             needs = f"The first flight with fixes on needs {' and '.join(channel.changes)}: {channel.message}"
             channel = fine("channel", f"A dry run (`send_fixes: false`) needs no change. {needs}")
         yield channel
-    yield from _parameters(ARDUPILOT_RULES, choice, reading)
+    yield from _parameters(ARDUPILOT_TABLE, choice, reading)
     yield _port(reading, "SERIALn_PROTOCOL=2")
 
 
-def _parameters(rules: tuple[ParameterRule, ...], choice: Choice, reading: AutopilotReading) -> Iterator[Finding]:
+def _parameters(table: ParameterTable, choice: Choice, reading: AutopilotReading) -> Iterator[Finding]:
     """Check the parameters that change what our messages do: one finding for each row of the table that is broken."""
-    faults = find_faults(rules, choice, reading.parameters)
+    faults = table.find_faults(choice, reading.parameters)
     for fault in faults:
         stops = " Until then edgevpr sends nothing." if fault.rule.is_dangerous else ""
         yield wrong(fault.rule.label, f"{fault.rule.why}{stops}", *fault.changes)
@@ -129,7 +112,7 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
 
 
 def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Finding]:
-    choice = px4_choice(reading.kind, reading.parameters)
+    choice = PX4_TABLE.choose(reading.kind, reading.parameters)
     if choice.channel is not Channel.COMMAND:
         yield fine("channel", _sentence(choice.reason))
     elif CONTROL in reading.parameters:
@@ -141,7 +124,7 @@ def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Fin
         )
     else:
         yield _px4_single_fixes(choice, reading)
-    yield from _parameters(PX4_RULES, choice, reading)
+    yield from _parameters(PX4_TABLE, choice, reading)
     yield _port(reading, "MAV_PROTO_VER=2")
 
 
@@ -177,14 +160,14 @@ RULES = {
     "ardupilot": FirmwareRules(
         name="ArduPilot",
         knows_fixes=(4, 5),  # release notes of 4.5.0: MAV_CMD_EXTERNAL_POSITION_ESTIMATE
-        parameters=(*TABLES[mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA].names, "FLOW_TYPE", "Q_ENABLE"),
+        parameters=(*ARDUPILOT_TABLE.names, "FLOW_TYPE", "Q_ENABLE"),
         findings=_ardupilot_findings,
         port_changes=lambda baud: ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={baud // 1000}"),
     ),
     "px4": FirmwareRules(
         name="PX4",
         knows_fixes=(1, 15),
-        parameters=TABLES[mavlink.MAV_AUTOPILOT_PX4].names,
+        parameters=PX4_TABLE.names,
         findings=_px4_findings,
         # TELEM 2, the usual port for a companion.
         port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),

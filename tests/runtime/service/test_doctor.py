@@ -13,7 +13,6 @@ from edgevpr.cli.main import main
 from edgevpr.mavlink import asking as module
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import AutopilotReading
-from edgevpr.mavlink.channel import ardupilot_choice
 from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
@@ -68,8 +67,6 @@ def said(reading: AutopilotReading, what: str, link=UDP, plan=FIXES) -> str:
 
 
 # What is said, once each; a `|` parts what must be in the message.
-
-
 BARE, VISUAL = replace(COPTER, parameters=PLAIN), replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
 HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
 MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter_flags=None, origin=None)
@@ -80,6 +77,7 @@ FUSED = with_parameters(VISUAL, EK3_SRC2_POSXY=6, EK3_SRC2_VELXY=6)
 @pytest.mark.parametrize(
     ("reading", "what", "message"),
     [
+        (COPTER, "channel", "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."),
         (PX4, "channel", "Message 296, as its EKF2_AGP0_CTRL fuses positions."),
         (replace(PX4, vehicle="plane", parameters={}), "channel", "Command 43003, as "),
         (HOVERING, "channel", "while it hovers (Q_ENABLE=1): without GPS it falls back to QHOVER or QLAND"),
@@ -100,35 +98,6 @@ FUSED = with_parameters(VISUAL, EK3_SRC2_POSXY=6, EK3_SRC2_VELXY=6)
 )
 def test_what_is_said(reading, what, message):
     assert all(part in said(reading, what) for part in message.split("|"))
-
-
-def test_a_copter_and_a_px4_that_are_set_up_have_nothing_wrong():
-    assert wrong(COPTER) == wrong(PX4) == {}
-
-
-# The channel of an ArduPilot.
-
-
-@pytest.mark.parametrize(
-    ("vehicle", "parameters", "sentence"),
-    [
-        ("copter", {"GPS2_TYPE": 14}, "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."),
-        ("copter", {"GPS1_TYPE": 14, "GPS2_TYPE": 14}, "GPS_INPUT as receiver 1, as its GPS1_TYPE is 14."),
-        ("plane", {}, "Command 43003, which a plane that reckons takes at any time."),
-        ("plane", {"Q_ENABLE": 1, "GPS2_TYPE": 14}, "GPS_INPUT as receiver 2, as its GPS2_TYPE is 14."),
-        ("copter", {"FLOW_TYPE": 6, "EK3_SRC2_VELXY": 5}, "Command 43003: FLOW_TYPE=6 carries it from fix to fix."),
-    ],
-)
-def test_the_channel_is_the_one_that_the_flight_will_choose(vehicle, parameters, sentence):
-    reading = replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)
-    assert (said(reading, "channel"), wrong(reading)) == (sentence, {})
-    assert ardupilot_choice(reading.kind, reading.parameters).channel.name in {"GPS_INPUT", "COMMAND"}
-
-
-def test_the_channel_follows_from_the_older_names_too():
-    older = {"GPS_TYPE": 1, "GPS_TYPE2": 14, "EK3_SRC1_POSXY": 3}
-    assert "GPS_TYPE2 is 14" in said(replace(COPTER, parameters=older), "channel")
-    assert "GPS_TYPE is 14" in said(replace(COPTER, parameters=older | {"GPS_TYPE": 14}), "channel")
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
@@ -196,19 +165,10 @@ def test_each_thing_that_is_wrong_is_the_only_one_found(change, what, changes):
     assert wrong(replace(COPTER, **change)) == {what: changes}
 
 
-def test_what_the_autopilot_does_not_know_is_not_wrong():
-    assert wrong(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
-
-
 def test_a_slow_line_is_to_be_faster():
     assert wrong(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")}
     px4_changes = ("MAV_1_CONFIG=102", "MAV_1_MODE=2", "SER_TEL2_BAUD=921600")
     assert wrong(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
-
-
-@pytest.mark.parametrize(("baud", "code"), [(57_600, 57), (111_100, 111), (115_200, 115), (1_500_000, 1500)])
-def test_ardupilot_has_its_own_numbers_for_baud_rates(baud, code):
-    assert RULES["ardupilot"].port_changes(baud) == ("SERIALn_PROTOCOL=2", f"SERIALn_BAUD={code}")
 
 
 def test_who_answers_nothing_is_judged_by_nothing_but_that():
@@ -272,14 +232,6 @@ def test_a_px4_without_message_296_must_reckon_well_by_itself():
     assert wrong(with_parameters(without, EKF2_EV_CTRL=1)) == {}
     assert wrong(with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1)).keys() == {"EKF2_EV_NOISE_MD"}
     assert wrong(replace(without, vehicle="plane")) == {}
-
-
-def test_an_old_or_a_silent_px4_is_wrong():
-    assert wrong(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
-        "firmware": ("PX4 1.15 or later",)
-    }
-    assert set(wrong(replace(PX4, version=None))) == {"firmware"}
-    assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
 # Nothing heard.
@@ -406,11 +358,6 @@ def test_where_no_autopilot_is_the_command_says_so_and_looks_at_the_board(link, 
     assert not found["link"][0]
     assert "memory" in found
     assert "channel" not in found
-
-
-def test_a_host_that_is_not_there_is_a_finding(capsys):
-    assert main(["doctor", "--link", "udpout:no-such-host.invalid:14550"]) == 1
-    assert not findings_of(capsys.readouterr().out)["link"][0]
 
 
 @pytest.mark.parametrize(

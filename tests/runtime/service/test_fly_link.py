@@ -32,7 +32,7 @@ def test_the_keys_of_the_configuration_reach_the_link():
         link = opened(config, port, NOT_SIGNING, stack)
         heartbeat = Peer(port).expect("HEARTBEAT")
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
-        sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._turns.now_s()))
+        sending = link.send_fix(Fix(50.0, 8.0, 20.0, link.turns.now_s()))
         wait_until(lambda: sending.sent is not None)
         assert "0.2 s" in sending.why
 
