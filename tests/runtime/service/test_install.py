@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from edgevpr import __version__
-from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import program
@@ -134,10 +133,6 @@ def test_everything_is_made_and_made_again(installed_root):
     assert lines_of(root) == said
     assert {name: tree(root)[name][0] for name in before} == {name: size for name, (size, _) in before.items()}
     assert (root / "etc/passwd").read_text().count("edgevpr:x") == 1
-
-
-def test_the_first_configuration_is_one(installed):
-    assert main(["check", "--offline", "--config", str(installed / "etc/edgevpr/config.yaml")]) == 2  # no map
 
 
 def test_a_dry_run_says_what_the_run_says_and_writes_nothing(installed_root, system, packages):

@@ -34,11 +34,6 @@ def directives(text: str) -> dict[str, str]:
     return dict(re.findall(r"(?m)^(\w+)=(.*)$", text))
 
 
-@needs_systemd
-def test_systemd_has_nothing_to_say_about_the_unit(tmp_path):
-    assert verify(UNIT.read_text(), tmp_path) == ""
-
-
 @pytest.mark.slow
 @needs_systemd
 def test_every_boards_unit_passes(tmp_path):
@@ -99,7 +94,9 @@ def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
 
 def test_serial_ports_and_cameras_stay_within_reach():
     unit = directives(UNIT.read_text())
-    assert "PrivateDevices" not in unit
+    # /dev/video*, /dev/media* and /run/udev are read by libcamera and GStreamer.
+    hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
+    assert not hidden & unit.keys()
     assert unit["DeviceAllow"] == "char-* rw"  # ProtectClock alone would shut them out
     assert unit["SupplementaryGroups"] == "dialout video"
 
@@ -111,13 +108,6 @@ def test_the_socket_of_a_jetsons_camera_is_let_into_the_private_tmp():
     assert "nvargus-daemon.service" in unit["After"].split()
 
 
-def test_nothing_hides_what_cameras_are_found_by():
-    """/dev/video*, /dev/media* and /run/udev, which libcamera and GStreamer read."""
-    unit = directives(UNIT.read_text())
-    hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
-    assert not hidden & unit.keys()
-
-
 def test_every_udev_rule_is_well_formed():
     rules = [line for line in (DEPLOY / "99-edgevpr.rules").read_text().splitlines() if line and line[0] != "#"]
     keys = r"(ACTION|SUBSYSTEMS?|KERNEL|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|LABEL|GOTO)"
@@ -125,7 +115,3 @@ def test_every_udev_rule_is_well_formed():
         assert re.fullmatch(rf'({keys}(==|!=|=|\+=)"[^"]+"(, (?!$)|$))+', rule), rule
     labels = set(re.findall(r'LABEL="(\w+)"', "\n".join(rules)))
     assert set(re.findall(r'GOTO="(\w+)"', "\n".join(rules))) == labels
-
-
-def test_networks_of_ones_own_are_looked_for_where_the_service_can_see():
-    assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
