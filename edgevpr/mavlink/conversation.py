@@ -1,5 +1,4 @@
-"""The conversation with the autopilot: it chooses the next message to be sent, and processes those received. It knows
-no port and no thread, and is used inside turns only (see `turns`)."""
+"""The conversation with the autopilot, without port and thread, used inside turns only (see `turns`)."""
 
 import logging
 import math
@@ -36,13 +35,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """The settings of a link:
-    - `component_id`: our own; `system_id`: that of the autopilot (None: of the first one heard).
-    - `max_fix_age_s`: a fix that has waited longer is never sent; `clock`: the monotonic clock of all time stamps.
-    - `listener`: hears the reports of the vehicle, and gives the positions of a continuous channel.
-    - `tap`: gets each packet written or received; `tape`: records, or plays back, all that is received and sent.
-    - `origin`: is sent to an autopilot that takes ODOMETRY and has no origin (None: never). Its altitude is that of the
-      ground; None: unknown, that of the autopilot's air pressure is sent."""
+    """The settings of a link. `system_id`: that of the autopilot (None: of the first one heard). A fix that has waited
+    for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all stamps. `tap` gets each packet written or
+    received. `origin` is sent to an autopilot that takes ODOMETRY and has none (None: never)."""
 
     component_id: int = 197
     system_id: int | None = None
@@ -56,9 +51,7 @@ class LinkSettings:
 
 
 class Conversation:
-    """Makes the packets to be sent, one after another, and processes those received. It holds the state of the
-    `autopilot`, the `fixes` and `texts` to be sent, the `requests` made to us, and the count of messages `sent`, by
-    name."""
+    """Makes the packets to be sent, one after another, and processes those received. `sent` counts messages by name."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -97,8 +90,7 @@ class Conversation:
         return bool(self._messages or self.texts or self.fixes)
 
     def copy_to(self, ground: "Conversation") -> None:
-        """From now on copy health and all that is for people to the conversation with a ground station, whose requests
-        are treated like ours. Each has a queue of texts of its own: while a link is lost, its texts wait."""
+        """From now on copy health and all that is for people to a ground station, and obey its requests, too."""
         self._ground, ground.requests = ground, self.requests
         ground._packer.srcSystem = self._packer.srcSystem
 
@@ -134,14 +126,12 @@ class Conversation:
             self._ground.set_health(health)
 
     def want_position(self) -> None:
-        """From now on request the autopilot's reports of position, attitude and so on, and again whenever they stop
-        or become rare."""
+        """From now on request the autopilot's reports, and again whenever they stop or become rare."""
         self._ask_position_s = self._clock()
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report of the vehicle, moved to `t_mono_s`, the time of a frame, as far as velocity and
-        attitude are known; None if it has no position. Roll and pitch are None if no attitude was received within 0.3 s
-        of it. On a continuous channel, `t_fix_s` is now."""
+        attitude (within 0.3 s) are known; None without a position. On a continuous channel, `t_fix_s` is now."""
         vehicle = self.autopilot.vehicle_at(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
@@ -253,8 +243,8 @@ class Conversation:
         return (self._messages.popleft(), None) if self._messages else None
 
     def _between(self, now_s: float) -> Sending | None:
-        """Return a fix that no match asks for, where one is due and helps. By it ArduPilot moves its position, and not
-        its velocity (NavEKF3, setLatLng). PX4 may move both: there a fix without a match would confirm itself."""
+        """Return a fix that no match asks for, where one is due and helps. ArduPilot moves its position by it; PX4 may
+        move its velocity, too, and would confirm itself."""
         is_due = now_s >= self._between_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         if not is_due or not (fix := self.settings.listener.fix_between(now_s)):
             return None
@@ -278,17 +268,14 @@ class Conversation:
             return messages.gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
         here = self.settings.origin
         if autopilot.origin is None and here and now_s - self._no_origin_since_s > ORIGIN_WITHIN_S:
-            # Again if it is not heard: an autopilot whose filter has not started yet ignores it.
-            self._no_origin_since_s = now_s
+            self._no_origin_since_s = now_s  # again if it is not heard: a filter that has not started ignores it
             return self._place_origin(here, system_id)
         if state and state.attitude and autopilot.origin:
             return messages.odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
 
     def _place_origin(self, here: Position, system_id: int) -> Message:
-        """Make the message that sets the origin, at the altitude of the ground or, if the map does not know that, at
-        the autopilot's pressure altitude. If neither is known, request the air pressure: an origin at a wrong altitude
-        of 0 is never set. Our positions and heights do not depend on it; altitudes above sea level in a mission do."""
+        """Make the message that sets the origin, without an altitude by air pressure: that is requested if unknown."""
         alt_m = self.autopilot.pressure_alt_m if here.alt_m is None else here.alt_m
         if alt_m is None:
             if self._has_asked_pressure:
@@ -319,7 +306,6 @@ class Conversation:
             self.send(messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
         is_silent = vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S
-        # A ground station that asks for rates of its own sets ours back, as all of a port share them.
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
         is_slowed |= is_continuous and now_s - self.autopilot.force_s > ASK_AGAIN_S
         if is_silent or is_slowed or self._asked_for_state != is_continuous:
@@ -330,7 +316,7 @@ class Conversation:
         self._reports.append((severity, text, topic))
 
     def _begin_anew(self, why: str) -> None:
-        """Begin again with an autopilot that has forgotten everything. `why` goes to the fixes without an answer."""
+        """Begin again with an autopilot that has forgotten all. `why` goes to the fixes without an answer."""
         self.fixes.break_off(why)
         self._asked_for_state = self._told_channel = None
         self._no_origin_since_s, self._has_set_origin = math.inf, False
