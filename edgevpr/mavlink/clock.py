@@ -7,6 +7,8 @@ import math
 from collections import deque
 from typing import NamedTuple
 
+from edgevpr.mavlink.ground import Announce
+from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import Message, mavlink
 
 SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
@@ -25,6 +27,7 @@ _BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS = 2**32
 _NEAR_WRAP_MS = 60_000
 LATE_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
+_PUNCTUAL_AFTER_S = 10.0  # without a late report
 # The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
 # `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
 _STAMPS = {
@@ -171,6 +174,31 @@ class AutopilotClock:
         boot_s += round((expected_s - boot_s) * 1e3 / _WRAP_MS) * _WRAP_MS / 1e3
         if self._utc_ahead_s is None or abs(utc_s - boot_s - self._utc_ahead_s) > _UTC_ROUNDED_S:
             self._utc_ahead_s = utc_s - boot_s
+
+
+class ReportDelay:
+    """Decides by their delay whether the autopilot's reports are used, and announces it when that changes. `is_late`:
+    the newest came more than LATE_S after it was sent, as on a link that is full, or after we were stopped."""
+
+    def __init__(self, announce: Announce) -> None:
+        self.is_late = False
+        self._announce = announce
+        self._late_s: float | None = None  # when one last came too late; None: all come in time
+
+    def update(self, delay_s: float, now_s: float) -> None:
+        """Process the delay of a report received at `now_s`."""
+        self.is_late = delay_s > LATE_S
+        if self.is_late:
+            if self._late_s is None:
+                log.warning(
+                    "the autopilot's reports come %.1f s late and are not used: the link is full; raise its baud rate, "
+                    "or let the other programs on it ask for fewer messages", delay_s,
+                )  # fmt: skip
+                self._announce(Severity.WARNING, f"link full: reports {delay_s:.1f} s late", "delay")
+            self._late_s = now_s
+        elif self._late_s is not None and now_s - self._late_s > _PUNCTUAL_AFTER_S:
+            self._late_s = None
+            self._announce(Severity.INFO, "reports come in time again", "delay")
 
 
 class ForeignStamps:

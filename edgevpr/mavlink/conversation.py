@@ -77,7 +77,6 @@ class Conversation:
         self._no_origin_since_s, self._has_set_origin = math.inf, False
         self._has_asked_pressure = False
         self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
-        self._was_late = False
 
     @property
     def channel(self) -> Channel:
@@ -199,7 +198,6 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_there or self._is_there is not None:
             self._is_there = is_there
-        self._announce_delay(now_s)
         self.fixes.report_silence(self.autopilot.readiness(now_s).why_silent, now_s)
         for report in self._reports:
             self.announce(*report)
@@ -322,20 +320,6 @@ class Conversation:
         self._no_origin_since_s, self._has_set_origin = math.inf, False
         if self._ask_position_s is not None:
             self._ask_position_s = self._clock()
-
-    def _announce_delay(self, now_s: float) -> None:
-        """Announce that the autopilot's reports have begun to come too late, or no longer do."""
-        is_late = self.autopilot.is_late(now_s)
-        if is_late and not self._was_late:
-            delay_s = self.autopilot.late_by_s
-            log.warning(
-                "the autopilot's reports come %.1f s late, and are not used: the link is full; raise its baud rate, or "
-                "let the other programs on it ask for fewer messages", delay_s,
-            )  # fmt: skip
-            self.announce(Severity.WARNING, f"link full: reports {delay_s:.1f} s late", "delay")
-        elif self._was_late and not is_late:
-            self.announce(Severity.INFO, "reports come in time again", "delay")
-        self._was_late = is_late
 
     def _announce_restart(self, now_s: float) -> None:
         self._restarts += 1

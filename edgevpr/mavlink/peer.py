@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import LATE_S, SILENT_AFTER_S, AutopilotClock
+from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock, ReportDelay
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
@@ -29,7 +29,6 @@ _MILLI_G_M_S2 = 9.80665e-3
 # Reports of where the vehicle is, and how it moves; the first three carry the boot time.
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
-_LATE_FOR_S = 10.0  # after the last one that came too late
 _ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ASK_ORIGIN_AGAIN_S = 10.0
 RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
@@ -153,8 +152,7 @@ class Autopilot:
         self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
         self.receivers = Receivers()
-        self._delay_s = 0.0  # by how much the newest report came late
-        self.late_by_s, self._late_s = 0.0, -math.inf  # the newest that came too late, and when
+        self.report_delay = ReportDelay(self._announce)
 
     @property
     def system_id(self) -> int | None:
@@ -168,10 +166,6 @@ class Autopilot:
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
         return now_s - self.heard_s <= SILENT_AFTER_S
-
-    def is_late(self, now_s: float) -> bool:
-        """Return True if its reports have come too late to be used in the last ten seconds."""
-        return now_s - self._late_s <= _LATE_FOR_S
 
     def asks_origin(self, now_s: float) -> bool:
         """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
@@ -243,9 +237,8 @@ class Autopilot:
     def _hear_report(self, message: Message, now_s: float) -> None:
         kind = message.get_type()
         if kind in _TIMED_REPORTS:
-            self._delay_s = self.clock.delay_s(message.time_boot_ms, now_s)
-        if kind in _MOTION_REPORTS and self._delay_s > LATE_S:
-            self.late_by_s, self._late_s = self._delay_s, now_s
+            self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
+        if kind in _MOTION_REPORTS and self.report_delay.is_late:
             return  # on a link that is full, or after we were stopped: what it says is past
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
