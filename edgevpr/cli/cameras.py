@@ -22,22 +22,26 @@ _READ_S = 0.25
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    text = "calibrate a camera whose lens distorts, by pictures of a chequerboard"
+    text = "calibrate a camera with images of a chessboard"
     parser = command(commands, "calibrate-camera", calibrate_camera, text)
-    parser.add_argument(
-        "source", metavar="SOURCE", help="a folder of pictures of the board, a video of it, or the camera itself"
-    )
+    parser.add_argument("source", metavar="SOURCE", help="folder of images of the board, a video of it, or a camera")
     parser.add_argument(
         "--board",
         type=_board,
         required=True,
         metavar="9x6",
-        help="its inner corners, where four squares meet: a board of 10x7 squares, of any size, has 9x6",
+        help="number of inner corners, where four squares meet: a board of 10x7 squares has 9x6",
     )
-    parser.add_argument("--out", required=True, metavar="YAML", help="the file to write, for `source: {lens: ...}`")
-    parser.add_argument("--fisheye", action="store_true", help="a lens that sees more than some 100 degrees")
+    parser.add_argument("--out", required=True, metavar="YAML", help="file to write, for `source: {lens: ...}`")
     parser.add_argument(
-        "--seconds", type=positive, default=90.0, metavar="S", help="the longest to look through a camera (90)"
+        "--fisheye", action="store_true", help="use the fisheye model, for lenses wider than about 100 degrees"
+    )
+    parser.add_argument(
+        "--seconds",
+        type=positive,
+        default=90.0,
+        metavar="S",
+        help="maximum time to watch a camera, in seconds (default: 90)",
     )
     add_json(parser)
 

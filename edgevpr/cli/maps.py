@@ -40,60 +40,78 @@ _OF_A_RECORDING = ("positions", "rate_hz")
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = group(commands, "map", "build, look into, check, repair, merge and shrink place maps")
+    maps = group(commands, "map", "build, inspect, check, repair, merge and shrink maps")
 
     def of_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
         parser = command(maps, name, run, text)
         parser.add_argument("map", metavar="MAP", help=more)
         return parser
 
-    _add_build(of_map("build", map_build, "make a map of a flight, or of an orthophoto", "to make, e.g. valley.gpkg"))
-    refine = of_map("refine", map_refine, "find out where the pictures really lie, by matching them")
-    refine.add_argument("--images", metavar="DIR", help="the images that the map was made of: more pictures are tied")
+    _add_build(
+        of_map(
+            "build", map_build, "build a map from images or from an orthophoto", "map to write, for example valley.gpkg"
+        )
+    )
+    refine = of_map("refine", map_refine, "refine the positions of the places by matching their images")
+    refine.add_argument(
+        "--images", metavar="DIR", help="images that the map was built from, to find more links between them"
+    )
     add_json(refine)
-    move = of_map("move", map_move, "move it to where GPS has it, as a flight has found")
-    move.add_argument("--by", metavar="LOG", required=True, help="flight log of a flight with this map and with GPS")
+    move = of_map("move", map_move, "shift a map by the offset from GPS that a flight measured")
+    move.add_argument("--by", metavar="LOG", required=True, help="log of a flight with this map and with GPS")
     add_json(move)
-    calibrate = of_map("calibrate", map_calibrate, "find out how sure a map can be, with the pictures it is of")
+    calibrate = of_map("calibrate", map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
-    calibrate.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and precision")
+    calibrate.add_argument(
+        "--config", metavar="FILE", help="configuration of the flight: camera, mask and precision are used"
+    )
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
-    info = of_map("info", map_info, "say what a map holds, or show it on a page")
-    info.add_argument("--page", metavar="FILE", help="write a page for any browser, offline (.html)")
+    info = of_map("info", map_info, "print what a map contains, or make a page of it")
+    info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
-    info.add_argument("--config", metavar="FILE", help="that of the map's flight: its lens lays the pictures")
+    info.add_argument(
+        "--config", metavar="FILE", help=("configuration of the mapping flight: its lens is used to draw the images")
+    )
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
-    add_json(of_map("check", map_check, "read everything in a map, and say what is damaged"))
-    add_json(of_map("repair", map_repair, "drop what is damaged; the original is kept as MAP.damaged"))
-    merge = command(maps, "merge", map_merge, "make one map of several of the same technique")
-    merge.add_argument("out", metavar="OUT", help="the map file to make")
+    add_json(of_map("check", map_check, "read the whole map and report what is damaged"))
+    add_json(of_map("repair", map_repair, "remove damaged places; keep the original as MAP.damaged"))
+    merge = command(maps, "merge", map_merge, "merge maps of the same technique")
+    merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
-    smaller = of_map("shrink", map_shrink, "keep only the best places, spread over the map")
-    smaller.add_argument("out", metavar="OUT", help="the map file to make")
-    smaller.add_argument("--places", type=count, metavar="N", required=True, help="as many places")
+    smaller = of_map("shrink", map_shrink, "reduce a map to its best places, spread over its area")
+    smaller.add_argument("out", metavar="OUT", help="map to write")
+    smaller.add_argument("--places", type=count, metavar="N", required=True, help="number of places to keep")
     add_json(smaller)
     subset.add(of_map)
-    worth = command(commands, "salience", run_salience, "say what of a picture is worth remembering")
+    worth = command(commands, "salience", run_salience, "print how memorable each image is")
     worth.add_argument("image", metavar="IMAGE")
-    worth.add_argument("--config", metavar="FILE", help="YAML; its section `salience` counts")
+    worth.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
     add_json(worth)
 
 
 def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
-    build.add_argument("--technique", metavar="NAME", help="see `edgevpr profile` (default: by the board)")
-    add_parameters(build, "a parameter of the technique")
-    build.add_argument("--board", default="this", metavar="NAME", help="that will fly (default: this machine)")
-    build.add_argument("--config", metavar="FILE", help="that of the flight: its camera, mask and salience")
+    build.add_argument(
+        "--technique", metavar="NAME", help=("technique to use, see `edgevpr profile` (default: chosen for the board)")
+    )
+    add_parameters(build, "set a parameter of the technique")
+    build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
+    build.add_argument(
+        "--config", metavar="FILE", help="configuration of the flight: camera, mask and salience are used"
+    )
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
-    build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places a second of a video (default: all)")
-    build.add_argument("--no-refine", dest="refine", action="store_false", help="leave positions as they are recorded")
-    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="do not find out how sure it is")
-    build.add_argument("--attribution", metavar="TEXT", help="the owner of the orthophoto, as its terms ask for")
-    build.add_argument("--append", action="store_true", help="add to an existing map, going on where it broke off")
+    build.add_argument(
+        "--rate-hz", type=positive, metavar="HZ", help="places per second of a video (default: every frame)"
+    )
+    build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
+    build.add_argument(
+        "--no-calibrate", dest="calibrate", action="store_false", help="skip the calibration of match confidence"
+    )
+    build.add_argument("--attribution", metavar="TEXT", help="attribution that the orthophoto's licence requires")
+    build.add_argument("--append", action="store_true", help="add to an existing map, or resume an interrupted build")
     add_json(build)
 
 
@@ -105,7 +123,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
 
 def add_orthophoto(parser: ArgumentParser) -> None:
     """Add the flags for an orthophoto, and for the pictures that are cut from it."""
-    flags = parser.add_argument_group("of an orthophoto, in place of --images")
+    flags = parser.add_argument_group("from an orthophoto, instead of --images")
     flags.add_argument(
         "--orthophoto",
         metavar="FILE",
@@ -116,13 +134,18 @@ def add_orthophoto(parser: ArgumentParser) -> None:
         "--footprint-m",
         type=_lengths,
         metavar="M",
-        help="ground along the longest side of a picture; at several heights, several: 75,105,150",
+        help="ground along the longest side of an image, in metres; a list for several heights: 75,105,150",
     )
-    flags.add_argument("--spacing-m", type=float, metavar="M", help="ground from place to place, e.g. a quarter")
+    flags.add_argument(
+        "--spacing-m",
+        type=float,
+        metavar="M",
+        help=("distance between places in metres, for example a quarter of the footprint"),
+    )
     flags.add_argument(
         "--area",
         metavar="AREA",
-        help="only over this: a mission or GeoJSON (a path: a footprint on either side), or LAT,LON,RADIUS_M",
+        help="area to map: a mission or GeoJSON (a path counts with a footprint on either side), or LAT,LON,RADIUS_M",
     )
 
 

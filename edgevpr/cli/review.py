@@ -17,30 +17,28 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    report = command(commands, "report", run_report, "make a page of a flight from its log, for any browser, offline")
+    report = command(commands, "report", run_report, "make an HTML page of a flight from its log")
     report.add_argument("log", metavar="LOG")
-    report.add_argument("--out", required=True, metavar="FILE", help="the page to write (.html)")
-    report.add_argument("--map", metavar="MAP", help="draw over its ground (default: that of the log's first line)")
+    report.add_argument("--out", required=True, metavar="FILE", help="page to write (.html)")
+    report.add_argument("--map", metavar="MAP", help="map to draw on (default: the map of the flight)")
     report.add_argument(
         "--images",
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with frames of this flight, repeatable, or its film (those of its recording need none)",
+        help="folder of frames of this flight (repeatable), or its video; not needed with a recording",
     )
     add_map_images(report)
-    export = command(commands, "export", run_export, "write matches and fixes of a flight, for a map viewer")
+    export = command(commands, "export", run_export, "export matches and fixes of a flight as GeoJSON or CSV")
     export.add_argument("log", metavar="LOG")
     form = export.add_mutually_exclusive_group(required=True)
     for name in ("geojson", "csv"):
-        form.add_argument(f"--{name}", metavar="FILE", help="file to write, - for standard output")
-    text = "fly a recorded flight again: the same, or with another configuration"
+        form.add_argument(f"--{name}", metavar="FILE", help="file to write (-: standard output)")
+    text = "replay a recorded flight, also with another configuration"
     replay = command(commands, "replay", run_replay, text)
-    replay.add_argument("log", metavar="LOG", help="the flight log; its last flight is taken")
-    replay.add_argument("--map", metavar="MAP", help="the flight's map (default: where it was)")
-    replay.add_argument(
-        "--config", metavar="FILE", help="what if: fly with the keys of this file, and put both side by side"
-    )
+    replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
+    replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
+    replay.add_argument("--config", metavar="FILE", help="replay with the keys of this file, and compare the results")
     add_json(replay)
 
 

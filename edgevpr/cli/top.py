@@ -23,9 +23,9 @@ _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other chann
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "top", run_top, "show how the flight on this computer goes")
+    parser = command(commands, "top", run_top, "show the running flight")
     parser.add_argument("--file", default=_FILE, metavar="PATH", help=f"the flight's status.file ({_FILE})")
-    parser.add_argument("--once", action="store_true", help="show it once, and end")
+    parser.add_argument("--once", action="store_true", help="print the status once")
     add_json(parser)
 
 
