@@ -40,6 +40,8 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all"
     if result.already_here:
         yield f"  {result.already_here} images were in the map already"
+    if result.tilted:
+        yield f"  left out: {result.tilted} tilted by more than 60 degrees (without --fov-deg or --lens: 20)"
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
     if result.without_data or result.says_nothing:

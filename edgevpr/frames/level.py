@@ -136,6 +136,10 @@ def levelled(
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
         return straightened(frame.image, overlay, view, lens.calibrated)
+    if taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
+        # The ground that it shows lies far from the aircraft, in an unknown direction.
+        view = View(reason=f"it is tilted {taking.tilt_deg:.0f} degrees, and its heading is unknown")
+        return straightened(frame.image, overlay, view, lens.calibrated)
     own_m = taking.own_m and scale * taking.own_m
     zoom = own_m / footprint_m if own_m and footprint_m else scale
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:

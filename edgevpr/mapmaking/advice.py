@@ -27,8 +27,9 @@ from edgevpr.core.text import at_work
 from edgevpr.frames.exif import fov_deg_of, read_exif, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
-from edgevpr.frames.positions import find_positions, find_track, read_positions
+from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
 from edgevpr.frames.source import Source, open_source, read_to_end
+from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
 from edgevpr.runtime.recognise.evidence import FEWEST_PLACES
 from edgevpr.runtime.recognise.landmarks import describe
@@ -39,7 +40,9 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _RUNS = 6  # of neighbouring pictures that are compared, spread over the folder
 _RUN_LENGTH = 3
+_TILT_RUN_LENGTH = 12  # those of a video are so close together that only every third or fourth has moved
 _FILM_PICTURES = 10  # of a video, a second apart
+_TILT_FILM_PICTURES = 60
 _LANDMARKS = 500
 # Limits chosen on corridor and grief_stromovka_seasons (ahead: turned by 12 degrees and moved up by 0.07 at most), and
 # on aerial_caliterra and aerial_garfield28. Turning on the spot moves pictures aside too: nearly all must be.
@@ -115,6 +118,30 @@ def require_ahead(pictures: "FlownPictures", mask: Mask | None) -> None:
             f"These pictures look straight down ({why}): give --camera nadir, or --camera forward if they look ahead."
         )
     _log.info("the camera is taken to look ahead (%s): give --camera nadir if it looks straight down", why)
+
+
+@at_work("measuring the tilt of the camera")
+def require_level(pictures: "FlownPictures", fov_deg: float | None) -> None:
+    """Raise UsageError if neighbouring pictures show that a camera that is to look straight down is tilted, and its
+    angles are not recorded: then nothing could level them."""
+    if pictures.folder:
+        paths = [path for run in _runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
+        table = pictures.positions or find_positions(pictures.source)
+        tags = read_positions(table) if table else {}
+        if any(tag.pitch_deg is not None for path in paths for tag in (tags.get(path.name), read_xmp(path)) if tag):
+            return
+        tilt = measure_tilt(_read_usable(paths), fov_deg)
+    else:
+        table = pictures.positions or find_track(pictures.source)
+        if table and any(tag.pitch_deg is not None for tag in read_track(table).tags):
+            return
+        tilt = measure_tilt(_read_film(pictures.source, _TILT_FILM_PICTURES), fov_deg)
+    if tilt and tilt.deg > MAX_UNKNOWN_TILT_DEG:
+        raise UsageError(
+            f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (by {tilt.pairs} pairs of "
+            "neighbouring images), and no angles are recorded: every position would be far off. Add roll_deg and "
+            "pitch_deg to the table of positions and give --fov-deg, or give --camera forward."
+        )
 
 
 def _compare_neighbours(pictures: "FlownPictures", mask: Mask | None) -> tuple[bool, str]:
@@ -201,13 +228,13 @@ def _read_usable(paths: Iterable[Path]) -> Iterator[Image]:
             yield read_image(path)
 
 
-def _runs(folder: Path) -> list[list[Path]]:
+def _runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
     """Choose runs of neighbouring pictures, spread over a folder; none comes twice."""
     paths = list_images(folder)
-    if len(paths) <= _RUNS * _RUN_LENGTH:
+    if len(paths) <= _RUNS * length:
         return [paths]
-    starts = np.linspace(0, len(paths) - _RUN_LENGTH, _RUNS).astype(int).tolist()
-    return [paths[start : start + _RUN_LENGTH] for start in starts]
+    starts = np.linspace(0, len(paths) - length, _RUNS).astype(int).tolist()
+    return [paths[start : start + length] for start in starts]
 
 
 def _gimbal_tilt_deg(folder: Path) -> float | None:

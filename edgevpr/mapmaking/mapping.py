@@ -122,15 +122,17 @@ def measure_ground(place_map: PlaceMap) -> Covered | None:
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
-    `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
-    the orthophoto has no data there. `white`: places cut from it that are white over a third or more. `seams`: places
-    through which a straight seam runs, of the `tried_for_seams`, some of all."""
+    `tilted`: frames that are tilted too far to be levelled. `not_memorable`: frames left out because they failed a
+    salience criterion. `without_data`: places left out because the orthophoto has no data there. `white`: places cut
+    from it that are white over a third or more. `seams`: places through which a straight seam runs, of the
+    `tried_for_seams`, some of all."""
 
     added: int = 0
     without_position: int = 0
     already_here: int = 0
     of_low_quality: int = 0
     says_nothing: int = 0
+    tilted: int = 0
     not_memorable: int = 0
     without_data: int = 0
     white: int = 0
@@ -175,6 +177,9 @@ def build_map(
             if unusable is None:
                 raise ModelError(describe_error(error)) from error
             unusable(ImageError(f"{frame.name}: {describe_error(error)}"))
+            continue
+        if encoded.view.reason:
+            result.tilted += 1
             continue
         of_name = ids_by_image.get((readable(frame.name),), ())
         if says_nothing(encoded.descriptor, min_quality):

@@ -99,7 +99,8 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
 
 
 def test_levelled_without_a_heading_turns_nothing(ground):
-    tilted = replace(taken(ground, heading_deg=0, pitch_deg=25), heading_deg=None)
+    steep, tilted = (replace(taken(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
+    assert "its heading is unknown" in levelled(steep, None, LENS).view.reason
     found = levelled(tilted, None, LENS)
     assert found.view.up_deg is None
     assert off(found.image, from_above(ground, found.view), found.mask) < 0.5
@@ -156,7 +157,7 @@ def test_levelled_takes_what_is_no_number_as_unknown(wrong):
     assert found.view == View(focal=pytest.approx(LENS_FOCAL))
 
 
-TILTED = {"roll_deg": 0.0, "pitch_deg": 40.0}
+TILTED = {"heading_deg": 90.0, "roll_deg": 0.0, "pitch_deg": 40.0}
 
 
 @pytest.mark.parametrize(
@@ -172,7 +173,7 @@ TILTED = {"roll_deg": 0.0, "pitch_deg": 40.0}
 )
 def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose, lens, below, reason):
     image = np.zeros((48, 64), np.uint8)
-    found = levelled(frame_of(image, heading_deg=90.0, **pose), None, lens, below=below)
+    found = levelled(frame_of(image, **pose), None, lens, below=below)
     assert found.image is image
     assert reason in found.view.reason
     assert (found.view.footprint_m, found.view.aside) == (None, None)

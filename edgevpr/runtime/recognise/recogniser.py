@@ -201,6 +201,8 @@ class Recogniser:
         """Search the map for an encoded frame, and learn from the decision what the next query needs."""
         place_filter = self._place_filter if self.matcher.follows else None
         objection = says_nothing(query.descriptor, self.rule.min_quality)
+        if not objection and query.view.reason:
+            objection = f"the image is not levelled: {query.view.reason}"
         if not objection and query.worth:
             objection = query.worth.reason
         if place_filter:

@@ -117,7 +117,6 @@ def test_pictures_are_scaled_to_the_places_that_are_searched_now(walk, ground):
         {"roll_deg": math.nan, "pitch_deg": math.nan},
         *({"height_m": HEIGHT_M * factor} for factor in (-0.05, 0.01, 0.5, 2.0, 100.0)),
         {"heading_deg": math.inf},
-        {"roll_deg": 170.0},
         {"heading_deg": None, "roll_deg": None, "pitch_deg": None, "height_m": None},
     ],
 )
@@ -125,6 +124,12 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | wrong))
     assert not event.failed
     assert recognised(event, 2)
+
+
+@pytest.mark.slow
+def test_a_picture_that_is_not_levelled_is_refused(walk, ground):
+    event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | {"roll_deg": 170.0}))
+    assert (event.accepted, event.reason) == (False, "the image is not levelled: it is tilted 170 degrees")
 
 
 @pytest.mark.slow
