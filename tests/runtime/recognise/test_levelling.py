@@ -127,6 +127,16 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 52.0])
+def test_a_steep_picture_of_known_angles_gives_the_position_of_the_aircraft(walk, ground, pitch_deg):
+    steep = frame(ground, 2, pitch_deg=pitch_deg)
+    event = walk(scaling()).step(steep)
+    assert recognised(event, 2)
+    found = event.located.position
+    assert math.hypot(*offset_m(steep.position.lat_deg, 8.0, found.lat_deg, found.lon_deg)) < 5.0
+
+
+@pytest.mark.slow
 def test_a_picture_that_is_not_levelled_is_refused(walk, ground):
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | {"roll_deg": 170.0}))
     assert (event.accepted, event.reason) == (False, "the image is not levelled: it is tilted 170 degrees")
