@@ -231,8 +231,8 @@ def _open_flown(
     order: MapOrder, pictures: FlownPictures, config: Config, place_map: PlaceMap | None, mask: Mask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
-    map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for one
-    that is tilted by angles that are not recorded."""
+    map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for
+    one that is tilted by angles that are not recorded."""
     source, settings, camera = pictures.open(), order.parameters, config.source.camera
     name = order.technique or (place_map.spec.name if place_map is not None else None)
     asks_camera = camera is None and place_map is None and "camera" not in settings
