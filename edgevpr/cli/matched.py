@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import aligned, nines, shown
+from edgevpr.core.text import aligned, format_probability, shown
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recognition import Recognition
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _NAME_COLUMNS, _REASON_COLUMNS = 17, 48  # with them a row has about 120 columns
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 _NUMBER = re.compile(r"\d+(\.\d+)?%?")
-_UNSURE = re.compile(r"confidence \d|\S+ sure by the flight")  # such reasons begin with figures that the table has
+_UNSURE = re.compile(r"confidence \d|track filter \d")  # such reasons begin with figures that the table has
 
 
 def match_of(event: "Recognition") -> dict[str, Any]:
@@ -63,7 +63,7 @@ def of_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
 def _found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
     """Return the left part of a row: the query, and the place that was found."""
     place, by = match["place"], match.get(sure)
-    certain = "-" if by is None else nines(by) if sure == "confidence" else f"{by:.3f}"
+    certain = "-" if by is None else format_probability(by) if sure == "confidence" else f"{by:.3f}"
     named = f"{place['number']} {_short(place['image'])}" if place else "-"
     return _short(match["query"]), "yes" if match["accepted"] else "no", certain, named
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from edgevpr.cli.shared import add_json, command, show
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import nines, printable
+from edgevpr.core.text import format_probability, printable
 
 _FILE = "/run/edgevpr/status.json"
 _LOOK_S = 1.0  # the flight writes its status once a second
@@ -96,7 +96,7 @@ def _seen(query: dict[str, Any] | None, now_s: float) -> str:
     ago = f"{now_s - query['t_frame_s']:.0f} s ago"
     if not query["accepted"]:
         return f"{ago}, refused: {query['reason']}"
-    sure = "" if query["confidence"] is None else f", confidence {nines(query['confidence'])}"
+    sure = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
     sure += _known(", score {:.3f}", query["score"])
     good = _known(", good to {:.0f} m", query["accuracy_m"])
     return f"{ago}, place {query['place']} ({query['reference_image']}){sure}{good}"

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import lines_of
-from edgevpr.core.text import aligned, beside, nines, shown
+from edgevpr.core.text import aligned, beside, format_probability, shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.simulate.rehearsal_report import RehearsalReport
@@ -197,5 +197,5 @@ def _said(query: dict[str, Any] | None) -> str:
         return "no query"
     if not query["accepted"]:
         return f"refused ({query['reason']})"
-    sure = "" if query["confidence"] is None else f" with {nines(query['confidence'])}"
+    sure = "" if query["confidence"] is None else f" with {format_probability(query['confidence'])}"
     return f"place {query['place']} accepted{sure}"

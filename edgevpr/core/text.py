@@ -22,7 +22,10 @@ T = TypeVar("T")
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 # Passwords and keys in the query part of an address, such as ?token=abc, which cameras use too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
-_COLUMNS, _TERMINAL_COLUMNS = 120, 79
+_COLUMNS = 120
+_TERMINAL_COLUMNS = 79
+_FEW_WRONG = 1e-3  # of all matches: fewer are not to be told apart in per cent
+_LEAST_WRONG = 1e-6
 _SILENT_S = 5.0  # a line is written after so long a silence
 _SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
 
@@ -189,14 +192,12 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
         stream.flush()
 
 
-def nines(probability: float) -> str:
-    """Show a probability with four digits or, close to 1, with as many as tell it from 1, at most 15: `0.9812`,
-    `0.99999970`."""
-    wrong = max(1 - probability, 1e-15)
-    if not wrong < 1:  # NaN as well
-        return f"{probability:.4f}"
-    digits = min(15, max(4, 1 - math.floor(math.log10(wrong))))
-    return f"{1 - wrong:.{digits}f}"
+def format_probability(probability: float) -> str:
+    """Show the probability of being right: "98.1 %" or, from 99.9 % on, "1 in 3,000 wrong", at most 1 in 1,000,000."""
+    wrong = max(1 - probability, _LEAST_WRONG)
+    if not wrong <= _FEW_WRONG:  # NaN as well
+        return f"{100 * probability:.1f} %"
+    return f"1 in {float(f'{1 / wrong:.1g}'):,.0f} wrong"
 
 
 def beside(east_m: float, north_m: float) -> str:

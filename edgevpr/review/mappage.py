@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgevpr.core.geodesy import axes_of, distance_m, moved, offset_m
-from edgevpr.core.text import nines
+from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.calibrate import LookAlike
 from edgevpr.review.album import Album
@@ -120,12 +120,14 @@ def _steps(
         said = [f"quality {place.quality:.2f}: the share of its picture that holds information"]
         said += [f"known to {figure(sd_m, 'm')}; its picture shows {pose.footprint_m:.3g} m of ground"] if pose else []
         said += [f"its tag lies {tags_off_m[place_id]:.0f} m from its picture"] if place_id in tags_off_m else []
-        said += [] if confidence is None else [f"mean confidence of its altered pictures: {nines(confidence)}"]
+        said += (
+            [] if confidence is None else [f"mean confidence of its altered pictures: {format_probability(confidence)}"]
+        )
         pictures = [("place", place.source_image, f"place {place_id}: {place.source_image}")]
         at = {"alike": points.get(twin.other_id) if twin else None, "weak": own if is_hard else None}
         if twin:
             image = images.get(twin.other_id, "")
-            said.append(f"looks like place {twin.other_id}: confidence {nines(twin.confidence)}")
+            said.append(f"looks like place {twin.other_id}: confidence {format_probability(twin.confidence)}")
             pictures.append(("place", image, f"looks alike: place {twin.other_id}: {image}"))
         yield Step(
             title=f"Place {place_id}: {place.source_image}",

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import nines, shown
+from edgevpr.core.text import format_probability, shown
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album
 from edgevpr.review.html import (
@@ -175,7 +175,7 @@ def _place_found(query: LoggedQuery) -> str:
     if query.place is None:
         return "no place was found"
     score = figure(number(query.line, "score"))
-    confidence = "" if query.confidence is None else f", confidence {nines(query.confidence)}"
+    confidence = "" if query.confidence is None else f", confidence {format_probability(query.confidence)}"
     return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
 
 

@@ -6,7 +6,7 @@ import os
 import pytest
 from fakes import FakeClock
 
-from edgevpr.core.text import nines, progress, waiting
+from edgevpr.core.text import format_probability, progress, waiting
 
 
 def test_a_file_gets_a_line_for_every_tenth():
@@ -59,6 +59,15 @@ def test_the_time_that_is_left_is_told_once_it_can_be_known():
     assert lines[-1] == "sets  40/40  100 %"
 
 
-@pytest.mark.parametrize(("probability", "said"), [(0.5, "0.5000"), (0.9999997, "0.99999970"), (1.0, "0." + 15 * "9")])
-def test_a_probability_shows_as_many_nines_as_it_has(probability, said):
-    assert nines(probability) == said
+@pytest.mark.parametrize(
+    ("probability", "said"),
+    [
+        (0.5, "50.0 %"),
+        (0.9989, "99.9 %"),
+        (0.9997, "1 in 3,000 wrong"),
+        (0.9999997, "1 in 1,000,000 wrong"),
+        (1.0, "1 in 1,000,000 wrong"),
+    ],
+)
+def test_format_probability_never_shows_a_row_of_nines(probability, said):
+    assert format_probability(probability) == said

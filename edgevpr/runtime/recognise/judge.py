@@ -13,7 +13,7 @@ import numpy as np
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.geodesy import shorter_deg
-from edgevpr.core.text import nines
+from edgevpr.core.text import format_probability
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
@@ -231,9 +231,9 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if evidence is None:
         return Verdict(False, "nothing is known that could make it sure")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = f"confidence {nines(confidence)}, {nines(needed)} needed: {evidence.describe()}"
+    figures = f"confidence {format_probability(confidence)}, {format_probability(needed)} needed: {evidence.describe()}"
     if followed is not None:
-        figures = f"{nines(followed)} sure by the flight so far; {figures}"
+        figures = f"track filter {format_probability(followed)}; {figures}"
     by_itself = confidence >= needed
     if not (by_itself or (followed is not None and _is_sure_by_flight(followed, confidence, needed, sure.precision))):
         return Verdict(False, figures)

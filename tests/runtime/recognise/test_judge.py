@@ -11,7 +11,7 @@ from sureness import NEEDED, agreed, bare_index, sure_rule, told
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.text import nines
+from edgevpr.core.text import format_probability
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence
@@ -43,7 +43,9 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     rule = sure_rule(lambda evidence: confidence)
     verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
-    assert verdict.reason.startswith(f"confidence {nines(confidence)}, 0.9000 needed: 2.01 times as many regions agree")
+    assert verdict.reason.startswith(
+        f"confidence {format_probability(confidence)}, 90.0 % needed: 2.01 times as many regions agree"
+    )
     assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
     )
@@ -156,7 +158,7 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
     assert verdict.accepted is accepted
     assert f"{inliers} landmarks agree, and {rival} with a place elsewhere" in verdict.reason
     if not accepted:
-        assert verdict.reason.startswith("confidence 0.5000, ")
+        assert verdict.reason.startswith("confidence 50.0 %, ")
         by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, by_flight=0.999)
         assert by_flight.accepted, "the flight knows which of the two it is"
 
