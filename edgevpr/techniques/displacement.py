@@ -179,6 +179,8 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
             return match
         if again == _ROUNDS:
             break
+        if np.ptp(mine[near].real) == np.ptp(mine[near].imag) == 0:
+            return match  # one point has no rotation
         turned, shift = fit_similarity(mine[near], there[near])
         if not 1 / _FURTHEST_SCALE < abs(turned) < _FURTHEST_SCALE:
             return match

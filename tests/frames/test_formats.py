@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from fakes import FakeCapture
 
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.decoding import WholePictures, open_pictures
@@ -180,10 +179,13 @@ def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
     assert np.abs(looks[0].astype(int) - looks[1]).mean() > 3
 
 
-class ThermalCamera(FakeCapture):
+class ThermalCamera:
     """A V4L2 camera of 16 bits, which OpenCV cuts down to 8 unless it is told not to."""
 
     converts = True
+
+    def __init__(self, pictures) -> None:
+        self._pictures = iter(pictures)
 
     def get(self, prop: int) -> float:
         return float(cv2.VideoWriter.fourcc(*"Y16 ")) if prop == cv2.CAP_PROP_FOURCC else 0.0
@@ -192,8 +194,8 @@ class ThermalCamera(FakeCapture):
         self.converts = self.converts and prop != cv2.CAP_PROP_CONVERT_RGB
 
     def read(self):
-        is_read, counts = super().read()
-        return is_read, cv2.merge([(counts >> 8).astype(np.uint8)] * 3) if self.converts else counts
+        counts = next(self._pictures)
+        return True, cv2.merge([(counts >> 8).astype(np.uint8)] * 3) if self.converts else counts
 
 
 def test_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path):
