@@ -57,7 +57,7 @@ def run_top(args: Namespace) -> int:
 def _no_flight(file: str) -> tuple[str, str]:
     """Return what to say, in two lines, where no flight tells its status in `file`."""
     return (
-        f"No flight tells its status at {file}:",
+        f"No running flight writes its status to {file}:",
         "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and name that PATH with --file.",
     )
 

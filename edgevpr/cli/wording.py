@@ -69,15 +69,15 @@ def of_refined(path: str, refined: "Refined") -> Iterator[str]:
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return
-    yield f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} ties between pictures"
+    yield f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} links between images"
     if refined.footprint_m:
-        moved = f"moved by {refined.moved_m:.1f} m, known to {refined.position_sd_m:.1f} m (medians)"
-        yield f"  position    {moved}; as recorded they scatter by {refined.recorded_sd_m:.1f} m"
-        yield f"  footprint   a picture shows {refined.footprint_m:.0f} m of ground along its longest side (median)"
+        moved = f"corrected by {refined.moved_m:.1f} m, accurate to {refined.position_sd_m:.1f} m (medians)"
+        yield f"  position    {moved}; the GPS tags scatter by {refined.recorded_sd_m:.1f} m"
+        yield f"  footprint   an image shows {refined.footprint_m:.0f} m of ground along its longest side (median)"
     if refined.surveyed:
         yield f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
-        yield f"  not tied    {not_tied} stay where they were recorded: a fix there is as fine as the spacing"
+        yield f"  not linked  {not_tied} keep their recorded position: a fix there is as accurate as the spacing"
     for place_id, image, off_m in refined.contradictory:
         yield f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies"
 
@@ -96,8 +96,8 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
         yield f"  time        {info.first_time} to {info.last_time}"
     if info.with_pose:
         shown = " or ".join(f"{each:.0f}" for each in info.footprints_m)
-        seen = f"a picture shows {shown} m of ground along its longest side"
-        yield f"  pose        of {info.with_pose} places, known to {info.position_sd_m:.1f} m; {seen}"
+        seen = f"an image shows {shown} m of ground along its longest side"
+        yield f"  pose        of {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {seen}"
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
     if info.attribution:

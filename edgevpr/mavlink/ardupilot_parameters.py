@@ -77,7 +77,7 @@ def choose_ardupilot_channel(kind: Kind, parameters: Parameters) -> Choice:
     if parameters.get(VISION) == _MAVLINK_VISION:
         return Choice(Channel.ODOMETRY, f"ODOMETRY, as its {VISION} is {_MAVLINK_VISION}")
     if kind is Kind.PLANE:
-        return Choice(Channel.COMMAND, "command 43003, which a plane that reckons takes at any time")
+        return Choice(Channel.COMMAND, "command 43003, which a dead-reckoning plane accepts at any time")
     return Choice(
         Channel.COMMAND,
         f"command 43003, which a {kind.value} without GPS takes only as long as optical flow carries it: set "

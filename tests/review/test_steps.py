@@ -60,7 +60,7 @@ def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
 
 
 def test_only_chosen_reasons_stay_on_ground_lanes_and_slider(page):
-    label = page.locator("label:has([data-group])", has_text="score … is below …")
+    label = page.locator("label:has([data-group])", has_text="not similar enough")
     count = int(label.locator("b").inner_text())
     assert 0 < count < COUNT
     label.locator("input").check()

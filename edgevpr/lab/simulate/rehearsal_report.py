@@ -71,10 +71,10 @@ class RehearsalReport:
     def answer(self) -> str:
         """The outcome in a sentence."""
         if not self.is_to_work:
-            return f"This mission is not to be expected to work over this map: {'; '.join(self.reasons)}."
+            return f"This mission is expected to fail over this map: {'; '.join(self.reasons)}."
         most_m = self.autopilot_error.most_m if self.autopilot_error else math.nan
         return (
-            "This mission is to be expected to work over this map: without GPS the autopilot was at most "
+            "This mission is expected to work over this map: without GPS the autopilot was at most "
             f"{most_m:.0f} m off, and no match was wrong."
         )
 

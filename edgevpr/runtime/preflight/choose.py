@@ -232,7 +232,7 @@ def describe_option(board: Board, option: Option, demand: Demand) -> str:
     figures = (
         f"{option.accuracy or 'never measured'}; {demand} take {fit.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the "
         f"process {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_round_down(fit.reachable_hz):g} Hz "
-        f"of {demand.rate_hz:g} are reached with {board.cores * board.cpu_share:.2g} of {board.cores} cores"
+        f"with {board.cores * board.cpu_share:.2g} of {board.cores} cores ({demand.rate_hz:g} Hz needed)"
     )
     return f"{figures}; it {fit.misfit}" if fit.misfit else figures
 

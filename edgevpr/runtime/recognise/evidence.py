@@ -100,7 +100,9 @@ class Evidence:
 
     def describe(self) -> str:
         """Describe the evidence in words, for the log."""
-        ahead = f"{math.exp(self.lead):.2f} times as many regions agree as elsewhere ({math.exp(self.agree):.1%})"
+        ahead = (
+            f"{math.exp(self.lead):.1f} times as many regions agree as for the runner-up ({math.exp(self.agree):.0%})"
+        )
         if self.landmarks is not None:
             rival = "" if self.rival is None else f", and {_to_count(self.rival)} with a place elsewhere"
             return f"{ahead}, {_to_count(self.landmarks)} landmarks agree{rival}"
@@ -149,15 +151,15 @@ class MapCalibration:
         """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
         if not self.recognisable:  # see `of_several`
             return (
-                f"the most cautious of its parts counts; of {self.asked} changed pictures of places in their own part "
-                f"at least {100 * self.accepted:.0f} % were accepted, at a precision of {100 * self.precision:.6g} %"
+                f"the most cautious of its parts counts: of {self.asked} altered copies of their own images at least "
+                f"{100 * self.accepted:.0f} % were accepted, at a precision of {100 * self.precision:.6g} %"
             )
-        wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'}"
+        wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
         alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
-            f"of {self.asked} changed pictures of its own places {100 * self.accepted:.0f} % were accepted, at a "
-            f"precision of {100 * self.precision:.6g} %, and {wrong}; {100 * self.hardly_recognisable:.0f} % of "
-            f"{len(self.recognisable)} places are hardly recognisable{alike}"
+            f"of {self.asked} altered copies of its own images {100 * self.accepted:.0f} % were accepted, at a "
+            f"precision of {100 * self.precision:.6g} %; {wrong}; {100 * self.hardly_recognisable:.0f} % of "
+            f"{len(self.recognisable)} places are hard to recognise{alike}"
         )
 
 

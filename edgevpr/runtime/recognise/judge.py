@@ -176,7 +176,7 @@ def says_nothing(query: Descriptor, min_quality: float) -> str | None:
     quality is at least `min_quality`. The few regions that hold information can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
-    return f"the picture says nothing: {query.quality:.0%} of it holds information, {min_quality:.0%} are needed"
+    return f"too little texture in the image: {query.quality:.0%} usable, {min_quality:.0%} needed"
 
 
 def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
@@ -208,7 +208,7 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
     if where and where.objection:
         return Verdict(False, where.objection)
     if findings.is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
-        return Verdict(False, f"this place was learnt within the last {NEW_FOR_S:g} s and says nothing new")
+        return Verdict(False, f"place was learnt within the last {NEW_FOR_S:g} s: it repeats the autopilot's position")
     return verdict
 
 
@@ -217,11 +217,11 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | 
     (None: there is no place elsewhere)."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
-        return f"score {score:.3f} is below {least:.3f}"
+        return f"not similar enough to any place: score {score:.3f}, {least:.3f} needed"
     if ahead is None and rule.min_score == 0 and rule.sure is None:
-        return "there is no place elsewhere to compare with, and this score alone says nothing"
+        return "no place elsewhere to compare with: the score alone does not decide"
     if ahead is not None and not ahead >= rule.min_margin:
-        return f"only {ahead:.3f} ahead of a place elsewhere, {rule.min_margin:.3f} needed"
+        return f"too little ahead of a place elsewhere: {ahead:.3f}, {rule.min_margin:.3f} needed"
     return None
 
 
@@ -229,7 +229,7 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
     evidence, followed = findings.evidence, findings.by_flight
     if evidence is None:
-        return Verdict(False, "nothing is known that could make it sure")
+        return Verdict(False, "map is not calibrated: no confidence available")
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
     figures = f"confidence {format_probability(confidence)}, {format_probability(needed)} needed: {evidence.describe()}"
     if followed is not None:
@@ -240,7 +240,7 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if evidence.lead < 0 and not by_itself:
         return Verdict(False, f"a place elsewhere agrees better: {figures}")
     if followed is not None and followed < _MIN_FOLLOWED:
-        return Verdict(False, f"the flight so far speaks against it: {figures}")
+        return Verdict(False, f"the track filter contradicts it: {figures}")
     if findings.ahead_of_turned is not None and findings.ahead_of_turned < _MIN_LEAD_OVER_TURNED:
         return Verdict(False, f"the same place agrees nearly as well if the picture is turned otherwise; {figures}")
     return Verdict(True, figures)
@@ -256,9 +256,9 @@ def _is_sure_by_flight(followed: float, confidence: float, needed: float, precis
 def _disproves(proof: Agreement, score: float) -> str | None:
     """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
     if not proof.is_expected:
-        return f"its landmarks lie otherwise than its regions: {proof.inliers} agree on another step"
+        return f"landmarks and regions disagree on the offset: {proof.inliers} landmarks support another one"
     if score >= _CLEAR_SCORE and proof.inliers < _MIN_INLIERS and proof.possible >= _ENOUGH_LANDMARKS:
-        return f"its landmarks do not agree: {proof.inliers} do, and {_MIN_INLIERS} are needed where so much does"
+        return f"too few landmarks agree: {proof.inliers}, {_MIN_INLIERS} needed at such a score"
     return None
 
 

@@ -108,7 +108,7 @@ def levelling_of(
         return Straightening(calibrated) if calibrated else None
     lens, mount = lens_of(config), mount_of(config)
     if lens is None:
-        _log.info("`source.fov_deg` is not set: pictures are neither untilted nor scaled nor turned")
+        _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
     return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_now(config), mount=mount)
