@@ -31,7 +31,7 @@ def flown(dockerfile):
 
 @pytest.mark.slow
 @pytest.mark.process
-def test_what_is_copied_is_enough_for_the_wheel(dockerfile, tmp_path):
+def test_dockerfile_copies_enough_for_the_wheel(dockerfile, tmp_path):
     for each in dockerfile.structure:
         if each["instruction"] == "COPY" and not each["value"].startswith("--from"):
             *sources, target = each["value"].split()
@@ -48,7 +48,7 @@ def test_what_is_copied_is_enough_for_the_wheel(dockerfile, tmp_path):
     assert list(tmp_path.glob(f"dist/edgevpr-{__version__}-*.whl"))
 
 
-def test_what_flies_is_no_root_and_installs_nothing(dockerfile, flown):
+def test_dockerfile_flies_without_root_and_installs_nothing(dockerfile, flown):
     build, last = dockerfile.parent_images
     assert build == last, "another Python could not use the packages"
     assert flown["USER"] == "edgevpr"

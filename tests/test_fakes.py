@@ -35,7 +35,7 @@ def recording(request, tmp_path):
     return open_source(str(tmp_path), live=True)
 
 
-def test_a_recording_is_read_to_its_end(recording):
+def test_source_of_a_recording_is_read_to_its_end(recording):
     assert (recording.is_live, recording.total, recording.dropped) == (False, COUNT, None)
     assert (recording.condition, recording.state, recording.ended) == (Condition.RUNNING, "reading", False)
     first = recording.read(0.0)
@@ -65,7 +65,7 @@ def camera(request):
     source.close()
 
 
-def test_a_camera_is_live_and_can_be_lost(camera):
+def test_source_of_a_camera_can_be_lost(camera):
     source, lose = camera
     assert (source.is_live, source.total, source.ended) == (True, 0, False)
     frame = wait_until(lambda: source.read(0.05))
@@ -111,7 +111,7 @@ def fix(clock, age_s=0.0):
     return Fix(50.0, 8.0, 20.0, clock.now_s - age_s)
 
 
-def test_a_fix_is_sent_and_answered(link):
+def test_send_fix_is_answered(link):
     link, clock = link
     sending = link.send_fix(fix(clock))
     sending.wait(10.0)
@@ -122,7 +122,7 @@ def test_a_fix_is_sent_and_answered(link):
 
 
 @pytest.mark.slow
-def test_a_fix_of_an_old_frame_never_leaves(link):
+def test_send_fix_drops_a_fix_of_an_old_frame(link):
     link, clock = link
     sending = link.send_fix(fix(clock, age_s=6.2))
     sending.wait(10.0)
@@ -130,7 +130,7 @@ def test_a_fix_of_an_old_frame_never_leaves(link):
     assert (link.stats().fixes_sent, link.stats().dropped_stale_fixes) == (0, 1)
 
 
-def test_where_the_vehicle_is_and_whether_it_listens(link):
+def test_link_reports_the_vehicle_and_whether_it_listens(link):
     link, clock = link
     assert link.listens()
     vehicle = link.vehicle()
@@ -142,7 +142,7 @@ def test_where_the_vehicle_is_and_whether_it_listens(link):
 
 
 @pytest.mark.parametrize("kind", ["real", "fake"])
-def test_a_text_is_announced_and_a_wish_of_the_ground_is_handed_on_where_it_is_offered(kind):
+def test_link_announces_texts_and_hands_on_wishes(kind):
     clock, port = FakeClock(), UdpPort()
     link = FakeLink(clock)
     if kind == "real":
@@ -170,7 +170,7 @@ def test_a_text_is_announced_and_a_wish_of_the_ground_is_handed_on_where_it_is_o
 
 
 @pytest.mark.parametrize("kind", ["real", "fake"])
-def test_without_an_autopilot_a_fix_waits_for_a_second_and_is_dropped(kind):
+def test_send_fix_waits_a_second_for_an_autopilot(kind):
     clock = FakeClock()
     port = UdpPort()
     link = FakeLink(clock, answer=None)

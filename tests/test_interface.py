@@ -52,7 +52,7 @@ def valley(flight):
     return path
 
 
-def test_a_picture_is_found_with_its_position_and_what_it_rests_on(flight, valley):
+def test_map_match_returns_position_and_confidence(flight, valley):
     with edgevpr.Map(valley) as ground:
         assert len(ground) == PLACES
         assert [place.source_image for place in ground.places()] == [f"{place}.jpg" for place in range(PLACES)]
@@ -73,7 +73,7 @@ def test_a_picture_is_found_with_its_position_and_what_it_rests_on(flight, valle
         assert nothing.reason
 
 
-def test_what_is_known_narrows_the_search(flight, valley):
+def test_map_match_uses_what_is_known(flight, valley):
     picture = cv2.imread(str(flight / "later" / "3.jpg"))
     with edgevpr.Map(valley) as ground:
         turned_deg = ground.match(picture).turned_deg
@@ -82,7 +82,7 @@ def test_what_is_known_narrows_the_search(flight, valley):
         assert ground.match(picture, near=Position(50.006, 8.0)).accepted
 
 
-def test_what_cannot_be_done_gets_a_sentence(flight, valley, tmp_path):
+def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
     with pytest.raises(MapError, match="nowhere"):
         edgevpr.Map(tmp_path / "nowhere.gpkg")
     with edgevpr.Map(valley) as ground, pytest.raises(ImageError):
@@ -115,7 +115,7 @@ def test_import_loads_nothing_heavy_before_it_is_needed(module):
         ("to_ros2.py", ["{valley}", "{flight}/later"], "pose "),
     ],
 )
-def test_the_examples_run(flight, valley, tmp_path, script, more, said):
+def test_examples_run(flight, valley, tmp_path, script, more, said):
     words = [word.format(flight=flight, valley=valley, tmp=tmp_path) for word in more]
     done = subprocess.run([sys.executable, EXAMPLES / script, *words], capture_output=True, text=True, env=os.environ)
     assert done.returncode == 0, done.stderr
@@ -125,7 +125,7 @@ def test_the_examples_run(flight, valley, tmp_path, script, more, said):
 
 
 @pytest.mark.process
-def test_the_example_of_a_film_makes_one_that_is_placed_by_its_subtitles(flight, tmp_path, capsys):
+def test_example_of_a_film_with_subtitles(flight, tmp_path, capsys):
     (tmp_path / "images").symlink_to(flight / "mapped")
     lines = (flight / "mapped" / "positions.csv").read_text().splitlines()
     (tmp_path / "positions.csv").write_text(

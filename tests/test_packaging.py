@@ -25,12 +25,12 @@ def wheel(tmp_path_factory) -> Path:
     return path
 
 
-def test_nothing_is_compiled_on_the_aircraft(wheel):
+def test_wheel_is_pure_python(wheel):
     assert wheel.name.endswith("-py3-none-any.whl")
     assert not [name for name in zipfile.ZipFile(wheel).namelist() if name.endswith((".so", ".pyd", ".c"))]
 
 
-def test_profiles_models_and_deployment_files_travel_inside(wheel):
+def test_wheel_has_profiles_models_and_deployment_files(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for kind in ("profiles", "models", "deploy"):
         there = [path for path in (ROOT / kind).rglob("*") if path.is_file() and path.parent.name != "__pycache__"]
@@ -41,7 +41,7 @@ def test_profiles_models_and_deployment_files_travel_inside(wheel):
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-def test_every_module_and_nothing_else_travels(wheel):
+def test_wheel_has_every_module_and_nothing_else(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "edgevpr").rglob("*.py")}
     figures = {f"edgevpr/runtime/preflight/{name}.json" for name in ("accuracy", "counted")}
@@ -55,7 +55,7 @@ def test_every_module_and_nothing_else_travels(wheel):
     assert {name for name in names if not name.startswith("edgevpr/shipped/")} == code | figures | looks
 
 
-def test_what_is_installed_works_far_from_the_checkout(wheel, tmp_path):
+def test_wheel_works_without_the_checkout(wheel, tmp_path):
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     elsewhere.mkdir()
     pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-version-check"]

@@ -9,7 +9,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.techniques import create
 
 
-def test_the_whole_walk(tmp_path):
+def test_flight_from_pictures_to_a_fix(tmp_path):
     frames = [
         Frame(image=textured(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
     ]

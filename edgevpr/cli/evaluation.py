@@ -31,7 +31,7 @@ from edgevpr.core.text import progress, shown
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from edgevpr.lab.evaluate.metrics import Quality
+    from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult
     from edgevpr.lab.evaluate.plan import EvaluationPlan, RowPlan
 
 
@@ -94,27 +94,24 @@ def _measure_techniques(args: Namespace) -> int:
     from edgevpr.lab.evaluate.evaluate import evaluate
     from edgevpr.lab.evaluate.metrics import compare
     from edgevpr.runtime.recognise.opening import gate_of
-    from edgevpr.techniques import create
 
     if args.sets or args.workers or len(args.data or ()) > 1:
         raise UsageError("--sets, --workers and several sets need a folder for the results: name it with --out.")
     plan = _plan(args)
-    errors: dict[str, ModelError] = {}  # by technique, whatever the form
-    for row in plan.rows.values():
-        try:
-            if row.technique not in errors:
-                create(row.technique, row.settings(None))
-        except ModelError as error:  # the other techniques are still measured
-            errors[row.technique] = error
-    rows = [row for row in plan.rows.values() if row.technique not in errors]
-    if not rows:
-        raise next(iter(errors.values()))
     gate = gate_of(config_of(args, args.config).salience)
     (chosen,) = plan.sets.values()
+    measured: list[TechniqueResult] = []
+    errors: dict[str, ModelError] = {}  # by technique, whatever the form
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as videos:
         dataset = chosen.open(Path(videos), progress)
         _say_cameras(plan)
-        measured = [evaluate(row.technique, dataset, row.settings(None), row, progress, gate) for row in rows]
+        for row in plan.rows.values():
+            try:
+                measured.append(evaluate(row.technique, dataset, row.settings(None), row, progress, gate))
+            except ModelError as error:  # the other techniques are still measured
+                errors[row.technique] = error
+    if not measured:
+        raise next(iter(errors.values()))
     _show("techniques", compare(measured), args.json)
     report(*(f"{technique} was not measured: {error}" for technique, error in errors.items()))
     return 1 if errors else 0

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.cli.maps import add_orthophoto, cuttings_of
-from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, group, show
+from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, group, lines_of, report, show
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress
 
 _PLACES_PER_TILE = 10_000
-_MOST_TOLD = 10  # tiles that are not mapped: a store that is away says the same of each
+_MAX_SHOWN = 10  # problems: a store that is away causes the same one for each tile
 _OF_PASSES = ("merged", "faded", "changed")  # of several flights over the same ground
 
 
@@ -62,42 +62,23 @@ def fleet_build(args: Namespace) -> int:
     out = out.absolute()
     order = FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
     done = list(building.build(order, tasks, args.scheduler, args.workers, progress))
-    problems = {each.key: each.problem for each in done if each.problem}
+    tiles = [each.tile for each in done if each.tile]
     unusable = [text for each in done for text in each.unusable]
-    result = {
+    problems = {each.key: each.problem for each in done if each.problem}
+    result: dict[str, Any] = {
         "maps": str(out),
-        "tiles": sum(each.tile is not None for each in done),
+        "tiles": len(tiles),
         "mapped_now": sum(each.is_new for each in done),
-        "places": sum(each.tile.places for each in done if each.tile),
-        "not_calibrated": sum(each.tile.expected is None for each in done if each.tile),
-        **{name: sum(getattr(each.tile, name) for each in done if each.tile) for name in _OF_PASSES},
+        "places": sum(tile.places for tile in tiles),
+        "not_calibrated": sum(tile.expected is None for tile in tiles),
+        **{name: sum(getattr(tile, name) for tile in tiles) for name in _OF_PASSES},
         "without_position": without_position,
         "unusable": unusable,
         "problems": problems,
     }
-    # Only their keys: the index has what there is to say of each, and there may be thousands.
-    show({**result, "new": [each.key for each in done if each.is_new]}, args.json, _said(result))
+    # The keys of new tiles only: the index has the rest, and there may be thousands.
+    text = {**result, "unusable": unusable[:_MAX_SHOWN], "problems": dict(list(problems.items())[:_MAX_SHOWN])}
+    show({**result, "new": [each.key for each in done if each.is_new]}, args.json, lines_of(text))
+    if more := max(len(unusable), len(problems), _MAX_SHOWN) - _MAX_SHOWN:
+        report(f"{more} more problems are not shown: --json has all")
     return 1 if problems or unusable else 0
-
-
-def _said(result: dict[str, Any]) -> list[str]:
-    lines = [
-        f"{result['maps']}: {result['places']} places in {result['tiles']} tiles, {result['mapped_now']} mapped anew; "
-        "index.gpkg shows them"
-    ]
-    if result["not_calibrated"]:
-        lines.append(f"  {result['not_calibrated']} tiles are not calibrated: they fly with the shipped confidence")
-    if any(result[name] for name in _OF_PASSES):
-        lines.append(
-            f"  of several flights over the same ground: {result['merged']} places became part of others, "
-            f"{result['faded']} faded; changed spots: {result['changed']} (layer `changes` of the tiles)"
-        )
-    if result["without_position"]:
-        lines.append(f"  left out: {result['without_position']} photographs without a position")
-    if result["unusable"]:
-        lines.append(f"  left out: {len(result['unusable'])} photographs: {result['unusable'][0]}")
-    told = list(result["problems"].items())[:_MOST_TOLD]
-    lines += [f"  not mapped  tile {key}: {problem}" for key, problem in told]
-    if more := len(result["problems"]) - len(told):
-        lines.append(f"  not mapped  {more} tiles more: --json names them")
-    return lines

@@ -26,7 +26,7 @@ from edgevpr.cli.shared import (
 )
 from edgevpr.core.config import Config, with_logs_in
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import progress, shown, waiting
+from edgevpr.core.text import progress, shown
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -182,10 +182,29 @@ def run_flight(args: Namespace) -> int:
 def run_check(args: Namespace) -> int:
     """Run `check`: check whether a flight can start with a configuration, and print the findings."""
     from edgevpr.runtime.service.check import check
-    from edgevpr.runtime.service.finding import lines
 
-    findings = check(args.config, offline=args.offline, say=waiting)
-    show(_found(findings), args.json, lines(findings))
+    return _show_findings(check(args.config, offline=args.offline), args.json)
+
+
+def run_doctor(args: Namespace) -> int:
+    """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
+    from edgevpr.mavlink.address import parse_link
+    from edgevpr.runtime.service.doctor import doctor
+
+    config = config_of(args, args.config)
+    if config.mavlink.link is None:
+        raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
+    address = parse_link(config.mavlink.link)
+    findings, reading = doctor(config, address)
+    return _show_findings(findings, args.json, link=str(address), reading=reading and asdict(reading))
+
+
+def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) -> int:
+    """Print findings, in JSON with the fields `others`, and return the exit code."""
+    from edgevpr.runtime.service.finding import format_findings
+
+    is_ok, fields = all(finding.ok for finding in findings), [asdict(finding) for finding in findings]
+    show({**others, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
     return max(finding.exit_code for finding in findings)
 
 
@@ -202,9 +221,9 @@ def service_install(args: Namespace) -> int:
     """Run `service install`: install the service on this machine."""
     from edgevpr.runtime.service.install import install
 
-    install(path_of(args.config), args.dry_run, _say)
-    _say("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
-    _say("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
+    install(path_of(args.config), args.dry_run, _print_step)
+    _print_step("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
+    _print_step("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
     return 0
 
 
@@ -212,29 +231,9 @@ def service_uninstall(args: Namespace) -> int:
     """Run `service uninstall`: remove the service from this machine."""
     from edgevpr.runtime.service.install import uninstall
 
-    uninstall(args.dry_run, _say)
+    uninstall(args.dry_run, _print_step)
     return 0
 
 
-def _say(line: str) -> None:
+def _print_step(line: str) -> None:
     print(shown(line), flush=True)  # some steps take minutes
-
-
-def run_doctor(args: Namespace) -> int:
-    """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
-    from edgevpr.mavlink.address import parse_link
-    from edgevpr.runtime.service.doctor import doctor
-    from edgevpr.runtime.service.finding import lines
-
-    config = config_of(args, args.config)
-    if config.mavlink.link is None:
-        raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
-    address = parse_link(config.mavlink.link)
-    findings, reading = doctor(config, address, waiting)
-    known = {"link": str(address), **_found(findings), "reading": reading and asdict(reading)}
-    show(known, args.json, lines(findings))
-    return max(finding.exit_code for finding in findings)
-
-
-def _found(findings: "Sequence[Finding]") -> dict[str, Any]:
-    return {"ok": all(each.ok for each in findings), "findings": [asdict(each) for each in findings]}

@@ -5,8 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, command, group, show
-from edgevpr.cli.wording import of_networks
+from edgevpr.cli.shared import add_json, command, group, lines_of, show
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.core.text import progress
 
@@ -29,8 +28,9 @@ def models_list(args: Namespace) -> int:
     from edgevpr.core.files import model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
-    found = list_models()
-    show([asdict(each) for each in found], args.json, of_networks(found, list(map(str, model_folders()))))
+    found = [asdict(each) for each in list_models()]
+    text = {each["name"]: {name: value for name, value in each.items() if name != "name"} for each in found}
+    show(found, args.json, lines_of({**text, "folders": list(map(str, model_folders()))}))
     return 0
 
 

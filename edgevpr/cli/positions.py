@@ -1,7 +1,6 @@
 """`edgevpr positions`: where pictures were taken, from a log, a track, subtitles or a table."""
 
 from argparse import Namespace
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,15 +63,5 @@ def positions(args: Namespace) -> int:
         "rounded_m": rounded_m(placed),
         "out": str(out),
     }
-    show(found, args.json, _text(args.record, found))
+    show(found, args.json)
     return 0
-
-
-def _text(record: str, found: dict[str, Any]) -> Iterator[str]:
-    yield f"{record}: {found['record']}"
-    of = f" of {found['of']} pictures" if found["of"] is not None else " positions"
-    offset_s = found["offset_s"]
-    clock = "" if offset_s is None else f", {offset_s:g} s added to the camera's clock"
-    yield f"{found['out']}: {found['placed']}{of}, {found['how']}{clock}"
-    if found["rounded_m"]:
-        yield f"positions are rounded to {found['rounded_m']:.0f} m: `map build` mends it where the camera looks down"

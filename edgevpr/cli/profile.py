@@ -1,6 +1,6 @@
 """`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, positive, report, show
 from edgevpr.core.errors import UsageError
-from edgevpr.core.text import at_work, progress
+from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
@@ -24,14 +24,6 @@ def add(commands: Any) -> None:
     asked.add_argument("--detect", action="store_true", help="say which board this is, and why; see --out")
     asked.add_argument("--map", metavar="MAP", help="the map to fly with: what its technique costs")
     asked.add_argument("--places", type=count, metavar="N", help="places to fly with: what every technique costs")
-    _add_plan(parser)
-    parser.add_argument(
-        "--out", metavar="FILE.yaml", help="with --detect: measure speed and, with a meter, power; write a profile"
-    )
-    add_json(parser)
-
-
-def _add_plan(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--board",
         default="this",
@@ -41,6 +33,10 @@ def _add_plan(parser: ArgumentParser) -> None:
     parser.add_argument("--flight-min", type=positive, default=20.0, metavar="MIN", help="length of the flight (20)")
     add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
     parser.add_argument("--hover-w", type=positive, metavar="W", help="what the aircraft draws to hover: minutes lost")
+    parser.add_argument(
+        "--out", metavar="FILE.yaml", help="with --detect: measure speed and, with a meter, power; write a profile"
+    )
+    add_json(parser)
 
 
 def profile(args: Namespace) -> int:
@@ -68,12 +64,11 @@ def profile(args: Namespace) -> int:
     tried: dict[int, list[Trial]] = {}  # by the number of threads for networks
     for board in boards:
         plan, wanted = _plan(args, board)
-        with at_work("measuring on this machine what techniques take"):
-            if board.threads not in tried:
-                trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
-                tried[board.threads] = list(trials)
-            here = with_comparable_score(load_board("this"), board)
-            results.append(estimate(board, here, tried[board.threads], plan))
+        if board.threads not in tried:
+            trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
+            tried[board.threads] = list(trials)
+        here = with_comparable_score(load_board("this"), board)
+        results.append(estimate(board, here, tried[board.threads], plan))
     if len(results) == 1:
         show(results[0], args.json, format_table(results[0]))
     else:

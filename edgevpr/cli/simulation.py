@@ -53,18 +53,26 @@ def add(commands: Any) -> None:
     flight = command(simulations, "flight", simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
     flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (default), or a later one")
-    flight.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another landscape and sway (1)")
+    flight.add_argument(
+        "--seed", type=_seed, default=1, metavar="N", help="another seed, another landscape and sway (1)"
+    )
     _add_over(flight.add_argument_group("over an orthophoto"), _NUMBERS)
     text = "fly a mission over another orthophoto than the map's, and say what to expect of it; GPS is lost on the way"
     rehearsal = command(simulations, "rehearsal", simulate_rehearsal, text)
     rehearsal.add_argument("map", metavar="MAP")
     rehearsal.add_argument("out", metavar="DIR", help="a new folder, for pictures, log and report.html")
-    rehearsal.add_argument("--seed", type=int, default=1, metavar="N", help="another seed, another sway (1)")
+    rehearsal.add_argument("--seed", type=_seed, default=1, metavar="N", help="another seed, another sway (1)")
     _add_over(rehearsal.add_argument_group("the flight"), _REHEARSED, required=True)
     add_map_images(rehearsal)
     add_json(rehearsal)
     demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
+
+
+def _seed(text: str) -> int:
+    if (value := int(text)) < 0:
+        raise ValueError
+    return value
 
 
 def _add_over(over: _ArgumentGroup, numbers: _Numbers, required: bool = False) -> None:
@@ -98,7 +106,6 @@ def simulate_autopilot(args: Namespace) -> int:
 
 def simulate_flight(args: Namespace) -> int:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
-    _require_seed(args)
     if args.orthophoto is None:
         if said := [name for name in ("track", *_NUMBERS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
@@ -108,11 +115,6 @@ def simulate_flight(args: Namespace) -> int:
         return 0
     if args.track is None or args.which is not None:
         raise UsageError("A flight over an orthophoto needs its --track, and has no --which.")
-    print(_fly_over(args))
-    return 0
-
-
-def _fly_over(args: Namespace) -> str:
     from edgevpr.core.text import progress
     from edgevpr.lab.simulate.rehearsal import ground_under, write_rehearsal
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
@@ -121,11 +123,10 @@ def _fly_over(args: Namespace) -> str:
     orthophoto = Orthophoto(args.orthophoto, ground_under(shots, numbers["fov_deg"]))
     taken = write_rehearsal(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
-    beyond = f" ({len(shots) - written} left out: they would show ground beyond the orthophoto)"
-    return (
-        f"{args.out}: {written} images in images/, where they were taken in positions.csv"
-        f"{beyond if written < len(shots) else ''}"
-    )
+    print(f"{args.out}: {written} images in images/, where they were taken in positions.csv")
+    if beyond := len(shots) - written:
+        print(f"{beyond} left out: they would show ground beyond the orthophoto")
+    return 0
 
 
 def _shots_of(args: Namespace, known: _Numbers) -> "tuple[list[GeoTag], dict[str, Any]]":
@@ -140,16 +141,10 @@ def _shots_of(args: Namespace, known: _Numbers) -> "tuple[list[GeoTag], dict[str
     return read_shots(args.track, numbers["height_m"], numbers["every_m"]), numbers
 
 
-def _require_seed(args: Namespace) -> None:
-    if args.seed < 0:
-        raise UsageError(f"--seed is {args.seed}: give 0 or more.")
-
-
 def simulate_rehearsal(args: Namespace) -> int:
     """Run `simulate rehearsal`: rehearse a mission over a map, and print what to expect of it."""
     from edgevpr.lab.simulate.mission import Mission, rehearse
 
-    _require_seed(args)
     shots, numbers = _shots_of(args, _REHEARSED)
     mission = Mission(
         place_map=args.map,

@@ -37,12 +37,5 @@ def map_subset(args: Namespace) -> int:
 
     area, out = read_area(args.mission), map_path(args.out)
     found = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
-    text = [f"{out}: {found.places} places of {found.maps} maps, {found.file_bytes / 1e6:.1f} MB"]
-    if left_out := found.near - found.places:
-        text.append(
-            f"  left out: {left_out} of {found.near} places within {args.margin_m:g} m, to keep to {args.mb:g} MB"
-        )
-    if not found.is_calibrated:
-        text.append("  not calibrated: it flies with the shipped confidence")
-    show({"map": str(out), **asdict(found)}, args.json, text)
+    show({"map": str(out), **asdict(found)}, args.json)
     return 0

@@ -1,12 +1,10 @@
-"""Texts of the results that people read most: of making and checking maps, of replays, and of networks. Each
+"""Texts of the results that people read most: of making and checking maps, and of replays. Each
 function returns the lines of one result; JSON has the same values by their names (see `show`)."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import lines_of
-from edgevpr.core.text import aligned, beside, format_probability, shown
+from edgevpr.core.text import aligned, beside, shown
 
 if TYPE_CHECKING:
     from edgevpr.lab.simulate.rehearsal_report import RehearsalReport
@@ -17,7 +15,6 @@ if TYPE_CHECKING:
     from edgevpr.places.mapinfo import MapInfo
     from edgevpr.review.compare import Lines, Packets
     from edgevpr.review.replay import Replayed
-    from edgevpr.runtime.preflight.networks import Listed
 
 WITHOUT_POSITIONS = (
     "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
@@ -45,12 +42,11 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
     if result.without_data or result.says_nothing:
-        yield f"  left out: {result.without_data} for want of data, {result.says_nothing} for want of texture"
+        yield f"  left out: {result.without_data} without data, {result.says_nothing} with too little texture"
     if result.white:
-        yield f"  {result.white} of the places are white over a third or more: cloud and snow are not there every day"
+        yield f"  {result.white} of the places are white over a third or more: clouds and snow do not stay"
     if result.seams > _SEAMS * result.tried_for_seams:
-        share = f"{result.seams} of {result.tried_for_seams} places that were looked at"
-        yield f"  straight seams run through {share}, as in a mosaic of several days: fewer are found there"
+        yield f"  {result.seams} of {result.tried_for_seams} places have straight seams: fewer of them are found"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:
@@ -121,23 +117,15 @@ def of_check(found: "MapCheck") -> Iterator[str]:
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
 
 
-def of_networks(found: Sequence["Listed"], folders: list[str]) -> Iterator[str]:
-    """Yield the networks on this machine: what each is, and what uses it, or why it cannot be used."""
-    for each in found:
-        yield from lines_of({each.name: {name: value for name, value in asdict(each).items() if name != "name"}})
-    yield f"{len(found)} networks in {' and '.join(folders)}"
-
-
 def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
-    yield from _first([*(text for each in lines.others for text in _of_line(each)), *packets.others])
-    for name, (then, now) in lines.program.items():
-        yield f"The program differs: {name} was {then}, is {now}"
+    yield from _first([*map(_of_line, lines.others), *packets.others])
+    yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
     yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
     yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
     yield f"MAVLink  {packets.alike} packets are the same, {len(packets.others)} differ"
     if again.guessed:
-        yield f"This edgevpr asks {again.guessed} times for something else than the one that flew: its costs differ."
+        yield f"{again.guessed} inputs are not on the tape where this program reads them: its costs differ."
     if again.why_ended:
         yield f"The replay ends before the flight: {again.why_ended}; {lines.after} lines come after it."
 
@@ -146,15 +134,17 @@ def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
     """Yield how the queries of a flight end with another configuration. `found` is the result of
     `review.compare.compare_queries`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
     others = found["queries"]
-    yield from _first([f"{each['query']}: {_said(each['then'])}; what if: {_said(each['now'])}" for each in others])
-    values = [["-" if each is None else str(each) for each in both] for both in found["summary"].values()]
-    names = (name.removesuffix("_m").replace("_", " ") + ", m" * name.endswith("_m") for name in found["summary"])
-    yield from aligned([("", "flight", "what if"), *((name, *each) for name, each in zip(names, values, strict=True))])
-    apart_m = found["apart_at_most_m"]
-    largest = "" if apart_m is None else f", their positions at most {apart_m:.1f} m apart"
-    yield f"{found['alike']} of {found['alike'] + len(others)} queries end alike{largest}"
+    ends = ((query["query"], _outcome(query["then"]), _outcome(query["now"])) for query in others)
+    yield from _first([f"{name}: {then}; what if: {now}" for name, then, now in ends])
+    figures = [
+        (name, *("-" if each is None else str(each) for each in both)) for name, both in found["summary"].items()
+    ]
+    yield from aligned([("", "flight", "what if"), *figures])
+    yield f"{found['alike']} of {found['alike'] + len(others)} queries end alike"
+    if (apart_m := found["apart_at_most_m"]) is not None:
+        yield f"their positions are at most {apart_m:.1f} m apart"
     if why_ended:
-        yield f"It ends before the flight: {why_ended}."
+        yield f"The replay ends before the flight: {why_ended}."
 
 
 def of_rehearsal(found: "RehearsalReport", folder: str) -> Iterator[str]:
@@ -185,17 +175,14 @@ def _first(texts: list[str]) -> list[str]:
     return texts[:_SHOWN] + more
 
 
-def _of_line(difference: dict[str, Any]) -> list[str]:
+def _of_line(difference: dict[str, Any]) -> str:
     where = f"{difference['t_mono_s']:.3f} s, {difference['query'] or difference['kind']}"
     if "only_in" in difference:
-        return [f"{where}: only in the {difference['only_in']}"]
-    return [f"{where}: {name} was {then}, is {now}" for name, (then, now) in difference["fields"].items()]
+        return f"{where}: only in the {difference['only_in']}"
+    return f"{where}: {', '.join(f'{name} was {then}, is {now}' for name, (then, now) in difference['fields'].items())}"
 
 
-def _said(query: dict[str, Any] | None) -> str:
+def _outcome(query: dict[str, Any] | None) -> str:
     if query is None:
         return "no query"
-    if not query["accepted"]:
-        return f"refused ({query['reason']})"
-    sure = "" if query["confidence"] is None else f" with {format_probability(query['confidence'])}"
-    return f"place {query['place']} accepted{sure}"
+    return f"place {query['place']} accepted" if query["accepted"] else f"refused ({query['reason']})"

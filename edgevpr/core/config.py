@@ -4,9 +4,10 @@ An unknown key, a wrong type or a value out of range raises ConfigError with one
 """
 
 import os
+import re
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
-from edgevpr.core.yamlfile import read_yaml
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -29,31 +29,45 @@ SOURCES = (
 
 _LARGEST = 2**63
 _SHOWN = 80  # characters of a wrong value in a message
+_UNUSABLE = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # no file name can have it; others are bytes, not UTF-8
 
 T = TypeVar("T", bound="DataclassInstance")
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", list: "a list"}
 _WORDS |= {dict: "a section"}
 
 
-def key(
-    flag: str = "",
-    text: str = "",
-    *,
-    within: tuple[float, float] | None = None,
-    choices: tuple[str, ...] = (),
-    sets: bool = True,
-    **default: Any,
-) -> Any:
-    """Make the dataclass field of a configuration key. Its value must be None, or lie `within` two numbers (None: any)
-    and be one of `choices` (empty: any). `flag` is the option that sets the key on the command line: its names and the
-    placeholder of its value, such as "--rate-hz HZ" (empty: no option); `text` is the option's help. The option of a
-    boolean key has no value: giving it sets the key to `sets`. `default` is passed on to `dataclasses.field`."""
-    return field(metadata={"within": within, "choices": choices, "flag": flag, "text": text, "sets": sets}, **default)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Key:
+    """A configuration key. `flags`: the options that set it on the command line (empty: none), `metavar`: the
+    placeholder of their value (None: argparse's own), `text`: their help. The value must be None, or lie `within` two
+    numbers (None: any) and be one of `choices` (empty: any). The option of a boolean key has no value: giving it sets
+    the key to `sets`. `name`: dotted name, such as "source.rate_hz"; `kind`: type of its value if not None."""
+
+    flags: tuple[str, ...] = ()
+    metavar: str | None = None
+    text: str = ""
+    within: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+    sets: bool = True
+    name: str = ""
+    kind: type = str
 
 
-def bounded(low: float, high: float, **default: Any) -> Any:
+def key(flag: str = "", text: str = "", *, default: Any = MISSING, **rules: Any) -> Any:
+    """Make the dataclass field of a `Key` with the fields `rules`. `flag` has its flags and their placeholder, such as
+    "--rate-hz HZ"."""
+    words = flag.split()
+    flags = tuple(word for word in words if word.startswith("-"))
+    metavar = words[-1] if len(words) > len(flags) else None
+    return field(default=default, metadata={"key": Key(flags=flags, metavar=metavar, text=text, **rules)})
+
+
+def bounded(low: float, high: float, default: Any = MISSING) -> Any:
     """Make a `key` whose value must be None or within low..high."""
-    return key(within=(low, high), **default)
+    return key(within=(low, high), default=default)
+
+
+_ANY = Key()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,42 +205,24 @@ class Config:
     battery: BatteryConfig
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Key:
-    """A configuration key: its dotted name ("source.rate_hz"); `kind`, the type of its value if not None; its flags on
-    the command line (empty: none); `metavar`, the placeholder of their value (None: argparse's own). The other fields
-    are the arguments of `key`."""
-
-    name: str
-    kind: type
-    within: tuple[float, float] | None
-    flags: tuple[str, ...]
-    metavar: str | None
-    text: str
-    choices: tuple[str, ...]
-    sets: bool
-
-
 def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
     """Yield the keys of the dataclass `cls` and of its sections, in the order of the fields. `prefix` is put before
     each name: the dotted name of the section that `cls` is, such as "source." ("": the whole configuration)."""
     hints = typing.get_type_hints(cls)
-    for each in fields(cls):
-        kind = _kind(hints[each.name])
+    for spec in fields(cls):
+        kind = _kind(hints[spec.name])
         if is_dataclass(kind):
-            yield from keys_of(kind, f"{prefix}{each.name}.")
-            continue
-        known = {"within": None, "choices": (), "flag": "", "text": "", "sets": True, **each.metadata}
-        words = known.pop("flag").split()
-        flags = tuple(word for word in words if word.startswith("-"))
-        metavar = words[-1] if len(words) > len(flags) else None
-        yield Key(name=prefix + each.name, kind=kind, flags=flags, metavar=metavar, **known)
+            yield from keys_of(kind, f"{prefix}{spec.name}.")
+        else:
+            yield replace(spec.metadata.get("key", _ANY), name=prefix + spec.name, kind=kind)
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
     """Load the shipped defaults, replace values by those of the file `path` (None: no file), then by `overrides`
     ({"source.rate_hz": 2.0}; None values are ignored). Raises ConfigError, which names the file, the key and what to
     do."""
+    from edgevpr.core.yamlfile import read_yaml  # loads PyYAML, which the list of flags does not need
+
     defaults_path = shipped("deploy") / "config.yaml"
     merged = _overlaid(read_yaml(defaults_path), read_yaml(path) if path is not None else {})
     for dotted, value in (overrides or {}).items():
@@ -241,6 +237,8 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 def changed_config(config: Config, path: str | Path) -> Config:
     """Return a copy of `config` with the values of the YAML file `path` in place of its own. Raises ConfigError."""
+    from edgevpr.core.yamlfile import read_yaml
+
     return build(Config, _overlaid(asdict(config), read_yaml(path)), str(path))
 
 
@@ -267,7 +265,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     values = {}
     for name, spec in known.items():
         if name in mapping:
-            values[name] = _converted(mapping[name], hints[name], spec.metadata, where, prefix + name)
+            values[name] = _convert(mapping[name], hints[name], spec.metadata.get("key", _ANY), where, prefix + name)
         elif spec.default is MISSING and spec.default_factory is MISSING:
             raise ConfigError(f"{where}: the key `{prefix}{name}` is missing: add it.")
     return cls(**values)
@@ -282,40 +280,31 @@ def _overlaid(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _converted(value: Any, hint: Any, rules: Mapping[str, Any], where: str, key: str) -> Any:
-    wanted, limits, choices = _kind(hint), rules.get("within"), rules.get("choices")
+def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
+    wanted, what = _kind(hint), f"{where}: `{name}`"
+    limits: Any = rules.within
     if value is None and isinstance(hint, types.UnionType):
         return None
     if is_dataclass(wanted):
         if not isinstance(value, dict):
-            raise ConfigError(f"{where}: `{key}` is a section: write its keys below it, indented.")
-        return build(wanted, value, where, f"{key}.")
+            raise ConfigError(f"{what} is a section: write its keys below it, indented.")
+        return build(wanted, value, where, f"{name}.")
     if value is None:
-        raise ConfigError(f"{where}: `{key}` has no value: write one.")
+        raise ConfigError(f"{what} has no value: write one.")
     if isinstance(value, int) and abs(value) > _LARGEST:
-        raise ConfigError(f"{where}: `{key}` is a number of too many digits: write a smaller one.")
+        raise ConfigError(f"{what} is a number of too many digits: write a smaller one.")
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if isinstance(value, str):
-        _require_sayable(value, f"{where}: `{key}`")
+    if isinstance(value, str) and _UNUSABLE.search(value):
+        raise ConfigError(f"{what} holds a character that no file name can have ({value!a:.60}): write it anew.")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{where}: `{key}` must be {_WORDS.get(wanted, wanted)}, not {value!r:.{_SHOWN}}.")
+        raise ConfigError(f"{what} must be {_WORDS.get(wanted, wanted)}, not {value!r:.{_SHOWN}}.")
     if limits and not limits[0] <= value <= limits[1]:
-        raise ConfigError(f"{where}: `{key}` is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
-    if choices and value not in choices:
-        allowed = f"{', '.join(choices[:-1])} or {choices[-1]}"
-        raise ConfigError(f"{where}: `{key}` is `{value:.{_SHOWN}}`: write {allowed}.")
+        raise ConfigError(f"{what} is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
+    if rules.choices and value not in rules.choices:
+        allowed = f"{', '.join(rules.choices[:-1])} or {rules.choices[-1]}"
+        raise ConfigError(f"{what} is `{value:.{_SHOWN}}`: write {allowed}.")
     return value
-
-
-def _require_sayable(text: str, what: str) -> None:
-    """Raise ConfigError if `text` cannot be a file name: for a NUL character or a lone surrogate."""
-    try:
-        is_sayable = b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
-        is_sayable = False
-    if not is_sayable:
-        raise ConfigError(f"{what} holds a character that no file name can have ({text!a:.60}): write it anew.")
 
 
 def _kind(hint: Any) -> type:

@@ -33,8 +33,7 @@ def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float
 class TechniqueSpec:
     """The specification of a technique: the form of its descriptors, and its optional abilities.
 
-    A map file stores the fields from `name` to `packed`. Only a technique with equal name, parameters, model and
-    shapes and dtypes of both parts can use the map.
+    A map file stores the fields from `name` to `packed`; only a technique that equals them can use it.
     `coarse`, `fine`: the two parts of a place's descriptor. `fine` None: there is no fine part.
     `model_sha256`: hash of the network file. None: no network is used.
     `packed`: the row of a place in the index in RAM, made by `Technique.pack`. None: the row is the coarse part.
@@ -80,9 +79,8 @@ class Descriptor:
 
     `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read for
     candidates only (None: the technique has none). `quality`: share of the image that holds information, 0..1.
-    A query may also have the following (None: the technique needs none). `regions`: the descriptors of its regions.
-    `good`: bool, one for each region, True if it is compared. `picture`: the prepared picture, for a technique that
-    encodes it again in other rotations.
+    Of a query, where the technique needs it: `regions`, the descriptors of its regions; `good`, bool, True for regions
+    that are compared; `picture`, which is encoded again in other rotations.
     """
 
     coarse: np.ndarray
@@ -146,9 +144,9 @@ class FineMatch:
 
 class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
-    coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Those whose `spec.fine` is None need
-    no `match`, those whose `spec.packed` is None no `pack`, those whose `spec.in_full` is None no `glance`, those whose
-    `spec.looks_down` is False no `turned` and no `unmoved`."""
+    coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Needed only with the ability:
+    `match` with `spec.fine`, `pack` with `spec.packed`, `glance` with `spec.in_full`, `turned` and `unmoved` with
+    `spec.looks_down`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -188,9 +186,8 @@ class Technique(Protocol):
     def glance(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Compare only a part of the query's regions with one place; for the arguments see `match`. Returns an estimate
-        of the score that `match` would give, and a list with only the best hypothesis, to be given to `match` (None:
-        there are no hypotheses)."""
+        """Estimate the score that `match` would give from a part of the query's regions. Returns it with a list of only
+        the best hypothesis, to be given to `match` (None: there are no hypotheses)."""
 
     def turned(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
         """Compare the query with the place of a `match` again, at its height, but under other rotations only."""

@@ -156,25 +156,21 @@ def progress(
 
 
 @contextmanager
-def at_work(text: str, stream: TextIO | None = None) -> Iterator[None]:
-    """Write `text` and the seconds so far to `stream` (None: stderr) every 5 s until the body of `with` has ended."""
-    if is_quiet():
-        yield
-        return
-    stream, ended, began_s = stream or sys.stderr, Event(), time.monotonic()
+def at_work(text: str) -> Iterator[None]:
+    """Write `text` and the seconds so far to stderr every 5 s until the body of `with` has ended."""
+    stream, ended, began_s = sys.stderr, Event(), time.monotonic()
 
-    def tell() -> None:
-        while not ended.wait(_SILENT_S):
-            stream.write(f"{text}, {time.monotonic() - began_s:.0f} s so far\n")
-            stream.flush()
+    def report() -> None:
+        while not (is_quiet() or ended.wait(_SILENT_S)):
+            print(f"{text}, {time.monotonic() - began_s:.0f} s so far", file=stream, flush=True)
 
-    teller = Thread(target=tell, daemon=True)
-    teller.start()
+    reporter = Thread(target=report, daemon=True)
+    reporter.start()
     try:
         yield
     finally:
         ended.set()
-        teller.join()
+        reporter.join()
 
 
 def _time_left(passed_s: float, done: int, total: int) -> str:

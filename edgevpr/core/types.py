@@ -43,10 +43,9 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receiver:
-    """The newest report of a GPS receiver: degrees, standard deviation `sd_m` of one axis, and `t_s`, the time of its
-    arrival (seconds on the clock of the frames). `velocity_m_s`: over the ground (east, north), None if unknown.
-    `alt_m`: above sea level, None if unknown. `steady_for_s`: for how long its fixes have followed each other without a
-    gap or jump and with a plausible accuracy."""
+    """The newest report of a GPS receiver: standard deviation `sd_m` of one axis, time of arrival `t_s` on the clock of
+    the frames, velocity over the ground (east, north), and altitude above sea level (None: unknown). `steady_for_s`:
+    since when its fixes have no gap, jump or implausible accuracy."""
 
     lat_deg: float
     lon_deg: float
@@ -61,15 +60,14 @@ class Receiver:
 class Vehicle:
     """The state of the aircraft as the autopilot reports it. None: unknown.
 
-    `lat_deg`, `lon_deg`, `alt_m`: its estimated position (metres above sea level).
+    `lat_deg`, `lon_deg`, `alt_m`: its estimated position (metres above sea level), with the standard deviation
+    `position_sd_m` of one axis (also None if the autopilot does not rely on it).
     `heading_deg`: compass direction of the nose, 0..360. `t_heard_s`: when the report came, on the clock of the frames.
-    `has_gps`: True if a GPS receiver had a 3D fix near the estimated position then. If False, the position may be
-    wrong: an autopilot reports its estimate long after GPS is lost, and ignores a receiver that it does not trust.
-    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; together they change by
-    `tilting_deg_s`. `height_m`: above the ground. `velocity_m_s`: over the ground (east, north). `sink_m_s`: speed
-    downwards. `height_doubt_m`: by how much `height_m` is in doubt, as its sources contradict each other.
-    `position_sd_m`: standard deviation of one axis of the position; also None if the autopilot does not rely on it.
-    `innovation_ratio`: of measured positions, those of edgevpr among them, to the filter's gate; above 1 it refuses
+    `has_gps`: a GPS receiver had a 3D fix near the estimated position then. If False, the position may be wrong: an
+    autopilot reports its estimate long after GPS is lost.
+    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; both change by `tilting_deg_s`.
+    `height_m`: above the ground; its sources disagree by `height_doubt_m`. `velocity_m_s`: over the ground (east,
+    north). `sink_m_s`: downwards. `innovation_ratio`: of measured positions to the filter's gate; above 1 it refuses
     them. `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
     `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
 
@@ -141,9 +139,8 @@ class Salience:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A place of the map without its descriptors, which are read separately. Units are those of `Frame`. `place_id` is
-    its number in the map, `source_image` the name of its picture, `quality` that of its `Descriptor`. `salience` is
-    None if the map was made without the salience criteria. Others: None is unknown."""
+    """A place of the map without its descriptors. Units are those of `Frame`; None is unknown. `place_id`: number in
+    the map; `source_image`: name of its picture; `quality`: that of its `Descriptor`."""
 
     place_id: int
     source_image: str
@@ -187,10 +184,9 @@ NO_COST = StageCost(0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
-    """Costs of the steps of one query: `read` the picture (in a flight only), `prepare` it (warp it as seen from
-    straight above), test its salience (`gate`), `encode` it, measure the `stride` since the frame before (in a flight
-    only), `scan` all places, `compare` and judge the candidates, `verify` the best one by its landmarks, `locate` the
-    aircraft. A step that the query did not reach has no cost."""
+    """Costs of the steps of a query: `read` the picture, `prepare` it (level it), test its salience (`gate`), `encode`
+    it, measure the `stride` since the frame before, `scan` all places, `compare` the candidates, `verify` the best one
+    by its landmarks, `locate` the aircraft. A step that was not reached has no cost; only flights read and stride."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
@@ -240,10 +236,9 @@ class QueryCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
-    """The outcome of the position fix that was made from one query. `query`: name of the frame. `sent`: True, False
-    (`why` gives the reason), or None while the fix waits to be sent or, over TCP, for the acknowledgement of the
-    receiver. `answer`: the autopilot's answer, the name of a MAV_RESULT (None: none yet). `lat_deg`, `lon_deg` and
-    `accuracy_m`: the position in the fix, None if there was nothing to send."""
+    """The outcome of the position fix of one query, the name of its frame. `sent`: False if not, for the reason `why`;
+    None while it waits to be sent or, over TCP, to be acknowledged. `answer`: the autopilot's, the name of a MAV_RESULT
+    (None: none yet). `lat_deg`, `lon_deg` and `accuracy_m`: the position, None if there was nothing to send."""
 
     query: str
     sent: bool | None
@@ -258,13 +253,11 @@ T = TypeVar("T")
 
 
 class Tape:
-    """Records all values that enter a flight from outside, or plays a recording back. This base class does neither: it
-    is for flights without a recording, and subclasses override it. Values are JSON types or bytes. `kind` is the name
-    of the input, such as "frame"."""
+    """Records all values that enter a flight from outside, or plays a recording back; this base class does neither.
+    Values are JSON types or bytes. `kind` is the name of the input, such as "frame"."""
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return a value of the input `kind`: call `look`, which gets it from outside, and record it; in a replay,
-        return the recorded value instead."""
+        """Get a value of the input `kind` by `look`, and record it; in a replay return the recorded value instead."""
         return look()
 
     def note(self, kind: str, *values: Any) -> None:

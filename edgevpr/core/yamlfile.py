@@ -2,14 +2,39 @@
 that time and memory grow only with the length of the file, which is limited."""
 
 from copy import deepcopy
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import read_file
 
 MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads some 100,000 a second
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Loader that refuses aliases and duplicate keys."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
+        if isinstance(event, yaml.AliasEvent):
+            raise _error(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in lines:
+                    raise _error(f"the key `{key.value}` stands in line {lines[key.value]} already", key.start_mark)
+                lines[key.value] = key.start_mark.line + 1
+        return super().construct_mapping(node, deep)
+
+
+def _error(problem: str, mark: Any) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, problem, mark)
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -24,10 +49,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 def parsed_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
     """Parse the bytes of the YAML file `path`; raises ConfigError as `read_yaml` does."""
-    import yaml  # not at the top: the command line lists its flags without it
-
     try:
-        content = deepcopy(_content(data.decode("utf-8-sig")))
+        content = deepcopy(_load(data.decode("utf-8-sig")))
     # An impossible date or a number of 5000 digits is a ValueError, deep nesting a RecursionError.
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
@@ -43,38 +66,5 @@ def parsed_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
 
 # Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
 @lru_cache(maxsize=32)
-def _content(text: str) -> Any:
-    """Parse a YAML text. Cached: the caller must not change the result."""
-    import yaml
-
-    return yaml.load(text, _loader())
-
-
-@cache
-def _loader() -> type:
-    """Return a strict subclass of PyYAML's safe loader. PyYAML is imported here, when the first file is read."""
-    import yaml
-
-    class StrictLoader(yaml.SafeLoader):
-        """Loader that refuses aliases and duplicate keys."""
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
-            if isinstance(event, yaml.AliasEvent):
-                raise _problem(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
-            return super().compose_node(parent, index)
-
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            lines: dict[str, int] = {}
-            for key, _ in node.value:
-                if isinstance(key, yaml.ScalarNode):
-                    if key.value in lines:
-                        said = f"the key `{key.value}` stands in line {lines[key.value]} already"
-                        raise _problem(said, key.start_mark)
-                    lines[key.value] = key.start_mark.line + 1
-            return super().construct_mapping(node, deep)
-
-    def _problem(said: str, mark: Any) -> yaml.YAMLError:
-        return yaml.constructor.ConstructorError(None, None, said, mark)
-
-    return StrictLoader
+def _load(text: str) -> Any:
+    return yaml.load(text, _StrictLoader)

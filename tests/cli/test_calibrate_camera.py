@@ -19,7 +19,7 @@ def board(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_folder_of_pictures_becomes_a_lens(board, tmp_path, capsys):
+def test_calibrate_camera_makes_a_lens_of_a_folder(board, tmp_path, capsys):
     out = str(tmp_path / "lens.yaml")
     assert main(["calibrate-camera", str(board), "--board", "9x6", "--out", out]) == 0
     assert "degrees across" in capsys.readouterr().out
@@ -33,6 +33,6 @@ def test_a_folder_of_pictures_becomes_a_lens(board, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", [["--board", "9"], ["--board", "2x6"], ["--board", "9x6", "--seconds", "0"]])
-def test_words_that_make_no_board_are_refused(board, tmp_path, words):
+def test_calibrate_camera_refuses_a_wrong_board(board, tmp_path, words):
     with pytest.raises(SystemExit):
         main(["calibrate-camera", str(board), "--out", str(tmp_path / "lens.yaml"), *words])

@@ -56,7 +56,7 @@ def calibration_in(path):
 
 
 @pytest.mark.slow
-def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
+def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert built(path, flight / "ref") == 0
     assert f"expect: {(found := calibration_in(path)).described()}\n" in capsys.readouterr().out
@@ -64,7 +64,7 @@ def test_a_build_ends_with_what_to_expect(flight, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
 
-def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, capsys, caplog, monkeypatch):
+def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys, caplog, monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES + 1)
     assert built(tmp_path / "small.gpkg", flight / "ref") == 0
     assert f"it has {PLACES} places" in caplog.text
@@ -76,7 +76,7 @@ def test_a_build_that_cannot_calibrate_says_why_and_is_whole(flight, tmp_path, c
 
 
 @pytest.mark.slow
-def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
+def test_map_calibrate_stores_and_reports_the_calibration(bare, flight, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
     found = calibration_in(bare)
     assert found.described() in capsys.readouterr().out
@@ -93,7 +93,7 @@ def test_a_map_is_calibrated_later_and_says_so(bare, flight, capsys):
         (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),
     ],
 )
-def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, code, said):
+def test_map_calibrate_refuses_other_pictures(bare, flight, capsys, flags, code, said):
     flags = [each.replace("FLIGHT", str(flight)) for each in flags]
     assert main(["map", "calibrate", str(bare), *flags]) == code
     assert said in capsys.readouterr().err
@@ -101,7 +101,7 @@ def test_what_cannot_be_calibrated_is_a_sentence(bare, flight, capsys, flags, co
 
 
 @pytest.mark.slow
-def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(bare, bare_map, flight, tmp_path, capsys):
+def test_map_shrink_keeps_the_calibration_and_map_merge_drops_it(bare, bare_map, flight, tmp_path, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
     assert main(["map", "shrink", str(bare), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
     assert calibration_in(tmp_path / "small.gpkg") == calibration_in(bare)
@@ -110,5 +110,3 @@ def test_a_smaller_map_keeps_its_calibration_and_a_merged_one_has_none(bare, bar
     assert main(["map", "merge", str(merged), str(bare), str(bare_map)]) == 0
     assert f"calibrate {merged}" in capsys.readouterr().out
     assert calibration_in(merged) is None
-    assert main(["map", "merge", str(tmp_path / "both.gpkg"), str(bare_map), str(bare_map)]) == 0
-    assert "calibrate" not in capsys.readouterr().out

@@ -21,12 +21,12 @@ def commands_with_json(parser=None):
                 yield from commands_with_json(inner)
 
 
-def test_the_schema_is_one_and_has_a_definition_for_every_command_and_no_other():
+def test_schema_defines_every_command_and_no_other():
     jsonschema.Draft202012Validator.check_schema(schema())
     assert {name for name in schema()["$defs"] if name.startswith("edgevpr ")} == set(commands_with_json())
 
 
-def test_what_is_not_documented_is_refused():
+def test_require_documented_refuses_other_fields():
     whole = {"map": "m.gpkg", "kept": 3, "of": 5}
     require_documented("edgevpr map shrink", json.dumps(whole))
     for other in (whole | {"kept": "3"}, whole | {"more": 1}, {"map": "m.gpkg", "kept": 3}):
@@ -34,7 +34,7 @@ def test_what_is_not_documented_is_refused():
             require_documented("edgevpr map shrink", json.dumps(other))
 
 
-def test_a_status_is_shown_once(tmp_path, capsys):
+def test_top_prints_a_status_as_json(tmp_path, capsys):
     path = tmp_path / "status.json"
     path.write_text(json.dumps(STATUS))
     assert main(["top", "--file", str(path), "--json"]) == 0

@@ -15,7 +15,7 @@ PLACES = 6
 A_METRE_DEG = 1 / 111_195  # of latitude
 
 
-def make(folder, turned_deg=(None,) * PLACES, height_m=(None,) * PLACES, height_ratio=1.0, places_known=True):
+def make(folder, turned_deg=(None,) * PLACES, places_known=True):
     """A set of places 200 m apart, mapped from 100 m, and a query over each. `turned_deg` is what positions.csv says
     of the heading of each query, truly that of its place, less that of the place; None: nothing."""
     rows, truth = ["file,lat,lon,yaw_deg,height_m"], ["query_file,ref_files"]
@@ -24,12 +24,10 @@ def make(folder, turned_deg=(None,) * PLACES, height_m=(None,) * PLACES, height_
     for place in range(PLACES):
         where = f"{50 + 200 * place * A_METRE_DEG:.7f},8"
         cv2.imwrite(str(folder / "ref" / f"r{place}.png"), from_height(place, 1.0))
-        cv2.imwrite(
-            str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(from_height(place, height_ratio), alpha=0.8)
-        )
+        cv2.imwrite(str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(from_height(place, 1.0), alpha=0.8))
         rows.append(f"r{place}.png,{where},{50 * place},100" if places_known else f"r{place}.png,,,,")
-        turned, height = turned_deg[place], height_m[place]
-        rows.append(f"q{place}.png,{where},{'' if turned is None else 50 * place + turned},{height or ''}")
+        turned = turned_deg[place]
+        rows.append(f"q{place}.png,{where},{'' if turned is None else 50 * place + turned},")
         truth.append(f"q{place}.png,r{place}.png")
     (folder / "positions.csv").write_text("\n".join(rows) + "\n")
     (folder / "ground_truth.csv").write_text("\n".join(truth) + "\n")
@@ -52,7 +50,7 @@ def refused(capsys, *argv):
     return capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_heading_rules_out_other_rotations_of_each_query_by_itself(capsys, tmp_path):
+def test_eval_with_known_headings_rules_out_other_rotations(capsys, tmp_path):
     folder = make(tmp_path / "set", turned_deg=(90, 90, 90, 0, 0, None))
     without = evaluated(capsys, folder)
     assert (without["known"], without["accepted"]) == (None, PLACES)
@@ -60,7 +58,7 @@ def test_a_heading_rules_out_other_rotations_of_each_query_by_itself(capsys, tmp
     assert (told["known"], told["accepted"], told["accepted_wrong"]) == ("heading", 3, 0)
 
 
-def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
+def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
     folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
     path = tmp_path / "m.gpkg"
     build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
@@ -86,6 +84,6 @@ def test_match_says_what_has_narrowed_each_query(capsys, tmp_path):
         ("height", True, ("--sequence", "2"), "2 queries are matched together"),
     ],
 )
-def test_what_cannot_be_known_gets_a_sentence(capsys, tmp_path, known, places_known, more, said):
+def test_eval_refuses_what_cannot_be_known(capsys, tmp_path, known, places_known, more, said):
     folder = make(tmp_path / "set", places_known=places_known)
     assert said in refused(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)

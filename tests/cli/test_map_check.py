@@ -50,7 +50,7 @@ DAMAGE = (
 )
 
 
-def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, capsys):
+def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
@@ -64,7 +64,7 @@ def test_a_whole_map_is_said_to_be_whole_and_a_repair_leaves_it_alone(valley, ca
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 
 
-def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, capsys):
+def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys):
     damage(valley, *DAMAGE)
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 1
@@ -95,7 +95,7 @@ def test_what_is_damaged_is_named_and_dropped_and_the_original_kept(valley, caps
     assert original.read_bytes() == before
 
 
-def test_a_map_of_which_nothing_can_be_read_is_left_as_it_is(valley, capsys):
+def test_map_repair_leaves_a_map_of_which_nothing_can_be_read(valley, capsys):
     damage(valley, "UPDATE places SET coarse = x'00'")
     before = valley.read_bytes()
     assert main(["map", "repair", str(valley)]) == 1
@@ -104,7 +104,7 @@ def test_a_map_of_which_nothing_can_be_read_is_left_as_it_is(valley, capsys):
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 
 
-def test_a_file_whose_pages_are_damaged_is_repaired_too(valley, capsys):
+def test_map_repair_of_damaged_pages(valley, capsys):
     data = bytearray(valley.read_bytes())
     with contextlib.closing(sqlite3.connect(valley)) as db:
         (fine,) = db.execute("SELECT fine FROM places WHERE place_id = 3").fetchone()
@@ -125,13 +125,13 @@ def run_full(arguments, bytes_at_most):
 
 
 @pytest.mark.parametrize("bytes_at_most", [1, 5_000, 45_000])
-def test_a_full_disk_leaves_no_map_of_nothing(flight, tmp_path, bytes_at_most, capsys):
+def test_map_build_leaves_no_empty_map_on_a_full_disk(flight, tmp_path, bytes_at_most, capsys):
     assert run_full(built(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
     assert "Traceback" not in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_leaves_no_half_of_a_merge_or_repair(valley, tmp_path, capsys):
+def test_map_merge_and_repair_leave_no_part_on_a_full_disk(valley, tmp_path, capsys):
     out = tmp_path / "out" / "m.gpkg"
     out.parent.mkdir()
     for bytes_at_most in (1, 5_000, 60_000):

@@ -73,7 +73,7 @@ def a_map(tmp_path, technique="hog"):
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
+def test_profile_tries_the_real_techniques(capsys, monkeypatch):
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog"))
     found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--hover-w", 90, "--json").out)
     rows = {row["option"]["label"]: row for row in found["techniques"]}
@@ -86,7 +86,7 @@ def test_the_real_techniques_are_tried_and_said(capsys, monkeypatch):
     assert found["recommended"] == "cohog"
 
 
-def test_boards_stand_beside_each_other_and_techniques_are_tried_once_for_those_alike(capsys, tried):
+def test_profile_tries_techniques_once_for_similar_boards(capsys, tried):
     boards = ["rpi-4b", "rpi-5", "rpi-3b"]
     said = run(capsys, "--board", ",".join(boards), "--places", 20).out.splitlines()
     assert [line.split()[:2] for line in said[3:]] == [[board, "cohog"] for board in boards]
@@ -96,7 +96,7 @@ def test_boards_stand_beside_each_other_and_techniques_are_tried_once_for_those_
     assert refused(capsys, "--board", "rpi-4b,nothing", "--places", 20)[0] == 2
 
 
-def test_with_a_map_its_places_count_and_only_its_forms_are_tried(capsys, tmp_path, tried):
+def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):
     path = a_map(tmp_path)
     capsys.readouterr()
     found = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--json").out)
@@ -105,7 +105,7 @@ def test_with_a_map_its_places_count_and_only_its_forms_are_tried(capsys, tmp_pa
     assert tried == ["hog", "hog 8bit", "hog 1bit"]
 
 
-def test_it_says_which_board_this_is_and_writes_a_profile_that_can_be_flown(capsys, tmp_path, tried):
+def test_profile_detect_writes_a_profile_that_can_be_used(capsys, tmp_path, tried):
     path = tmp_path / "mine.yaml"
     said = run(capsys, "--detect", "--out", path)
     assert "usable cores" in said.out
@@ -129,7 +129,7 @@ def test_it_says_which_board_this_is_and_writes_a_profile_that_can_be_flown(caps
         (["--places", "50", "--board", "rpi4"], "There is no board `rpi4`"),
     ],
 )
-def test_what_makes_no_sense_is_one_sentence_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, sentence):
+def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, sentence):
     monkeypatch.chdir(tmp_path)
     code, said = refused(capsys, *argv)
     assert code in (1, 2)

@@ -34,12 +34,12 @@ def said(capfd, *words):
         ("\ud800\0", r"\ud800\x00"),
     ],
 )
-def test_what_a_terminal_would_act_on_is_escaped(text, printed):
+def test_printable_escapes_what_a_terminal_acts_on(text, printed):
     assert printable(text) == printed
     printed.encode("utf-8")
 
 
-def test_a_name_that_is_not_utf_8_becomes_one():
+def test_decoded_name_is_utf_8():
     assert decoded_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
     assert decoded_name("café.jpg") == "café.jpg"
 
@@ -57,12 +57,12 @@ def test_a_name_that_is_not_utf_8_becomes_one():
         ("serial:/dev/ttyAMA0:921600", "serial:/dev/ttyAMA0:921600"),
     ],
 )
-def test_passwords_are_left_out(address, without):
+def test_without_passwords_replaces_them(address, without):
     assert without_passwords(address) == without
     assert shown(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
 
 
-def test_a_message_is_one_line_and_a_traceback_keeps_its_own():
+def test_line_formatter_keeps_a_message_in_one_line():
     try:
         raise ValueError("rtsp://pilot:secret@cam\nINFO all is well")
     except ValueError:
@@ -73,7 +73,7 @@ def test_a_message_is_one_line_and_a_traceback_keeps_its_own():
 
 
 @pytest.mark.slow
-def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path, capfd):
+def test_main_escapes_names_of_images(tmp_path, capfd):
     for number, folder in enumerate(("ref", "query")):
         (tmp_path / folder).mkdir()
         picture = cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes()
@@ -90,7 +90,7 @@ def test_the_name_of_an_image_is_escaped_in_errors_and_tables(tmp_path, capfd):
 
 
 @pytest.mark.slow
-def test_the_password_of_a_camera_is_not_printed(tmp_path, capfd):
+def test_main_prints_no_password(tmp_path, capfd):
     (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
     _, *checked = said(capfd, "check", "--config", tmp_path / "c.yaml")
     assert "http://pilot:***@127.0.0.1:9/cam" in checked[0]
@@ -100,15 +100,8 @@ def test_the_password_of_a_camera_is_not_printed(tmp_path, capfd):
     assert "secret" not in "".join([*checked, *refused])
 
 
-def test_a_wrong_flag_is_repeated_without_its_escapes(capfd):
+def test_main_escapes_a_wrong_flag(capfd):
     code, _, err = said(capfd, "match", "m.gpkg", "--images", "x", "\x1b[31m")
     assert code == 2
     assert "\\x1b[31m" in err
     assert "\x1b" not in err
-
-
-def test_a_form_that_does_not_exist_is_refused(capsys):
-    data = ["--query", "q", "--ref", "r", "--ground-truth", "t.csv"]
-    for form in ("x", "float,", "8bit,9bit"):
-        assert main(["eval", *data, "--form", form]) == 2
-        assert "8bit" in capsys.readouterr().err

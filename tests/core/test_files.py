@@ -8,7 +8,7 @@ import pytest
 from edgevpr.core.files import open_file, read_file
 
 
-def test_a_file_is_read_whole(tmp_path):
+def test_read_file_reads_all(tmp_path):
     (tmp_path / "a").write_bytes(b"abc" * 1000)
     assert read_file(tmp_path / "a", 3000) == b"abc" * 1000
     (tmp_path / "empty").touch()
@@ -16,13 +16,13 @@ def test_a_file_is_read_whole(tmp_path):
     assert b"Linux" in read_file("/proc/version", 3000)  # which says that it has no bytes
 
 
-def test_a_file_that_is_too_large_is_not_read(tmp_path):
+def test_read_file_refuses_a_file_that_is_too_large(tmp_path):
     (tmp_path / "a").write_bytes(bytes(3001))
     with pytest.raises(OSError, match="MB"):
         read_file(tmp_path / "a", 3000)
 
 
-def test_no_more_room_is_made_than_the_file_needs(tmp_path):
+def test_read_file_allocates_no_more_than_the_file_has(tmp_path):
     (tmp_path / "a").write_bytes(bytes(5000))
     tracemalloc.start()
     try:
@@ -34,7 +34,7 @@ def test_no_more_room_is_made_than_the_file_needs(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/dev/null", "pipe"])
-def test_what_is_no_file_is_refused_at_once(path, tmp_path):
+def test_open_file_refuses_pipes_and_devices(path, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(OSError, match="pipe"):
@@ -42,6 +42,6 @@ def test_what_is_no_file_is_refused_at_once(path, tmp_path):
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_a_folder_is_one(tmp_path):
+def test_read_file_refuses_a_folder(tmp_path):
     with pytest.raises(IsADirectoryError):
         read_file(tmp_path, 3000)

@@ -1,7 +1,6 @@
 """Checks of the source of frames, for `edgevpr check` and `doctor`: the device or the program that reads the camera,
-the cable, and a frame that comes and fits the lens."""
+the cable, and a first frame that fits the lens."""
 
-import os
 import re
 import subprocess
 import time
@@ -15,67 +14,50 @@ from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.lens import sight_of
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_by_program, open_source
-from edgevpr.power import machine
 from edgevpr.runtime.recognise.levelling import calibrated_lens
-from edgevpr.runtime.service.finding import Finding, device, fine, looked_at, wrong
+from edgevpr.runtime.service.finding import Finding, check_device, fine, run_check, wrong
 
-FRAME_WAIT_S = 65.0  # longer than any source takes to say that it is lost; a pipeline that starts slowly takes most
+FRAME_WAIT_S = 65.0  # longer than any source takes to report that it is lost; a pipeline that starts slowly takes most
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
 _LIST_S = 10.0  # for the program to list the cameras
 _LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
-_BY_LIBCAMERA = ("media*", "video*", "dma_heap/*")  # devices below /dev that it opens
-_BOOT = "boot/firmware/config.txt"
-_ARGUS_SOURCE = "nvarguscamerasrc"
-_ARGUS_SOCKET = "tmp/argus_socket"
+_LIBCAMERA_DEVICES = ("media*", "video*", "dma_heap/*")  # below /dev
 
 
-def camera_findings(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
+def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
     """Check what a live source is read with: its device, or the program and what that needs. Other sources have no
-    finding. `root` is the root of the file system with /dev and /boot."""
+    finding. `root` is the root of the file system with /dev."""
     if uri.startswith("/dev/"):
-        yield device("camera", uri, root)
+        yield check_device("camera", uri, root)
     elif is_by_program(uri):
         from edgevpr.frames.programs import require_program  # loads FFmpeg
 
-        found = looked_at("camera", lambda: require_program(uri))
-        if found.ok and not uri.startswith("gst:"):
-            found = _ribbon(uri, found.message, root)
-        if found.ok and _ARGUS_SOURCE in uri:
-            found = _argus(found.message, root)
-        yield found
+        finding = run_check("camera", lambda: require_program(uri))
+        if finding.ok and not uri.startswith("gst:"):
+            finding = _check_ribbon(uri, finding.message, root)
+        yield finding
 
 
-def _argus(program: str, root: Path) -> Finding:
-    """Check the socket of the daemon that reads the ribbon camera of a Jetson."""
-    if (root / _ARGUS_SOCKET).is_socket():
-        return fine("camera", f"{_ARGUS_SOURCE} by {program}, its daemon listens at /{_ARGUS_SOCKET}")
-    return wrong(
-        "camera",
-        f"/{_ARGUS_SOCKET} is not there, through which {_ARGUS_SOURCE} reads the camera: start its daemon, or pass the "
-        "socket into the container; the service takes it in when it starts.",
-        "sudo systemctl restart nvargus-daemon, then restart edgevpr",
-    )
-
-
-def _ribbon(uri: str, program: str, root: Path) -> Finding:
+def _check_ribbon(uri: str, program: str, root: Path) -> Finding:
     """Check the devices of a camera on a Raspberry Pi's ribbon, and whether `program` lists it."""
-    devices = [each for pattern in _BY_LIBCAMERA for each in sorted((root / "dev").glob(pattern))]
-    for each in devices:
-        if not os.access(each, os.R_OK | os.W_OK):
-            return device("camera", f"/{each.relative_to(root)}", root)
+    for pattern in _LIBCAMERA_DEVICES:
+        for file in sorted((root / "dev").glob(pattern)):
+            device = check_device("camera", f"/{file.relative_to(root)}", root)
+            if not device.ok:
+                return device
     try:
         listing = subprocess.run([program, "--list-cameras"], capture_output=True, text=True, timeout=_LIST_S)
     except subprocess.TimeoutExpired:
         return wrong("camera", f"{program} --list-cameras does not end: restart the board.")
     cameras = dict(_LISTED.findall(listing.stdout + listing.stderr))
-    number = uri.partition(":")[2] or "0"
-    if number in cameras:
-        return fine("camera", f"{uri}: {cameras[number]}, read by {program}")
-    changes = ["both ends of the ribbon: the right way round, and pushed home, with the power off"]
-    if "camera_auto_detect=1" not in (machine.text(root / _BOOT) or ""):
-        changes.append(f"camera_auto_detect=1 in /{_BOOT}, or the dtoverlay= of your sensor, and reboot")
-    others = f"only {', '.join(cameras)}" if cameras else "none"
-    return wrong("camera", f"{uri} is not found: {program} --list-cameras lists {others}.", *changes)
+    if name := cameras.get(uri.partition(":")[2] or "0"):
+        return fine("camera", f"{uri}: {name}, read by {program}")
+    return wrong(
+        "camera",
+        f"{uri} is not found: {program} --list-cameras lists {', '.join(cameras) or 'none'}.",
+        "with the power off, push in both ends of the ribbon, the right way round",
+        "camera_auto_detect=1, or the dtoverlay= of the sensor, in /boot/firmware/config.txt, and reboot",
+    )
 
 
 def frame_seen(config: SourceConfig) -> str:
@@ -85,22 +67,22 @@ def frame_seen(config: SourceConfig) -> str:
     assert config.uri is not None
     lens = calibrated_lens(config)
     with closing(open_source(config.uri, live=True)) as source:
-        (width, height), state = _frame_size(source, config.uri), source.state
+        (width, height), state = _read_size(source, config.uri), source.state
         facts, age_s = source.facts, source.latency_s
-    seen = f"{config.uri}, {state}, {width} x {height} pixels"
+    parts = [config.uri, state, f"{width} x {height} pixels"]
     if lens is not None:
-        seen = f"{seen}, of which {lens.path} shows {sight_of(lens, (width, height)).fov_deg:.0f} degrees"
-    if age_s is None:
-        return seen
-    if age_s > FIX_MAX_AGE_S:
+        parts.append(f"of which {lens.path} shows {sight_of(lens, (width, height)).fov_deg:.0f} degrees")
+    if age_s is not None and age_s > FIX_MAX_AGE_S:
         raise SourceError(
-            f"{seen}, {age_s:.1f} s old: no fix of a picture older than {FIX_MAX_AGE_S:g} s is sent: shorten "
-            "the buffers of the camera."
+            f"{', '.join(parts)}, {age_s:.1f} s old: no fix of a picture older than {FIX_MAX_AGE_S:g} s is sent: "
+            "shorten the buffers of the camera."
         )
-    return f"{seen}{f', {facts}' if facts else ''}, {age_s:.1f} s old: a flight accepts it"
+    if age_s is not None:
+        parts += [*([str(facts)] if facts else []), f"{age_s:.1f} s old: a flight accepts it"]
+    return ", ".join(parts)
 
 
-def _frame_size(source: Source, uri: str) -> tuple[int, int]:
+def _read_size(source: Source, uri: str) -> tuple[int, int]:
     """Wait for a frame, 65 s at most; return its width and height in pixels."""
     begin_s = time.monotonic()
     is_hopeless = False

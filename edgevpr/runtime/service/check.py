@@ -3,21 +3,21 @@ closes it again."""
 
 import os
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from edgevpr.core.config import Config, load_config
-from edgevpr.core.errors import EdgevprError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.config import BatteryConfig, Config, MavlinkConfig, load_config
+from edgevpr.core.errors import ConfigError, EdgevprError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.text import waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_steps
-from edgevpr.mavlink.address import LinkAddress, parse_links
+from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.autopilot import DRY_RUN
@@ -28,75 +28,67 @@ from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.levelling import calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
-from edgevpr.runtime.service.doctor import silence
-from edgevpr.runtime.service.finding import Finding, fine, log_findings, looked_at, wrong
+from edgevpr.runtime.service.doctor import explain_silence
+from edgevpr.runtime.service.finding import Finding, check_logs, fine, run_check, wrong
 
 
-def check(
-    config_path: str | Path, *, offline: bool = False, say: Callable[[str], None] = lambda text: None
-) -> list[Finding]:
-    """Check everything that a flight needs, and return a finding for each part.
-
-    The check waits for a frame of the source and a heartbeat of the autopilot, unless `offline`: then it is enough that
-    source and link can be opened. `say` is called with a short text while the check waits, and with "" after it.
-    """
+def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
+    """Check everything that a flight needs, and return a finding for each part. It waits for a frame of the source and
+    a heartbeat of the autopilot, unless `offline`: then it is enough that source and link can be opened."""
     try:
         config = load_config(config_path)
     except EdgevprError as error:
         return [wrong("configuration", str(error), exit_code=error.exit_code)]
     config = at_recorded_rate(config, recorded_steps(config.source.uri))
-    findings = [
-        fine("configuration", str(config_path)),
-        looked_at("board", lambda: _board(config)),
-        looked_at("battery", lambda: _battery(config)),
-        looked_at("map", lambda: _map(config)),
-    ]
-    say("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
-    findings.append(looked_at("source", lambda: _source(config, offline)))
-    say("waiting for the flight controller")
-    findings.append(looked_at("link", lambda: _link(config, offline)))
-    say("")
-    return [*findings, *log_findings(config.log, has_link=config.mavlink.link is not None)]
+    findings = [fine("configuration", str(config_path))]
+    try:
+        board = load_board(config.board)
+        findings.append(fine("board", f"{board.title}, up to {board.memory_max_mb:.0f} MB for edgevpr"))
+        findings.append(run_check("map", lambda: _check_map(config, board)))
+    except ConfigError as error:  # then nothing is known of what the map would take
+        findings.append(wrong("board", str(error), exit_code=error.exit_code))
+    findings.append(run_check("battery", lambda: _check_battery(config.battery)))
+    waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
+    findings.append(run_check("source", lambda: _check_source(config, offline)))
+    waiting("waiting for the flight controller")
+    findings.append(run_check("link", lambda: _check_link(config.mavlink, offline)))
+    waiting("")
+    return [*findings, *check_logs(config.log, has_link=config.mavlink.link is not None)]
 
 
-def _board(config: Config) -> str:
-    board = load_board(config.board)
-    return f"{board.title}, {board.cores} cores, up to {board.memory_max_mb:.0f} MB for edgevpr"
-
-
-def _battery(config: Config) -> str:
-    pack = parse_pack(config.battery.pack)
+def _check_battery(battery: BatteryConfig) -> str:
+    pack = parse_pack(battery.pack)
     return f"{pack.cells} cells in series, {pack.capacity_mah} mAh"
 
 
-def _map(config: Config) -> str:
+def _check_map(config: Config, board: Board) -> str:
     if config.mapping.learn and config.map is not None:
         path = map_path(config.map).absolute()
-        # The map is neither made nor opened for writing: root would leave a file that the service may not write.
+        # Not opened for writing: root would leave a file that the service may not write.
         if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-            raise MapError(f"{path} or its folder may not be written by this user: learning needs both.")
+            raise MapError(f"{path} or its folder cannot be written by this user: learning needs both.")
         if not path.exists():
-            return f"{path}, to be made by the first flight"
+            return f"{path}, which the first flight makes"
         with PlaceMap.open(path) as place_map:
             if not len(place_map):
                 return f"{path}, empty so far"
-    recogniser = open_recogniser(config, load_board(config.board), narrowed=True)
+    recogniser = open_recogniser(config, board, narrowed=True)
     with closing(recogniser.place_map) as place_map:
-        found = outlook(recogniser, config)
-        sure = ""
+        expected = outlook(recogniser, config)
+        confidence = ""
         if recogniser.rule.sure:
             calibration = calibration_of(place_map)
-            sure = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
-    t_query_s = found.t_query_s or 0.0
+            confidence = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
+    t_query_s = expected.t_query_s or 0.0
     if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
         raise EdgevprError(
             f"No fix would ever be sent ({too_late(t_query_s)}): use a faster board, fewer places or candidates, "
-            f"or a technique that costs less; {found.reason}."
+            f"or a technique that costs less; {expected.reason}."
         )
-    return f"{config.map}, {found.reason}{sure}"
+    return f"{config.map}, {expected.reason}{confidence}"
 
 
-def _source(config: Config, offline: bool) -> str:
+def _check_source(config: Config, offline: bool) -> str:
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
@@ -114,23 +106,20 @@ def _source(config: Config, offline: bool) -> str:
         return f"{uri}, {source.state}"
 
 
-def _link(config: Config, offline: bool) -> str:
-    settings = config.mavlink
+def _check_link(settings: MavlinkConfig, offline: bool) -> str:
     address, ground = parse_links(settings.link, settings.ground)
     if address is None:
-        return "none, so what is recognised goes into the log only"
+        return "none: results go into the log only"
     signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
+    parts = [str(address)]
     with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
-        parts = [str(address)] if offline else [str(address), _heartbeat(inquiry, address)]
+        if not offline:
+            if inquiry.heartbeat() is None:
+                raise LinkError(explain_silence(address, inquiry).message)
+            parts.append(f"autopilot of system {inquiry.system_id}")
     if ground:
         with Inquiry(ground, settings.component_id, settings.system_id):
             parts.append(f"ground station at {ground}")
     if settings.signing_key is not None:
         parts.append("signed")
     return ", ".join(parts if settings.send_fixes else [*parts, DRY_RUN])
-
-
-def _heartbeat(inquiry: Inquiry, address: LinkAddress) -> str:
-    if inquiry.heartbeat() is None:
-        raise LinkError(silence(address, inquiry.reader.bad_bytes, inquiry.others, inquiry.signing.refused).message)
-    return f"autopilot heard: system {inquiry.system_id}"

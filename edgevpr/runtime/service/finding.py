@@ -1,7 +1,6 @@
-"""Findings of `edgevpr check` and `edgevpr doctor`: what was checked, whether it is fine, and what to change; and the
-checks of this machine: limits of its control groups, devices, and free room on disk."""
+"""Findings of `edgevpr check` and `edgevpr doctor`, and the checks of this machine: memory, devices, and the disk of
+the logs."""
 
-import getpass
 import grp
 import os
 import shutil
@@ -19,7 +18,7 @@ from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 
 LOG_ROOM_MB = 10  # some hours of queries
-_NOBODYS_GROUPS = ("root", "tty")  # devices of these are held by a login shell, or kept from all users: none is to join
+_SYSTEM_GROUPS = ("root", "tty")  # no user is to join them: a login shell holds the device, or a udev rule is missing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,93 +44,83 @@ def wrong(what: str, message: str, *changes: str, exit_code: int = 1) -> Finding
     return Finding(what=what, ok=False, message=message, changes=changes, exit_code=exit_code)
 
 
-def judged(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
+def judge(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
     """Return a fine finding with the text `good` if `ok`, else a wrong one with the text `bad` and the `changes`."""
     return fine(what, good) if ok else wrong(what, bad, *changes)
 
 
-def looked_at(what: str, look: Callable[[], str]) -> Finding:
-    """Return a finding: fine with the text that `look` returns, or wrong with the error that it raises."""
+def run_check(what: str, check: Callable[[], str]) -> Finding:
+    """Return a finding: fine with the text that `check` returns, or wrong with the error that it raises."""
     try:
-        return fine(what, look())
+        return fine(what, check())
     except EdgevprError as error:
         return wrong(what, str(error), exit_code=error.exit_code)
     except OSError as error:
         return wrong(what, f"{error.filename}: {error.strerror}: check the path and its permissions.")
 
 
-def lines(findings: Iterable[Finding]) -> Iterator[str]:
+def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
     """Yield the findings as lines of text: one for each finding, then one for each of its changes."""
     for finding in findings:
         yield f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}"
         yield from (f"{'':<22}change: {change}" for change in finding.changes)
 
 
-def board_findings(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
+def check_machine(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
     """Check this machine for a flight with `config` over the link `address` (None: no link). `root` is the root of the
     file system with /proc, /sys and /dev. Raises ConfigError if the board is unknown."""
-    yield _memory(load_board(config.board).memory_max_mb, root)
+    yield _check_memory(load_board(config.board).memory_max_mb, root)
     if address and address.kind == "serial":
-        yield device("serial", address.where, root)
-    yield from log_findings(config.log, has_link=config.mavlink.link is not None)
+        yield check_device("serial", address.where, root)
+    yield from check_logs(config.log, has_link=config.mavlink.link is not None)
 
 
-def device(what: str, path: str, root: Path = Path("/")) -> Finding:
-    """Check that a device file exists, that this user may use it, and that no other program holds it, nor a console if
-    it is a serial port. `what` names the check in the finding."""
+def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
+    """Check that a device file exists, that no other program has it open, and that this user may use it; and that a
+    serial port is not a console. `what` names the check in the finding."""
     file = root / path.lstrip("/")
     try:
-        status = file.stat()
+        status, port = file.stat(), file.resolve()
     except OSError as error:
         return wrong(what, f"{path}: {error.strerror}: connect it, or correct the name.")
     if not stat.S_ISCHR(status.st_mode):
-        return wrong(what, f"{path} is no device: correct the name.")
+        return wrong(what, f"{path} is not a device: correct the name.")
+    is_serial, no_login = what == "serial", f"sudo systemctl disable --now serial-getty@{port.name}"
+    if is_serial and (console := _find_console(port, root)):
+        no_console = f"remove console={console} from the kernel's command line (cmdline.txt), and reboot"
+        return wrong(what, f"{path} is the console of the kernel, which writes into the link.", no_console, no_login)
+    program, is_login = _find_program(port, root)
+    if program:
+        return wrong(what, f"{path} is in use by {program}.", no_login if is_login else f"stop {program}")
     group = str(status.st_gid)
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name
-    mode = f"group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
-    may_use, user = os.access(file, os.R_OK | os.W_OK), _user_name()
-    held, changes = _held(file.resolve(), root) if what == "serial" else _opened(file.resolve(), root)
-    if held:
-        return wrong(what, f"{path} ({mode}) is not free: {held}.", *changes)
-    denied = f"{path} may not be used by {user or f'user {os.getuid()}'} ({mode})"
-    if not may_use and group in _NOBODYS_GROUPS:
-        why = ": a login shell on it is the usual reason" if changes else ""
-        return wrong(what, f"{denied}{why}.", *(changes or ("install the udev rules 99-edgevpr.rules of edgevpr",)))
-    if not may_use and user is None:
-        return wrong(what, f"{denied}: start the container with the group.", f"--group-add {status.st_gid}")
-    if not may_use:
-        return wrong(
-            what, f"{denied}: log in again after the change.", f"sudo usermod --append --groups {group} {user}"
-        )
-    return fine(what, f"{path}, {mode}")
+    mode = f"{path}, group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
+    if os.access(file, os.R_OK | os.W_OK):
+        return fine(what, mode)
+    change = f"sudo usermod --append --groups {group} USER, and log in; in a container --group-add {status.st_gid}"
+    if group in _SYSTEM_GROUPS:
+        change = no_login if is_serial else "install the udev rules 99-edgevpr.rules of edgevpr"
+    return wrong(what, f"{mode}: user {os.getuid()} has no access.", change)
 
 
-def _user_name() -> str | None:
-    """Return the name of this user; None for a user of a number only, as of `docker run --user`."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # the latter from Python 3.13 on
-        return None
-
-
-def log_findings(log: LogConfig, has_link: bool) -> Iterator[Finding]:
+def check_logs(log: LogConfig, has_link: bool) -> Iterator[Finding]:
     """Check that the flight log can be written and, if there is a link, the tlog (the log of all MAVLink packets)."""
     if path := log.path:
-        yield looked_at("log", lambda: _room(path, "path", LOG_ROOM_MB))
+        yield run_check("log", lambda: _require_room(path, "path", LOG_ROOM_MB))
     else:
         yield fine("log", "none, so nothing of the flight is kept")
     if (tlog := log.tlog) and has_link:
-        yield looked_at("tlog", lambda: _room(tlog, "tlog", SPARED_BYTES / 1e6 + LOG_ROOM_MB))
+        yield run_check("tlog", lambda: _require_room(tlog, "tlog", SPARED_BYTES / 1e6 + LOG_ROOM_MB))
     elif tlog:
         yield fine("tlog", "none, since there is no link")
 
 
-def _room(file: str, key: str, needed_mb: float) -> str:
+def _require_room(file: str, key: str, needed_mb: float) -> str:
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        raise EdgevprError(f"{path} is no file in a folder that is there: correct `log: {{{key}: ...}}`.")
+        raise EdgevprError(f"{path} is not a file in an existing folder: correct `log: {{{key}: ...}}`.")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise EdgevprError(f"{path} may not be written by this user: change its permissions or `log: {{{key}: ...}}`.")
     free_mb = shutil.disk_usage(path.parent).free / 1e6
@@ -140,7 +129,7 @@ def _room(file: str, key: str, needed_mb: float) -> str:
     return str(path)
 
 
-def _memory(needed_mb: float, root: Path) -> Finding:
+def _check_memory(needed_mb: float, root: Path) -> Finding:
     limit_mb = machine.ram_limit_mb(root)
     limit = f"{limit_mb:.0f} of {machine.ram_mb(root):.0f} MB for this process"
     controllers = machine.text(root / "sys/fs/cgroup/cgroup.controllers")
@@ -153,50 +142,29 @@ def _memory(needed_mb: float, root: Path) -> Finding:
     return fine("memory", limit)
 
 
-def _held(port: Path, root: Path) -> tuple[str | None, tuple[str, ...]]:
-    """Return what holds the serial port (None: nothing is found), and the changes that free it from it; if nothing is
-    found, those that free it from a login shell."""
-    console = _console_on(port, root)
-    program, is_login = _program_on(port, root)
-    held = [f"console={console} makes it the console of the kernel, which writes into the link"] if console else []
-    held += [f"{program} {'lets people log in on it' if is_login else 'has it open'}"] if program else []
-    if program and not (console or is_login):
-        return held[0], (f"stop {program}",)
-    if "Raspberry Pi" in (machine.model(root) or ""):
-        change = "sudo raspi-config, Interface Options, Serial Port: login shell no, hardware yes; then reboot"
-        return " and ".join(held) or None, (change,)
-    changes = [f"remove console={console} from the kernel's command line (cmdline.txt), and reboot"] if console else []
-    return " and ".join(held) or None, (*changes, f"sudo systemctl disable --now serial-getty@{console or port.name}")
-
-
-def _opened(file: Path, root: Path) -> tuple[str | None, tuple[str, ...]]:
-    """Return what has a device open (None: nothing is found), and the change that frees it."""
-    program, _ = _program_on(file, root)
-    return (f"{program} has it open", (f"stop {program}",)) if program else (None, ())
-
-
-def _console_on(port: Path, root: Path) -> str | None:
+def _find_console(port: Path, root: Path) -> str | None:
     """Return the name of a port as the kernel's console, now or after the next start, e.g. "ttyS0"; None if the kernel
     has no console on it."""
-    lines = (machine.text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
-    words = " ".join(lines).split()
+    texts = (machine.text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
+    words = " ".join(texts).split()
     consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
     return next((console for console in consoles if (root / "dev" / console).resolve() == port), None)
 
 
-def _program_on(port: Path, root: Path) -> tuple[str | None, bool]:
-    """Return the program that uses a port, as "NAME (process PID)", None if none is seen; and whether the port is its
-    terminal, as it is of a getty and a login shell. Open files are seen of this user's programs only, or by root."""
+def _find_program(port: Path, root: Path) -> tuple[str | None, bool]:
+    """Return the program that uses a device, as "NAME (process PID)", None if none is seen; and whether the device is
+    its terminal, as it is of a login shell. Only root sees the open files of other users' programs."""
     device = port.stat().st_rdev
     major, minor = os.major(device), os.minor(device)
     terminal = str(minor & 0xFF | major << 8 | (minor & ~0xFF) << 12)  # the number that proc(5) calls tty_nr
-    others = [each for each in (root / "proc").glob("[0-9]*") if each.name != str(os.getpid())]
-    for process in sorted(others, key=lambda each: int(each.name)):
+    for process in sorted((root / "proc").glob("[0-9]*"), key=lambda folder: int(folder.name)):
+        if process.name == str(os.getpid()):
+            continue
         start, _, stat_fields = (machine.text(process / "stat") or "").rpartition(")")
-        named = f"{start.partition('(')[2]} (process {process.name})"
+        name = f"{start.partition('(')[2]} (process {process.name})"
         if stat_fields.split()[4:5] == [terminal]:
-            return named, True
+            return name, True
         with suppress(OSError):
-            if any(each.resolve() == port for each in (process / "fd").iterdir()):
-                return named, False
+            if any(file.resolve() == port for file in (process / "fd").iterdir()):
+                return name, False
     return None, False

@@ -1,24 +1,34 @@
 """`edgevpr service`: prints the unit of the service; makes its user, folders, program, configuration, unit and udev
-rules, and removes them again. Maps, flight logs and the configuration stay."""
+rules, and removes them again. Maps, flight logs and the configuration stay.
+
+The program is a virtual environment (`venv`) with a copy of the running edgevpr and the packages that it needs. Each
+step may be repeated, so that a run after an interrupted one completes the work."""
 
 import os
 import platform
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from functools import partial
+from importlib import util
 from pathlib import Path
 
+import edgevpr
 from edgevpr import __version__
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import shipped, write_whole
 from edgevpr.core.text import printable
 from edgevpr.power.boards import Board, load_board
-from edgevpr.runtime.service import program
-from edgevpr.runtime.service.program import AGAIN, NAME, VENV, command, is_told
 
+NAME = "edgevpr"  # of the package, its command, the service, its user and the user's group
+_VENV = "opt/edgevpr"  # below the root; not below /home, which the service cannot see
+_UNFINISHED = "unfinished"  # the file that is in the environment while packages are installed
+_SHIPPED = ("profiles", "models", "deploy")
+_SCRIPT = "#!{python}\nimport sys\n\nfrom edgevpr.cli.main import program\n\nsys.exit(program())\n"
+_AGAIN = "correct that and run it again: what is done stays"
 _CONFIG = "etc/edgevpr/config.yaml"
 _UNIT, _RULES = "etc/systemd/system/edgevpr.service", "etc/udev/rules.d/99-edgevpr.rules"
 _MAPS, _LOGS = "var/lib/edgevpr", "var/log/edgevpr"
@@ -27,7 +37,7 @@ _BOOTED = "run/systemd/system"  # sd_booted(3)
 # The unit's ProtectHome and PrivateTmp show the service empty folders instead of these.
 _HIDDEN_FROM_THE_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 
-Step = tuple[str, Callable[[], object]]  # what it brings about, in words, and what to call; it may be repeated
+Step = tuple[str, Callable[[], object]]  # what it brings about, in words, and what to call
 
 _FIRST_CONFIG = """\
 # Written by `edgevpr service install`. It needs only the keys that differ from the defaults; deploy/config.yaml of
@@ -66,23 +76,23 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
     written = config or (there if there.exists() else None)
     content = written.read_bytes() if written else _FIRST_CONFIG.encode()
     unit = render_unit(load_board(load_config(written).board if written else "this"))
-    rules, venv = (shipped("deploy") / "99-edgevpr.rules").read_bytes(), root / VENV
+    rules, venv = (shipped("deploy") / "99-edgevpr.rules").read_bytes(), root / _VENV
     steps: tuple[Step, ...] = (
         (f"system user {NAME}, without a login, in the groups {_GROUPS}", _make_user),
         *(
-            (f"folder /{name}", partial(command, "install", "-d", "-o", NAME, "-g", NAME, root / name))
+            (f"folder /{name}", partial(_run, "install", "-d", "-o", NAME, "-g", NAME, root / name))
             for name in (_MAPS, _LOGS)
         ),
         (f"configuration in /{_CONFIG}", lambda: _put(root / _CONFIG, content)),
-        (f"virtual environment in /{VENV}", lambda: program.make_environment(venv)),
-        ("packages of requirements.lock, by their hashes", lambda: program.install_packages(venv)),
-        (f"edgevpr {__version__}", lambda: program.copy_edgevpr(venv)),
+        (f"virtual environment in /{_VENV}", lambda: _make_environment(venv)),
+        ("packages of requirements.lock, by their hashes", lambda: _install_packages(venv)),
+        (f"edgevpr {__version__}", lambda: _copy_edgevpr(venv)),
         (f"unit, with the limits of the board, in /{_UNIT}", lambda: _put(root / _UNIT, unit.encode())),
         (f"udev rules in /{_RULES}", lambda: _put(root / _RULES, rules)),
         ("systemd has read the unit", lambda: _reload_units(root)),
         ("udev has read its rules, and named what is plugged in", _reload_rules),
     )
-    _walk(steps, dry_run, say)
+    _take_steps(steps, dry_run, say)
 
 
 def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/")) -> None:
@@ -91,18 +101,18 @@ def uninstall(dry_run: bool, say: Callable[[str], None], root: Path = Path("/"))
         _require_root(root)
     stop = ("systemctl", "disable", "--now", NAME)
     steps: tuple[Step, ...] = (
-        ("service stopped and not started any more", lambda: command(*stop) if (root / _UNIT).exists() else None),
+        ("service stopped and not started any more", lambda: _run(*stop) if (root / _UNIT).exists() else None),
         *((f"no /{name}", partial((root / name).unlink, missing_ok=True)) for name in (_UNIT, _RULES)),
         ("systemd has read that the unit is gone", lambda: _reload_units(root)),
         ("udev has read that its rules are gone", _reload_rules),
         # Last, since this may be the very program that runs.
-        (f"no /{VENV}", lambda: program.remove_program(root / VENV)),
+        (f"no /{_VENV}", lambda: _remove_environment(root / _VENV)),
     )
-    _walk(steps, dry_run, say)
+    _take_steps(steps, dry_run, say)
     say(f"kept   /{_CONFIG}, /{_MAPS}, /{_LOGS} and the user {NAME}, to whom they belong")
 
 
-def _walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> None:
+def _take_steps(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> None:
     """Carry out the steps in order, or none with `dry_run`; `say` gets a line about each. Raises EdgevprError for the
     first step that fails."""
     before = os.umask(0o022)  # the service's user is to read what root writes
@@ -115,7 +125,7 @@ def _walk(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]) -> N
                     os.sync()  # so that a finished step stays finished after a power cut
                 except OSError as error:
                     where = f"{error.filename}: " if error.filename else ""
-                    raise EdgevprError(f"{what}: {where}{error.strerror or error}; {AGAIN}.") from error
+                    raise EdgevprError(f"{what}: {where}{error.strerror or error}; {_AGAIN}.") from error
     finally:
         os.umask(before)
 
@@ -125,10 +135,10 @@ def _require_right_to_change(root: Path) -> None:
     for folder in _HIDDEN_FROM_THE_SERVICE if root == Path("/") else ():
         if Path(sys.base_prefix).resolve().is_relative_to(folder):
             raise EdgevprError(
-                f"This Python lies in {sys.base_prefix}, out of sight of the service: install edgevpr with the "
-                "system's (/usr/bin/python3 -m venv) and run it from there."
+                f"The service cannot see {sys.base_prefix}, where this Python is: install edgevpr with the system's "
+                "(/usr/bin/python3 -m venv) and run it from there."
             )
-    if is_told("systemctl", "is-active", "--quiet", NAME):
+    if _succeeds("systemctl", "is-active", "--quiet", NAME):
         raise EdgevprError(f"The service runs: `systemctl stop {NAME}` on the ground, then run it again.")
 
 
@@ -138,10 +148,10 @@ def _require_root(root: Path) -> None:
 
 
 def _make_user() -> None:
-    if not is_told("id", NAME):
+    if not _succeeds("id", NAME):
         shell = ("--home-dir", f"/{_MAPS}", "--shell", "/usr/sbin/nologin")
-        command("useradd", "--system", "--user-group", *shell, NAME)
-    command("usermod", "--append", "--groups", _GROUPS, NAME)
+        _run("useradd", "--system", "--user-group", *shell, NAME)
+    _run("usermod", "--append", "--groups", _GROUPS, NAME)
 
 
 def _put(path: Path, content: bytes) -> None:
@@ -154,14 +164,89 @@ def _put(path: Path, content: bytes) -> None:
 
 def _reload_units(root: Path) -> None:
     if not (root / _BOOTED).is_dir():
-        raise EdgevprError(
-            "systemd does not run here, and the service needs it: start the machine with it, then run this again; what "
-            "is done stays."
-        )
-    command("systemctl", "daemon-reload")
+        raise EdgevprError(f"systemd, which the service needs, does not run here: start the machine with it; {_AGAIN}.")
+    _run("systemctl", "daemon-reload")
 
 
 def _reload_rules() -> None:
-    command("udevadm", "control", "--reload")
+    _run("udevadm", "control", "--reload")
     subsystems = ("tty", "video4linux", "media", "dma_heap")
-    command("udevadm", "trigger", *(f"--subsystem-match={name}" for name in subsystems))
+    _run("udevadm", "trigger", *(f"--subsystem-match={name}" for name in subsystems))
+
+
+def _run(*words: str | Path, **environment: str) -> None:
+    """Run a program, `words` being its name and arguments, with `environment` added to our variables. If it fails,
+    raise EdgevprError with the last line of its output."""
+    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
+    name, variables = Path(words[0]).name, {**os.environ, "PATH": path, **environment}
+    try:
+        done = subprocess.run(
+            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", env=variables
+        )
+    except FileNotFoundError as error:
+        raise EdgevprError(f"{name} is not on this machine; {_AGAIN}.") from error
+    if done.returncode:
+        lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+        errors = [line for line in lines if line.startswith("ERROR: ")]  # pip's: its last line may advise an upgrade
+        problem = (errors or lines or [f"exit code {done.returncode}"])[-1]
+        raise EdgevprError(f"{name}: {problem.removeprefix('ERROR: ').rstrip('.')}; {_AGAIN}.")
+
+
+def _succeeds(*words: str | Path) -> bool:
+    """Run a program; return True if its exit code is 0, False also if it is not installed."""
+    try:
+        return subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True).returncode == 0
+    except OSError:
+        return False
+
+
+def _make_environment(venv: Path) -> None:
+    """Make the virtual environment; if an interrupted run has left it unfinished, or an upgrade of the system has taken
+    its Python, make it anew."""
+    if util.find_spec("ensurepip") is None:
+        raise EdgevprError("Python's venv module is missing: `apt install python3-venv`, then run it again.")
+    is_own = (venv / "pyvenv.cfg").is_file()
+    if not is_own and venv.exists() and any(venv.iterdir()):
+        raise EdgevprError(f"{venv} is not a virtual environment: move it away.")
+    if Path(sys.prefix).resolve() == venv.resolve():  # it is this very program
+        return
+    if (venv / _UNFINISHED).exists() or not _succeeds(venv / "bin" / "python", "-I", "-m", "pip", "--version"):
+        _run(sys.executable, "-I", "-m", "venv", *(("--clear",) if is_own else ()), venv)
+
+
+def _install_packages(venv: Path) -> None:
+    """Install the packages that edgevpr needs, and check them by their hashes. Without a network this succeeds if all
+    are installed already."""
+    pip = (venv / "bin" / "python", "-I", "-m", "pip", "--disable-pip-version-check", "--no-input", "install")
+    lock = shipped("deploy") / "requirements.lock"
+    (venv / _UNFINISHED).touch()
+    try:  # /tmp may be memory, of which a small board has too little
+        _run(*pip, "--require-hashes", "--only-binary", ":all:", "--requirement", lock, TMPDIR=str(venv))
+    finally:
+        (venv / _UNFINISHED).unlink()
+
+
+def _copy_edgevpr(venv: Path) -> None:
+    """Copy the running edgevpr, a checkout or an installed one, into the environment, and compile it for a quick start.
+    This needs no network and no tool to build it."""
+    (site,) = venv.glob("lib/python3*/site-packages")
+    room = venv / "new"
+    shutil.rmtree(room, ignore_errors=True)
+    without_bytecode = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(edgevpr.__file__).parent, room, ignore=without_bytecode)
+    for kind in _SHIPPED:  # in a checkout they lie beside the package
+        shutil.copytree(shipped(kind), room / "shipped" / kind, ignore=without_bytecode, dirs_exist_ok=True)
+    shutil.rmtree(site / NAME, ignore_errors=True)
+    room.rename(site / NAME)
+    script = venv / "bin" / NAME
+    script.write_text(_SCRIPT.format(python=venv / "bin" / "python"), "utf-8")
+    script.chmod(0o755)
+    _run(venv / "bin" / "python", "-I", "-m", "compileall", "-q", site / NAME)
+
+
+def _remove_environment(venv: Path) -> None:
+    """Remove the virtual environment, if there is one. Raises EdgevprError if something else is there."""
+    if venv.exists() and not (venv / "pyvenv.cfg").is_file():
+        raise EdgevprError(f"{venv} is not a virtual environment: remove it by hand.")
+    if venv.exists():
+        shutil.rmtree(venv)

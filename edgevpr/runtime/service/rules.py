@@ -13,7 +13,7 @@ from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters, own_name
 from edgevpr.mavlink.parameters import ParameterTable
 from edgevpr.mavlink.px4_parameters import CONTROL, FUSES_POSITION, PX4_TABLE, VISION_CONTROL
-from edgevpr.runtime.service.finding import Finding, fine, judged, wrong
+from edgevpr.runtime.service.finding import Finding, fine, judge, wrong
 
 _SWITCHES = (1, 4)  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
 _FROM_FLOW, _FROM_VISION = 5, 6  # values of EK3_SRCn_...
@@ -59,39 +59,31 @@ def _parameters(table: ParameterTable, choice: Choice, reading: AutopilotReading
         stops = " Until then edgevpr sends nothing." if fault.rule.is_dangerous else ""
         yield wrong(fault.rule.label, f"{fault.rule.why}{stops}", *fault.changes)
     if not faults:
-        yield fine("parameters", "those that change what positions of edgevpr do are right")
+        yield fine("parameters", "all that affect positions of edgevpr are right")
 
 
 def _single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
     """Check the use of command 43003, which sends single fixes: something else, such as airspeed or optical flow, must
     carry the vehicle's position from one fix to the next."""
-    parameters, kind = reading.parameters, reading.kind
+    parameters = reading.parameters
     hovers = parameters.get("Q_ENABLE") == 1  # only planes have it, whatever type the heartbeat reports
-    if kind is Kind.PLANE and not hovers:
+    if reading.kind is Kind.PLANE and not hovers:
         return fine("channel", _sentence(choice.reason))
     flow = parameters.get("FLOW_TYPE", 0)
     if flow and _sets_with(parameters, "VELXY", _FROM_FLOW):
-        return fine("channel", f"Command 43003: FLOW_TYPE={flow:g} carries it from fix to fix.")
-    # ArduPlane's ekf_check.cpp: QHOVER while the pilot flies it with the sticks, QLAND while it flies by itself.
-    end = "falls back to QHOVER or QLAND" if hovers else "stops" if kind is Kind.ROVER else "lands"
-    while_it = " while it hovers (Q_ENABLE=1)" if hovers else ""
-    unused = " FLOW_TYPE is set, but no EK3_SRCn_VELXY is 5, so the flow is not used." if flow else ""
+        return fine("channel", f"Command 43003; optical flow (FLOW_TYPE={flow:g}) carries it from fix to fix.")
     second = own_name(parameters, RECEIVERS[SECOND])
-    if taken := parameters.get(second, 0):
-        unused += f" It takes the place of the second receiver (type {taken:g})."
+    replaced = f", in place of its receiver of type {taken:g}" if (taken := parameters.get(second, 0)) else ""
     return wrong(
         "channel",
-        f"This {reading.vehicle} has nothing that carries it from one fix to the next{while_it}: without GPS it {end} "
-        f"by its EKF failsafe after some 9 s.{unused} Let it take edgevpr for a second GPS receiver, and reboot.",
+        f"Nothing carries this {reading.vehicle} from one fix to the next, so without GPS its EKF failsafe acts after "
+        f"some 9 s. Let it use edgevpr as the second GPS receiver{replaced}, and reboot.",
         f"{second}={MAVLINK_GPS}",
         *(() if parameters.get("GPS_AUTO_SWITCH") in _SWITCHES else ("GPS_AUTO_SWITCH=1",)),
     )
 
 
 def _by_odometry(choice: Choice, reading: AutopilotReading) -> Finding:
-    if reading.origin is None:
-        no_origin = f"{choice.reason}, but the filter has no origin: it cannot be placed on the Earth."
-        return wrong("channel", no_origin, "wait for a GPS fix, or set the EKF origin from the ground station")
     sets = _sets_with(reading.parameters, "POSXY", _FROM_VISION)
     switch = "" if not sets or 1 in sets else f"; when GPS is lost, the operator switches to source set {sets[0]}"
     return fine("channel", _sentence(f"{choice.reason}{switch}"))
@@ -119,7 +111,7 @@ def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Fin
         choice = replace(choice, channel=Channel.SENSOR)  # for the other parameters that it will need
         yield wrong(
             "channel",
-            "PX4 can take positions as measurements (message 296), but is not set for it: change this, and reboot.",
+            "PX4 can use positions as measurements (message 296), but is not set up for it: change this, and reboot.",
             f"{CONTROL}={FUSES_POSITION}",
         )
     else:
@@ -129,22 +121,20 @@ def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Fin
 
 
 def _px4_single_fixes(choice: Choice, reading: AutopilotReading) -> Finding:
-    """Return the finding about command 43003. That a copter may use optical flow is no news: PX4 may by default."""
     if reading.kind is Kind.PLANE:
         return fine("channel", _sentence(choice.reason))
     others = ", unless another system aboard sends ODOMETRY" if reading.parameters.get(VISION_CONTROL) else ""
     return wrong(
         "channel",
-        f"This {reading.vehicle} has nothing that carries it from one fix to the next: without GPS its position is "
-        "lost after some seconds, and its failsafe decides. Let it take positions as measurements: change this, and "
-        "reboot.",
+        f"Nothing carries this {reading.vehicle} from one fix to the next, so without GPS its failsafe acts after some "
+        "seconds. Let it use positions as measurements, and reboot.",
         f"{VISION_CONTROL}={FUSES_POSITION}{others}",
     )
 
 
 def _port(reading: AutopilotReading, change: str) -> Finding:
-    old = "It speaks MAVLink 1, which knows neither signatures nor new messages."
-    return judged("port", not reading.says_version_1, "MAVLink 2", old, change)
+    message = "It sends MAVLink 1, which has neither signatures nor new messages."
+    return judge("port", not reading.says_version_1, "MAVLink 2", message, change)
 
 
 def _sentence(words: str) -> str:

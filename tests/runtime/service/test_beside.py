@@ -60,9 +60,7 @@ def mavproxy(put, folder):
         pytest.param(mavproxy, "MAVProxy owns it", id="MAVProxy"),
     ],
 )
-def test_fixes_are_answered_and_a_ground_station_hears_all_though_the_owner_of_the_port_is_killed_in_flight(
-    recording, tmp_path, owner, section
-):
+def test_run_behind_a_router_that_is_killed_in_flight(recording, tmp_path, owner, section):
     cable, log = SerialCable(tmp_path), tmp_path / "flight.jsonl"
     with ExitStack() as stack:
         station_port = stack.enter_context(closing(UdpPort()))

@@ -1,9 +1,8 @@
 """`edgevpr check` on a real map, folder, socket and pty; and on each thing that can be wrong."""
 
+import os
 import shutil
 import socket
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +10,11 @@ import cv2
 import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
+from mavlink_peers import free_port
 from pictures import textured
 
 from edgevpr import techniques
+from edgevpr.cli.main import main
 from edgevpr.core.types import Frame, StageCost
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
@@ -23,13 +24,7 @@ from edgevpr.runtime.service.check import Finding, check
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-ITEMS = ["configuration", "board", "battery", "map", "source", "link", "log"]
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+ITEMS = ["configuration", "board", "map", "battery", "source", "link", "log"]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +48,7 @@ def settings(flight_folder, tmp_path) -> dict:
         "board": "rpi-zero-2w",
         "map": str(flight_folder / "valley.gpkg"),
         "source": {"uri": str(flight_folder / "images")},
-        "mavlink": {"link": f"udpin:127.0.0.1:{free_port(socket.SOCK_DGRAM)}"},
+        "mavlink": {"link": f"udpin:127.0.0.1:{free_port()}"},
         "log": {"path": str(tmp_path / "flight.jsonl")},
     }
 
@@ -67,21 +62,22 @@ def wrong(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
     findings = check(config_file, offline=True)
-    assert [finding.what for finding in findings] == ITEMS
+    assert [finding.what for finding in findings if finding.what != "tlog"] == ITEMS
     return [finding for finding in findings if not finding.ok]
 
 
-def test_a_query_that_is_too_slow_for_any_fix_is_wrong_unless_no_fixes_are_wanted(settings, config_file, monkeypatch):
+def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(settings, config_file, monkeypatch):
     probe = pick.probe
     monkeypatch.setattr(pick, "probe", lambda technique: replace(probe(technique), encode=StageCost(6.0, 6.0)))
-    (finding,) = wrong(config_file, settings | {"board": "this"})
+    settings["board"] = "this"
+    (finding,) = wrong(config_file, settings)
     assert finding.what == "map"
     assert too_late(6.0) in finding.message
-    without_fixes = {"mavlink": {"link": settings["mavlink"]["link"], "send_fixes": False}}
-    assert wrong(config_file, settings | {"board": "this"} | without_fixes) == []
+    settings["mavlink"]["send_fixes"] = False
+    assert wrong(config_file, settings) == []
 
 
-def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tmp_path):
+def test_check_opens_the_ground_link_and_the_signing_key(settings, config_file, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(32))
     key.chmod(0o600)
@@ -90,36 +86,21 @@ def test_a_ground_link_and_a_signing_key_are_looked_at(settings, config_file, tm
     assert not key.with_name("key.time").exists(), "root must not make what the service is to write"
     key.chmod(0o640)
     (finding,) = wrong(config_file, settings)
-    assert (finding.what, "chmod 600" in finding.message) == ("link", True)
+    assert finding.what == "link"
     settings["mavlink"] = {"ground": "udpout:127.0.0.1:9"}
     (finding,) = wrong(config_file, settings)
     assert finding.what == "link"
 
 
-def test_a_tlog_is_looked_at_like_the_flight_log(settings, config_file, tmp_path):
+def test_check_leaves_nothing_behind(settings, config_file, tmp_path, flight_folder):
     settings["log"]["tlog"] = str(tmp_path / "flight.tlog")
-    config_file.write_text(yaml.safe_dump(settings))
-    found = check(config_file, offline=True)
-    assert [(each.what, each.ok, each.message) for each in found][-1] == ("tlog", True, str(tmp_path / "flight.tlog"))
-    assert list(tmp_path.iterdir()) == [config_file]
-    settings["log"]["tlog"] = str(tmp_path / "absent" / "flight.tlog")
-    config_file.write_text(yaml.safe_dump(settings))
-    (finding,) = [each for each in check(config_file, offline=True) if not each.ok]
-    assert (finding.what, "`log: {tlog:" in finding.message) == ("tlog", True)
-    settings["mavlink"]["link"] = None
-    config_file.write_text(yaml.safe_dump(settings))
-    last = check(config_file, offline=True)[-1]
-    assert (last.what, last.ok) == ("tlog", True)
-
-
-def test_all_is_well_and_nothing_is_left_behind(settings, config_file, tmp_path, flight_folder):
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]
     assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
 
 
 @pytest.mark.parametrize("text", ["map: [", "mapp: valley.gpkg", "source: {rate_hz: 1000}", "\x00", "- 1", None])
-def test_a_configuration_that_cannot_be_read_is_the_only_finding(config_file, text):
+def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
     if text is not None:
         config_file.write_text(text)
     (finding,) = check(config_file)
@@ -128,34 +109,38 @@ def test_a_configuration_that_cannot_be_read_is_the_only_finding(config_file, te
 
 
 @pytest.mark.parametrize(
-    ("changes", "wrong_things", "named"),
+    ("changes", "wrong_things"),
     [
-        ({"map": None, "source": {"uri": None}}, ["map", "source"], ""),
-        ({"board": "rpi-zero-2"}, ["board", "map"], "rpi-zero-2w"),
-        ({"battery": {"pack": "4x5200"}}, ["battery", "map"], "4x5200"),
-        ({"technique": "cohog"}, ["map"], "hog, not cohog"),
+        ({"mavlink": {"link": None}, "log": {"path": None, "tlog": "/absent/x.tlog"}}, []),
+        ({"source": {"uri": "rtsp://127.0.0.1:9/camera"}}, []),  # it may deliver later
+        ({"map": None, "source": {"uri": None}}, ["map", "source"]),
+        ({"battery": {"pack": "4x5200"}}, ["map", "battery"]),
+        ({"technique": "cohog"}, ["map"]),
         (
             {"mapping": {"learn": True}, "mavlink": {"link": None}, "source": {"uri": "rtsp://127.0.0.1:9/camera"}},
             ["source"],
-            "--link",
         ),
-        ({"source": {"uri": "/dev/video99"}}, ["source"], "/dev/video99"),
-        ({"source": {"uri": "ftp://camera/x"}}, ["source"], "ftp://camera/x"),
-        ({"source": {"uri": "udp://127.0.0.1"}}, ["source"], "udp://127.0.0.1"),
-        ({"mavlink": {"link": "udp:127.0.0.1"}}, ["link"], "udp:127.0.0.1"),
-        ({"mavlink": {"link": "serial:/dev/ttyACM99:921600"}}, ["link"], "serial:/dev/ttyACM99:921600"),
-        ({"mavlink": {"link": "tcp:127.0.0.1:9"}}, ["link"], "Connection refused"),
-        ({"log": {"path": "/"}}, ["log"], "/"),
-        ({"log": {"path": "/absent/flight.jsonl"}}, ["log"], "/absent"),
+        ({"source": {"uri": "/dev/video99"}}, ["source"]),
+        ({"source": {"uri": "ftp://camera/x"}}, ["source"]),
+        ({"mavlink": {"link": "udp:127.0.0.1"}}, ["link"]),
+        ({"mavlink": {"link": "serial:/dev/ttyACM99:921600"}}, ["link"]),
+        ({"mavlink": {"link": "tcp:127.0.0.1:9"}}, ["link"]),
+        ({"log": {"path": "/"}}, ["log"]),
+        ({"log": {"path": "/absent/flight.jsonl", "tlog": "/absent/flight.tlog"}}, ["log", "tlog"]),
     ],
 )
-def test_what_is_wrong_is_found_at_once(settings, config_file, changes, wrong_things, named):
-    findings = wrong(config_file, settings | changes)
-    assert [finding.what for finding in findings] == wrong_things
-    assert named.strip("-") in findings[0].message
+def test_check_finds_what_is_wrong_offline(settings, config_file, changes, wrong_things):
+    assert [finding.what for finding in wrong(config_file, settings | changes)] == wrong_things
 
 
-def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config_file, tmp_path):
+def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
+    config_file.write_text(yaml.safe_dump(settings | {"board": "rpi-zero-2"}))
+    findings = {finding.what: finding.ok for finding in check(config_file, offline=True)}
+    assert not findings["board"]
+    assert "map" not in findings
+
+
+def test_check_of_a_flight_that_learns_needs_no_map_and_makes_none(settings, config_file, tmp_path):
     settings |= {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg")}
     assert wrong(config_file, settings) == []
     assert not (tmp_path / "new.gpkg").exists()
@@ -166,7 +151,7 @@ def test_a_flight_that_learns_needs_no_map_yet_and_none_is_made(settings, config
     assert finding.what == "map"
 
 
-def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, config_file):
+def test_check_reports_places_beyond_the_budget(settings, config_file):
     big = config_file.with_name("big.gpkg")
     shutil.copy(settings["map"], big)
     with PlaceMap.open_for_adding(big) as place_map:
@@ -179,29 +164,51 @@ def test_places_that_the_budget_does_not_hold_are_told(flight_folder, settings, 
     assert " places are left " in finding.message
 
 
-def wrong_online(config_file: Path, settings: dict, **how) -> list[Finding]:
+def test_check_finds_a_port_that_another_program_has(settings, config_file):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        settings["mavlink"]["link"] = f"udpin:127.0.0.1:{other.getsockname()[1]}"
+        (finding,) = wrong(config_file, settings)
+    assert finding.what == "link"
+
+
+def test_check_opens_a_serial_port(settings, config_file):
+    controller, port = os.openpty()
+    settings["mavlink"]["link"] = f"serial:{os.ttyname(port)}:921600"
+    assert wrong(config_file, settings) == []
+    os.close(controller)
+    os.close(port)
+
+
+def wrong_online(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong when it waits for a frame and a heartbeat."""
     config_file.write_text(yaml.safe_dump(settings))
-    return [finding for finding in check(config_file, **how) if not finding.ok]
+    return [finding for finding in check(config_file) if not finding.ok]
 
 
 def autopilot_of(settings: dict, **how) -> AnsweringAutopilot:
     return AnsweringAutopilot(parse_link(settings["mavlink"]["link"]).number, **how)
 
 
-def test_a_frame_and_a_heartbeat_are_waited_for_and_told(settings, config_file):
-    told = []
+def test_check_waits_for_a_frame_and_a_heartbeat(settings, config_file, capsys):
     config_file.write_text(yaml.safe_dump(settings))
     with autopilot_of(settings, system_id=7) as autopilot:
-        findings = {finding.what: finding for finding in check(config_file, say=told.append)}
-    assert all(finding.ok for finding in findings.values())
-    assert findings["source"].message.endswith("160 x 120 pixels")
-    assert findings["link"].message.endswith("system 7")
-    assert [len(text) > 0 for text in told] == [True, True, False]
+        assert main(["check", "--config", str(config_file)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines] == ITEMS
+    assert lines[4].endswith("160 x 120 pixels")
+    assert lines[5].endswith("system 7")
     assert autopilot.names() <= {"HEARTBEAT"}
 
 
-def test_a_camera_that_does_not_deliver_is_wrong(settings, config_file):
+def test_check_finds_another_autopilot_than_the_configured(settings, config_file):
+    settings["mavlink"]["system_id"] = 3
+    with autopilot_of(settings, system_id=4):
+        (finding,) = wrong_online(config_file, settings)
+    assert "system 4" in finding.message
+
+
+def test_check_finds_a_camera_that_does_not_deliver(settings, config_file):
     settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port(socket.SOCK_STREAM)}/camera"
     settings["mavlink"]["link"] = None
     (finding,) = wrong_online(config_file, settings)
@@ -209,17 +216,12 @@ def test_a_camera_that_does_not_deliver_is_wrong(settings, config_file):
     assert finding.message.startswith(f"{settings['source']['uri']}: ")
 
 
-def edgevpr_check(config_file: Path, *arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "edgevpr", "check", "--config", str(config_file), *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-def test_the_command_prints_a_line_for_each_thing_and_exits_with_0(settings, config_file):
-    config_file.write_text(yaml.safe_dump(settings))
-    done = edgevpr_check(config_file, "--offline")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert [line.split()[1] for line in done.stdout.splitlines()] == ITEMS
-    with autopilot_of(settings):
-        done = edgevpr_check(config_file)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert edgevpr_check(config_file).returncode == 1
+def test_check_takes_no_damaged_image_for_a_frame(settings, config_file, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (folder / "1.png").write_bytes(b"no picture")
+    settings["source"]["uri"], settings["mavlink"]["link"] = str(folder), None
+    (finding,) = wrong_online(config_file, settings)
+    assert finding.what == "source"
+    shutil.copy(next(Path(settings["map"]).parent.glob("images/*.png")), folder / "2.png")
+    assert wrong_online(config_file, settings) == []

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import pytest
 from flight_process import cpu_s, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
+from mavlink_peers import free_port
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight import aboard
@@ -40,9 +41,7 @@ def wait_for_queries(log, count, process):
 @contextmanager
 def autopilot():
     """A simulated flight controller as a process, up; gives its link, and a call that ends it and tells what it saw."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json"]
     process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -60,7 +59,7 @@ def autopilot():
         process.stderr.close()
 
 
-def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
+def test_run_sends_what_the_log_says(fly, tmp_path):
     with autopilot() as (link, asked):
         run = fly("--link", link, "--rate-hz", "3")  # ten seconds: a vehicle must have been heard before the first fix
         said = run.communicate(timeout=120)[1]
@@ -87,11 +86,6 @@ def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
     assert told <= {line["query"] for line in answered}
     assert len(answered) == len({line["query"] for line in answered})
     assert f"{seen['fixes_accepted']} taken" in said
-    for line in queries:
-        cost = line["costs"]
-        assert 0 < cost["u_encode"] <= 1
-        assert 0 < cost["u_match"] <= 1
-        assert cost["rss_mb"] > 10
     # The board draws between the queries too, and the process does more than its queries' stages.
     totals, slack = queries[-1]["totals"], 1 + 1e-4
     assert totals["used_mah"] * slack > sum(line["costs"]["used_mah"] for line in queries)
@@ -102,7 +96,7 @@ def test_the_flight_controller_receives_what_the_log_says(fly, tmp_path):
 WITHHELD = {"dry run: no fix is sent", "not sent yet: nothing is heard of the vehicle"}  # the second for five seconds
 
 
-def test_a_dry_run_tells_everything_and_sends_no_fix(fly, tmp_path):
+def test_dry_run_sends_all_but_fixes(fly, tmp_path):
     with autopilot() as (link, asked):
         said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
         seen = asked()
@@ -121,7 +115,7 @@ def test_a_dry_run_tells_everything_and_sends_no_fix(fly, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_flight_with_everything_flushed(fly, tmp_path, number):
+def test_run_ends_by_a_signal_with_a_complete_log(fly, tmp_path, number):
     run = fly("--rate-hz", "0.5", "--link", "udpout:127.0.0.1:9")
     wait_for_queries(tmp_path / "flight.jsonl", 1, run)
     run.send_signal(number)
@@ -134,7 +128,7 @@ def test_a_signal_ends_the_flight_with_everything_flushed(fly, tmp_path, number)
     assert lines[-1]["queries"] < PLACES
 
 
-def test_a_signal_ends_a_flight_that_has_not_begun(recording, tmp_path, monkeypatch, caplog):
+def test_run_ends_by_a_signal_before_the_flight(recording, tmp_path, monkeypatch, caplog):
     """What a flight begins with takes half a minute on a slow board."""
 
     def computing(*_):
@@ -143,21 +137,14 @@ def test_a_signal_ends_a_flight_that_has_not_begun(recording, tmp_path, monkeypa
         pytest.fail("it went on computing")
 
     monkeypatch.setattr(aboard, "outlook", computing)
-    flags = (
-        "--map",
-        recording / "cohog.gpkg",
-        "--source",
-        recording / "seen" / "images",
-        "--log",
-        tmp_path / "f.jsonl",
-    )
+    place_map, images, log = recording / "cohog.gpkg", recording / "seen" / "images", tmp_path / "f.jsonl"
     with caplog.at_level("INFO"):
-        assert main(["run", *map(str, flags)]) == 0
+        assert main(["run", "--map", str(place_map), "--source", str(images), "--log", str(log)]) == 0
     assert any("before the flight" in each for each in caplog.messages)
-    assert list(read_log(tmp_path / "f.jsonl")) == []
+    assert list(read_log(log)) == []
 
 
-def test_a_long_query_is_broken_off_when_the_flight_is_to_end(recording, tmp_path):
+def test_run_breaks_off_a_long_query(recording, tmp_path):
     """Many regions of thirty places, compared as the thesis does, take seconds."""
     place_map, images, log = tmp_path / "slow.gpkg", recording / "blind" / "images", tmp_path / "flight.jsonl"
     built = ["map", "build", place_map, "--images", images, "--technique", "cohog", "--param", "w1=1200"]
@@ -187,7 +174,7 @@ def manager(tmp_path):
         yield listening, {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"}
 
 
-def test_systemd_hears_ready_alive_and_stopping(fly, tmp_path):
+def test_run_notifies_systemd(fly, tmp_path):
     with manager(tmp_path) as (listening, environment):
         run = fly("--rate-hz", "20", **environment)
         said = []
@@ -199,7 +186,7 @@ def test_systemd_hears_ready_alive_and_stopping(fly, tmp_path):
     assert any(line.startswith("STATUS=") and "queries" in line for line in said)
 
 
-def test_a_relative_log_of_the_service_lies_in_its_folder_of_logs(fly, tmp_path):
+def test_run_puts_a_relative_log_into_the_folder_of_logs(fly, tmp_path):
     (tmp_path / "logs").mkdir()
     run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))
     said = run.communicate(timeout=120)[1]

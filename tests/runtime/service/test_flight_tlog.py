@@ -31,7 +31,7 @@ def dumped(path: Path) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
 
 
-def test_a_flight_that_is_killed_leaves_a_log_that_is_read(fly, tmp_path):
+def test_tlog_of_a_killed_flight_can_be_read(fly, tmp_path):
     path = tmp_path / "flight.tlog"
     with closing(UdpPort()) as port:
         heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
@@ -48,7 +48,7 @@ def test_a_flight_that_is_killed_leaves_a_log_that_is_read(fly, tmp_path):
     assert "BAD_DATA" not in said
 
 
-def test_the_log_of_a_whole_flight_has_what_was_sent(fly, tmp_path):
+def test_tlog_has_all_packets_sent(fly, tmp_path):
     path = tmp_path / "flight.tlog"
     with closing(UdpPort()) as port:
         flight = fly("--link", f"udpout:127.0.0.1:{port.number}", "--tlog", path)

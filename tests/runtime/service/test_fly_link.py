@@ -24,7 +24,7 @@ def opened(config, port, signing, stack):
     return open_links(settings, world, Navigator(5.0, 1.0), None, stack)[0]
 
 
-def test_the_keys_of_the_configuration_reach_the_link():
+def test_open_links_uses_the_keys_of_the_configuration():
     keys = {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2}
     config = load_config(None, keys)
     with ExitStack() as stack:
@@ -37,7 +37,7 @@ def test_the_keys_of_the_configuration_reach_the_link():
         assert "0.2 s" in sending.why
 
 
-def test_the_key_and_where_the_time_is_kept_reach_the_link(tmp_path):
+def test_open_links_signs_and_keeps_the_time(tmp_path):
     key, state = tmp_path / "key", tmp_path / "state"
     key.write_bytes(bytes(32))
     key.chmod(0o600)

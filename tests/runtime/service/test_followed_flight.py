@@ -1,4 +1,4 @@
-"""`match.follow` and `match.accept_precision` of a flight: what they change."""
+"""`match.follow` of a flight."""
 
 import pytest
 from flights import of_kind
@@ -21,7 +21,7 @@ def flown(recording, tmp_path, match="{}", technique="cohog"):
     return of_kind(read_log(log), "query")
 
 
-def test_a_flight_is_followed_unless_it_is_told_not_to(recording, tmp_path):
+def test_run_follows_the_flight_by_default(recording, tmp_path):
     assert load_config(None).match.follow
     followed = flown(recording, tmp_path)
     assert all({"confidence", "lost"} <= set(line["followed"]) for line in followed)
@@ -31,5 +31,5 @@ def test_a_flight_is_followed_unless_it_is_told_not_to(recording, tmp_path):
 @pytest.mark.parametrize(
     ("match", "technique"), [("{follow: false}", "cohog"), ("{sequence: 2}", "cohog"), ("{follow: true}", "hog")]
 )
-def test_what_has_no_confidence_or_is_asked_for_a_sequence_is_not_followed(recording, tmp_path, match, technique):
+def test_run_does_not_follow_without_confidence_or_with_a_sequence(recording, tmp_path, match, technique):
     assert not any("followed" in line for line in flown(recording, tmp_path, match, technique))

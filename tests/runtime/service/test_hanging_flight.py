@@ -50,7 +50,7 @@ def hanging(recording, tmp_path):
 
 
 @pytest.mark.parametrize("step", ["read", "pixels", "release"])
-def test_a_camera_that_hangs_is_reported_as_lost_and_the_flight_ends_when_asked(hanging, step, tmp_path):
+def test_run_reports_a_hanging_camera_and_ends(hanging, step, tmp_path):
     flight = hanging(step)
     status = wait_for(
         lambda: (found := read_status(tmp_path / "status.json")) and "lost" in found[0]["source"] and found
@@ -64,7 +64,7 @@ def test_a_camera_that_hangs_is_reported_as_lost_and_the_flight_ends_when_asked(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_camera_whose_opening_hangs_holds_no_flight(hanging, number, tmp_path):
+def test_run_ends_while_a_camera_hangs_in_opening(hanging, number, tmp_path):
     flight = hanging("open")
     wait_for(lambda: read_status(tmp_path / "status.json"))
     flight.send_signal(number)
@@ -72,7 +72,7 @@ def test_a_camera_whose_opening_hangs_holds_no_flight(hanging, number, tmp_path)
     assert list(read_log(tmp_path / "f.jsonl"))[-1]["kind"] == "end"
 
 
-def test_a_main_thread_that_hangs_feeds_no_watchdog_and_is_ended_all_the_same(hanging, tmp_path):
+def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(hanging, tmp_path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         flight = hanging("main", NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000")
@@ -88,7 +88,7 @@ def test_a_main_thread_that_hangs_feeds_no_watchdog_and_is_ended_all_the_same(ha
 
 
 @pytest.mark.network
-def test_a_program_that_gives_no_picture_is_ended_with_the_flight(recording, tmp_path):
+def test_run_ends_the_program_of_a_camera(recording, tmp_path):
     """As a pipeline whose sensor hangs: the thread that waits for it is left, and it would keep the camera."""
     program = tmp_path / "gst-launch-1.0"
     program.write_text("#!/bin/sh\nexec sleep 600.25\n")

@@ -4,6 +4,7 @@ The programs that change users and services are scripts that change the folder."
 import base64
 import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -12,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from edgevpr import __version__
+from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.service import program
+from edgevpr.runtime.service import install as module
 from edgevpr.runtime.service.install import install, render_unit, uninstall
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
@@ -62,16 +64,16 @@ def bare(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """A lock of one package, and what has pip find it."""
-    folder = tmp_path_factory.mktemp("packages")
+    """A lock of one package, beside the files to deploy, and what has pip find it."""
+    folder = shutil.copytree(module.shipped("deploy"), tmp_path_factory.mktemp("packages"), dirs_exist_ok=True)
     lines = (
         'absent==2.0 ; python_version == "2.7" \\\n    --hash=sha256:00\n',
         f"tiny.one==1.0 \\\n    --hash=sha256:{tiny_wheel(folder)}\n",
     )
     (folder / "requirements.lock").write_text("# a lock\n" + "".join(lines))
     with pytest.MonkeyPatch.context() as patch:
-        real = program.shipped
-        patch.setattr(program, "shipped", lambda kind: folder if kind == "deploy" else real(kind))
+        real = module.shipped
+        patch.setattr(module, "shipped", lambda kind: folder if kind == "deploy" else real(kind))
         patch.setenv("PIP_NO_INDEX", "1")
         patch.setenv("PIP_FIND_LINKS", str(folder))
         yield folder
@@ -117,7 +119,7 @@ def version_of(root: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd="/").stdout
 
 
-def test_everything_is_made_and_made_again(installed_root):
+def test_install_can_be_repeated(installed_root):
     root, said = installed_root
     assert (root / "etc/systemd/system/edgevpr.service").read_text() == render_unit(load_board("this"))
     assert (root / "etc/udev/rules.d/99-edgevpr.rules").read_text().startswith("# udev rules of edgevpr")
@@ -135,13 +137,17 @@ def test_everything_is_made_and_made_again(installed_root):
     assert (root / "etc/passwd").read_text().count("edgevpr:x") == 1
 
 
-def test_a_dry_run_says_what_the_run_says_and_writes_nothing(installed_root, system, packages):
+def test_install_writes_a_valid_configuration(installed):
+    assert main(["check", "--offline", "--config", str(installed / "etc/edgevpr/config.yaml")]) == 2  # no map
+
+
+def test_install_dry_run_writes_nothing(installed_root, system, packages):
     before = tree(system)
     assert lines_of(system, dry_run=True) == installed_root[1]
     assert tree(system) == before
 
 
-def test_what_is_missing_is_made_again_and_what_was_left_unfinished_anew(installed):
+def test_install_repairs_what_is_missing(installed):
     (package,) = installed.glob("opt/edgevpr/lib/*/site-packages/tiny_one-1.0.dist-info/RECORD")
     (profile,) = installed.glob("opt/edgevpr/lib/*/site-packages/edgevpr/shipped/profiles/rpi-5.yaml")
     missing = (package, profile, installed / "opt/edgevpr/bin/edgevpr", installed / "opt/edgevpr/bin/python")
@@ -154,7 +160,7 @@ def test_what_is_missing_is_made_again_and_what_was_left_unfinished_anew(install
     assert version_of(installed) == f"edgevpr {__version__}\n"
 
 
-def test_a_configuration_of_ones_own_is_taken_and_the_one_before_kept(installed, tmp_path):
+def test_install_keeps_the_configuration_before(installed, tmp_path):
     first = (installed / "etc/edgevpr/config.yaml").read_bytes()
     own = tmp_path / "own.yaml"
     own.write_text("board: rpi-5\n")
@@ -166,7 +172,7 @@ def test_a_configuration_of_ones_own_is_taken_and_the_one_before_kept(installed,
 
 
 @pytest.mark.parametrize("case", ["configuration", "32 bits", "running"])
-def test_what_forbids_it_stops_it_before_anything_is_done(system, tmp_path, monkeypatch, case):
+def test_install_refuses_before_it_changes_anything(system, tmp_path, monkeypatch, case):
     own = tmp_path / "own.yaml"
     own.write_text("mapp: x\n" if case == "configuration" else "")
     if case == "32 bits":
@@ -179,7 +185,7 @@ def test_what_forbids_it_stops_it_before_anything_is_done(system, tmp_path, monk
     assert tree(system) == before
 
 
-def test_what_is_no_virtual_environment_is_left_alone(system, packages):
+def test_install_leaves_alone_what_is_not_a_virtual_environment(system, packages):
     (system / "opt/edgevpr").mkdir(parents=True)
     (system / "opt/edgevpr/mine").touch()
     with pytest.raises(EdgevprError, match="/opt/edgevpr"):
@@ -190,7 +196,7 @@ def test_what_is_no_virtual_environment_is_left_alone(system, packages):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
-def test_only_root_may_change_the_system():
+def test_install_needs_root():
     script = (
         "import os; from edgevpr.runtime.service.install import install, uninstall; os.seteuid(65534)\n"
         "for action in (lambda: install(None, False, print), lambda: uninstall(False, print)):\n"
@@ -201,7 +207,7 @@ def test_only_root_may_change_the_system():
     assert [line.split()[:2] for line in done.stdout.splitlines()] == 2 * [["Only", "root"]]
 
 
-def test_uninstalling_leaves_maps_logs_and_configuration(installed):
+def test_uninstall_leaves_maps_logs_and_configuration(installed):
     """The last test: what it leaves is not installed again."""
     kept = [installed / name for name in ("var/lib/edgevpr/v.gpkg", "var/log/edgevpr/f.jsonl")]
     for path in kept:

@@ -45,7 +45,7 @@ def generated(tmp_path_factory):
     return folder
 
 
-def test_a_first_flight_makes_the_map_in_which_a_second_one_recognises_places(generated, tmp_path):
+def test_learning_flight_makes_a_map_for_a_second_flight(generated, tmp_path):
     place_map = tmp_path / "m.gpkg"
     flags = ("--learn", "--technique", "cohog", "--camera", "nadir", "--rate-hz", "60")
     lines, said = flown(place_map, generated / "first" / "images", tmp_path / "1.jsonl", *flags)
@@ -66,7 +66,7 @@ def test_a_first_flight_makes_the_map_in_which_a_second_one_recognises_places(ge
     assert "learnt" not in lines[-1], "a flight that does not learn has nothing to say of it"
 
 
-def test_kill_9_costs_no_place_that_the_log_calls_learnt_and_the_next_flight_goes_on(recording, tmp_path, monkeypatch):
+def test_learning_flight_loses_no_learnt_place_by_kill_9(recording, tmp_path, monkeypatch):
     place_map, log = tmp_path / "m.gpkg", tmp_path / "flight.jsonl"
     source = recording / "seen" / "images"
     process = start(place_map, source, log, "--learn", "--technique", "hog", "--rate-hz", "25")
@@ -93,7 +93,7 @@ def test_kill_9_costs_no_place_that_the_log_calls_learnt_and_the_next_flight_goe
         assert sorted(place.source_image for place in whole.places()) == [f"{n:02d}.png" for n in range(PLACES)]
 
 
-def test_after_a_fix_that_may_be_taken_nothing_is_learnt_from_the_autopilot(recording, tmp_path):
+def test_learning_flight_learns_nothing_after_a_fix(recording, tmp_path):
     """The autopilot says to be where no place is; the frames show places of the map."""
     pictures = [cv2.imread(str(path)) for path in sorted((recording / "seen" / "images").iterdir())]
 
@@ -125,7 +125,7 @@ def test_after_a_fix_that_may_be_taken_nothing_is_learnt_from_the_autopilot(reco
 
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not on this machine")
-def test_a_full_disk_ends_the_learning_and_not_the_flight(recording, tmp_path):
+def test_learning_flight_goes_on_where_the_disk_is_full(recording, tmp_path):
     lines, said = flown(
         tmp_path / "m.gpkg",
         recording / "seen" / "images",
@@ -146,15 +146,9 @@ def test_a_full_disk_ends_the_learning_and_not_the_flight(recording, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="prlimit is not on this machine")
-def test_a_map_that_cannot_be_written_is_flown_with_all_the_same(recording, tmp_path):
-    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
-    flags = ("--learn", "--rate-hz", "60")
-    _, said = flown(
-        tmp_path / "m.gpkg",
-        recording / "seen" / "images",
-        tmp_path / "f.jsonl",
-        *flags,
-        through=["prlimit", "--fsize=0"],
-    )
+def test_learning_flight_uses_a_map_that_cannot_be_written(recording, tmp_path):
+    place_map = shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
+    images, flags, through = recording / "seen" / "images", ("--learn", "--rate-hz", "60"), ["prlimit", "--fsize=0"]
+    _, said = flown(place_map, images, tmp_path / "f.jsonl", *flags, through=through)
     assert f"{PLACES} queries, {PLACES} accepted" in said
     assert said.count("nothing more is learnt") == 1

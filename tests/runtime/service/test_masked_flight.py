@@ -1,4 +1,4 @@
-"""The mask from the file to the match: used by map and query, and said where it is missing."""
+"""The mask from the file to the match: used by map and query."""
 
 import cv2
 import numpy as np
@@ -51,22 +51,8 @@ def opened(folder, name, mask):
     return open_recogniser(load_config(None, settings), load_board("this"))
 
 
-def test_a_mask_that_is_missing_is_said_to_be_the_mask(folder, tmp_path, capsys):
-    missing = str(tmp_path / "nope.png")
-    said = f"The mask of `source.mask` (--mask) cannot be used: The image {missing} cannot be read "
-    (tmp_path / "c.yaml").write_text(
-        f"map: {folder / 'masked.gpkg'}\nsource: {{uri: {folder / 'ref'}, mask: {missing}}}\nlog: {{path: null}}\n"
-    )
-    assert main(["run", "--config", str(tmp_path / "c.yaml")]) == 1
-    assert said in capsys.readouterr().err
-    built = ["map", "build", str(tmp_path / "new.gpkg"), "--images", str(folder / "ref"), "--mask", missing]
-    assert main(built) == 1
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "new.gpkg").exists()
-
-
 @pytest.mark.slow
-def test_with_the_mask_more_is_recognised_behind_a_display(folder):
+def test_mask_finds_more_places_behind_a_display(folder):
     found = {}
     for name, mask in (("plain.gpkg", False), ("masked.gpkg", True)):
         walk = opened(folder, name, mask)

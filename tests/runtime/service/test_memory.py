@@ -55,14 +55,14 @@ def flight(big_map):
     return list(read_log(log)), largest, mapped
 
 
-def test_a_flight_completes_within_a_hard_limit_of_memory(flight):
+def test_flight_completes_within_a_hard_limit_of_memory(flight):
     lines, largest, _ = flight
     assert lines[-1]["kind"] == "end"
     assert lines[-1]["queries"] == FRAMES
     assert largest["VmPeak"] < LIMIT_BYTES / 1e6
 
 
-def test_the_whole_process_takes_60_mb_of_its_own_and_140_with_the_libraries(flight):
+def test_flight_takes_60_mb_and_140_with_the_libraries(flight):
     largest = flight[1]
     assert 30 < largest["Pss"] <= largest["VmHWM"]
     assert largest["RssAnon"] < 60
@@ -70,12 +70,12 @@ def test_the_whole_process_takes_60_mb_of_its_own_and_140_with_the_libraries(fli
     assert largest["VmHWM"] < 140
 
 
-def test_memory_does_not_grow_from_query_to_query(flight):
+def test_flight_does_not_grow_from_query_to_query(flight):
     told_mb = [line["costs"]["rss_mb"] for line in flight[0] if line["kind"] == "query"]
     assert max(told_mb[WARM_AFTER:]) < told_mb[WARM_AFTER - 1] + 4
 
 
-def test_what_a_flight_does_not_need_is_not_in_its_memory(flight):
+def test_flight_loads_no_library_that_it_does_not_need(flight):
     mapped = flight[2]
     assert "cv2" in mapped
     assert "onnxruntime" not in mapped
@@ -84,7 +84,7 @@ def test_what_a_flight_does_not_need_is_not_in_its_memory(flight):
 
 # Choosing which places stay takes lists of all of them, for a moment.
 @pytest.mark.parametrize(("share", "beside_bytes"), [(1.0, 1_000_000), (0.5, 2_500_000)])
-def test_the_index_stays_within_its_budget_and_loading_takes_little_beside_it(big_map, share, beside_bytes):
+def test_load_index_stays_within_its_budget(big_map, share, beside_bytes):
     technique = create("cohog")
     budget_bytes = int(share * PLACES) * bytes_per_place(technique.spec)
     with PlaceMap.open(big_map) as place_map:

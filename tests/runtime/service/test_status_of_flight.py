@@ -1,12 +1,7 @@
-"""The status of a flight that is a process of its own, and `edgevpr top` on a terminal and off it."""
+"""The status of a flight that is a process of its own."""
 
-import os
-import pty
 import re
-import select
-import sys
 import time
-from contextlib import contextmanager
 
 import psutil
 import pytest
@@ -49,7 +44,7 @@ def status_of(path, wanted=lambda status: True):
     raise AssertionError(f"no such status at {path}")
 
 
-def test_a_flight_tells_its_status_opens_no_port_and_removes_its_file(fly, tmp_path, capsys):
+def test_run_writes_its_status_and_opens_no_port(fly, tmp_path, capsys):
     run, path = fly(), tmp_path / "status.json"
     status = status_of(path, lambda status: status["accepted"])
     assert status["queries"] >= status["accepted"] >= 1
@@ -67,7 +62,7 @@ def test_a_flight_tells_its_status_opens_no_port_and_removes_its_file(fly, tmp_p
     assert not path.exists()
 
 
-def test_a_service_has_its_file_where_systemd_says_and_else_there_is_none(fly, tmp_path):
+def test_run_writes_no_status_outside_a_service(fly, tmp_path):
     (tmp_path / "run").mkdir()
     run = fly(file=None, RUNTIME_DIRECTORY=str(tmp_path / "run"))
     assert status_of(tmp_path / "run" / "status.json")
@@ -78,7 +73,7 @@ def test_a_service_has_its_file_where_systemd_says_and_else_there_is_none(fly, t
     assert not list(tmp_path.rglob("status.json*"))
 
 
-def test_a_service_flies_without_a_status_where_a_flight_is_refused(fly, tmp_path):
+def test_service_flies_where_no_status_can_be_written(fly, tmp_path):
     refused = fly(file=tmp_path / "nowhere" / "s")
     said = refused.communicate(timeout=PATIENCE_S)[1]
     assert refused.returncode == 1
@@ -88,29 +83,3 @@ def test_a_service_flies_without_a_status_where_a_flight_is_refused(fly, tmp_pat
     service.terminate()
     service.communicate(timeout=PATIENCE_S)
     assert service.returncode == 0
-
-
-@contextmanager
-def terminal(*command):
-    """A program on a terminal of 60 columns and 12 lines; gives a call that waits for words on it, and returns all."""
-    pid, descriptor = pty.fork()
-    if pid == 0:
-        os.environ.update(COLUMNS="60", LINES="12")
-        os.execv(sys.executable, [sys.executable, "-m", "edgevpr", *command])
-    seen = ""
-
-    def wait_for_words(words, times=1):
-        nonlocal seen
-        give_up_s = time.monotonic() + PATIENCE_S
-        while seen.count(words) < times:
-            assert time.monotonic() < give_up_s, seen
-            if select.select([descriptor], [], [], 1.0)[0]:
-                seen += os.read(descriptor, 65_536).decode()
-        return seen
-
-    try:
-        yield wait_for_words
-        os.write(descriptor, b"\x03")
-        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-    finally:
-        os.close(descriptor)

@@ -36,13 +36,13 @@ def directives(text: str) -> dict[str, str]:
 
 @pytest.mark.slow
 @needs_systemd
-def test_every_boards_unit_passes(tmp_path):
+def test_render_unit_passes_systemds_verification(tmp_path):
     for name in board_names():
         assert verify(render_unit(load_board(name)), tmp_path) == ""
 
 
 @needs_systemd
-def test_the_exposure_stays_under_two(tmp_path):
+def test_unit_keeps_its_exposure_under_two(tmp_path):
     unit = tmp_path / "edgevpr.service"
     unit.write_text(UNIT.read_text())
     judged = subprocess.run(
@@ -55,7 +55,7 @@ def test_the_exposure_stays_under_two(tmp_path):
     assert judged.returncode == 0, judged.stdout
 
 
-def test_no_medium_is_required_that_may_be_pulled_in_flight():
+def test_unit_requires_no_medium_that_may_be_pulled_in_flight():
     """systemd stops a service with the mount that it requires, and starts neither again."""
     said = directives(UNIT.read_text())
     requiring = {"WorkingDirectory", "StateDirectory", "LogsDirectory", "RequiresMountsFor", "Requires", "BindsTo"}
@@ -65,11 +65,11 @@ def test_no_medium_is_required_that_may_be_pulled_in_flight():
     assert {f"{folder[1:].replace('/', '-')}.mount" for folder in folders} < set(said["After"].split())
 
 
-def test_the_committed_unit_is_that_of_the_default_board():
+def test_unit_is_that_of_the_default_board():
     assert UNIT.read_text() == render_unit(load_board("rpi-zero-2w"))
 
 
-def test_the_limits_are_those_of_the_board():
+def test_render_unit_has_the_limits_of_the_board():
     board = replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0)
     unit = render_unit(board)
     assert directives(unit)["MemoryMax"] == "777000000"
@@ -79,36 +79,31 @@ def test_the_limits_are_those_of_the_board():
     assert "rpi-zero-2w" not in unit
 
 
-def test_a_board_of_ones_own_writes_no_line_of_its_own():
+def test_render_unit_escapes_the_name_of_the_board():
     unit = render_unit(replace(load_board("rpi-zero-2w"), name="x\nExecStartPre=/bin/sh"))
     assert "\n# Board: x\\nExecStartPre=/bin/sh\n" in unit
     assert directives(unit)["ExecStartPre"] == directives(UNIT.read_text())["ExecStartPre"]
 
 
-def test_the_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
+def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
     unit = directives(UNIT.read_text())
     assert unit["Restart"] == "always"
     assert unit["StartLimitIntervalSec"] == "0"
     assert unit["RestartPreventExitStatus"] == str(UsageError.exit_code)
+    assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
 
 
-def test_serial_ports_and_cameras_stay_within_reach():
+def test_unit_leaves_serial_ports_and_cameras_within_reach():
     unit = directives(UNIT.read_text())
-    # /dev/video*, /dev/media* and /run/udev are read by libcamera and GStreamer.
+    # /dev/video*, /dev/media* and /run/udev, which libcamera and GStreamer read, are not hidden.
     hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
     assert not hidden & unit.keys()
     assert unit["DeviceAllow"] == "char-* rw"  # ProtectClock alone would shut them out
     assert unit["SupplementaryGroups"] == "dialout video"
+    assert (unit["PrivateTmp"], unit["BindPaths"]) == ("yes", "-/tmp/argus_socket"), "of a Jetson's camera"
 
 
-def test_the_socket_of_a_jetsons_camera_is_let_into_the_private_tmp():
-    unit = directives(UNIT.read_text())
-    assert unit["PrivateTmp"] == "yes"
-    assert unit["BindPaths"] == "-/tmp/argus_socket", "other boards do not have it"
-    assert "nvargus-daemon.service" in unit["After"].split()
-
-
-def test_every_udev_rule_is_well_formed():
+def test_udev_rules_are_well_formed():
     rules = [line for line in (DEPLOY / "99-edgevpr.rules").read_text().splitlines() if line and line[0] != "#"]
     keys = r"(ACTION|SUBSYSTEMS?|KERNEL|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|LABEL|GOTO)"
     for rule in rules:
